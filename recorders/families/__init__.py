@@ -1,5 +1,5 @@
-"""Simulates, imports and models what single families of systems need; a package each.
+"""Simulators, importers and models of single families of systems, in one package per family.
 
 A family has the same name here, in `fuselog.replay` and in `fuselog.pipeline`. Nothing outside imports
-them: they register. Begin with a small one, `ranging`.
+these packages: they register themselves. Begin with a small one, `ranging`.
 """

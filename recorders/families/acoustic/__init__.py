@@ -1,5 +1,5 @@
-"""Records shots and sounds that arrays of microphones hear; begin with `simulator`.
+"""Recordings of shots and sounds heard by arrays of microphones; begin with `simulator`.
 
-That is one shot after the other. `shot_sequence` and `sound_source` are scenarios of their own: shots of
-a shooter who moves, and a sound heard by microphones; `sound_recordings` imports real ones.
+`simulator` records one shot after another. `shot_sequence` and `sound_source` are separate scenarios:
+shots of a moving shooter, and a sound heard by microphones. `sound_recordings` imports real sounds.
 """

@@ -1,4 +1,4 @@
-"""Makes the streams of a sound that microphones heard: differences of arrivals, and their places."""
+"""Streams of a sound heard by microphones: differences of arrival times, and microphone positions."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,14 @@ Floats = NDArray[np.float64]
 
 
 class HeardSound(NamedTuple):
-    """Holds what n microphones recorded of one sound at the same time.
+    """Simultaneous recordings of one sound by n microphones.
 
     Attributes:
         time_ns: the stamp of the sound.
         recordings: (n, samples).
-        rate_hz: of the samples.
-        places_m: of the microphones (n, 3).
-        microphone_id: their numbers (n,).
+        rate_hz: sampling rate.
+        places_m: positions of the microphones (n, 3).
+        microphone_id: numbers of the microphones (n,).
     """
 
     time_ns: int
@@ -37,14 +37,14 @@ def difference_stream(
     speed_of_sound_mps: float,
     weighting: Weighting = "phat",
 ) -> Stream:
-    """Return the arrivals of one sound at several microphones.
+    """Measure the arrivals of one sound at several microphones and return them as a stream.
 
     Args:
-        prefix: of the topic, which ends with `/differences`.
-        heard: what the microphones recorded.
-        band_hz: the frequencies that are used.
+        prefix: prefix of the topic, which ends with `/differences`.
+        heard: recordings of the microphones.
+        band_hz: lowest and highest frequency to use.
         weighting: see `fuselog.recorders.families.acoustic.arrivals`.
-        speed_of_sound_mps: sets how much later a sound may come at all, and is stated.
+        speed_of_sound_mps: limits the delays, and is written to the channel's metadata.
     """
     time_ns, recordings, rate_hz, places_m, microphone_id = heard
     away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
@@ -66,11 +66,11 @@ def difference_stream(
 
 
 def microphone_stream(time_ns: int, places_m: Floats) -> Stream:
-    """Make the stream that says where microphones are, numbered from 1 on.
+    """Make the stream of microphone positions, with microphones numbered from 1.
 
     Args:
-        time_ns: the stamp of all.
-        places_m: (n, 3), where they are.
+        time_ns: stamp of all messages.
+        places_m: positions (n, 3).
     """
     return make_stream(
         "/microphones",

@@ -1,9 +1,9 @@
-"""Measures how much later a sound comes at one microphone than at another, by cross-correlation.
+"""Differences between the arrival times of a sound at microphones, by cross-correlation.
 
-Knapp and Carter, "The Generalized Correlation Method for Estimation of Time Delay", IEEE Transactions
-on Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is the delay's,
-plus that of noise and echoes; the delay is where the cosines of what is left sum to most. Weighted by
-the phase transform all frequencies count alike.
+Knapp and Carter, "The Generalized Correlation Method for Estimation of Time Delay", IEEE Transactions on
+Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is that of the
+delay plus that of noise and echoes; the estimated delay maximizes the sum of the cosines of the
+remaining phases. With the phase transform, all frequencies have the same weight.
 """
 
 from itertools import combinations
@@ -18,14 +18,14 @@ from scipy.special import gammaincinv
 Floats = NDArray[np.float64]
 Weighting = Literal["phat", "none"]
 
-# How many points the correlation is sought on for every sample.
+# Number of points per sample on which the correlation is evaluated.
 FINER = 4
-# Newton's steps from the best of them; it converges quadratically.
+# Number of Newton steps from the best point; they converge quadratically.
 STEPS = 5
 
 
 class Delay(NamedTuple):
-    """States how much later one signal is than another; `likeness` is 1 where all phases agree."""
+    """Delay of one signal relative to another; `likeness` is 1 if all phases agree."""
 
     delay_s: float
     variance_s2: float
@@ -33,13 +33,14 @@ class Delay(NamedTuple):
 
 
 class Arrivals(NamedTuple):
-    """Holds when a sound came at each microphone, beside the one that hears it most clearly.
+    """Arrival times of a sound at each microphone, relative to the microphone that hears it best.
 
     Attributes:
-        reference: which one that is.
-        delay_s: (n,) later than there; zero for itself.
-        variance_s2: (n,) of each microphone's own arrival, so that a difference has the sum of two.
-        likeness: (n,) of the signals, see `Delay`.
+        reference: index of that reference microphone.
+        delay_s: (n,), delays relative to the reference; zero for the reference.
+        variance_s2: (n,), variance of each microphone's own arrival time; a difference has the sum of
+            two.
+        likeness: (n,), similarity of the signals, see `Delay`.
     """
 
     reference: int
@@ -56,23 +57,23 @@ def delay_between(
     longest_s: float,
     weighting: Weighting = "phat",
 ) -> Delay:
-    """Measure how much later `late` (samples,) is than `early`, at most `longest_s` either way.
+    """Measure the delay of `late` (samples,) relative to `early`, at most `longest_s` either way.
 
-    The variance is that of the equation that the delay solves, sum w omega sin(phase left) = 0, from
-    what is left of the phases themselves (the sandwich of Huber, "The behavior of maximum likelihood
-    estimates under nonstandard conditions", 1967): of noise that is independent from frequency to
-    frequency, however strong at which. It does not know of a wrong peak.
+    The variance is that of the root of the equation for the delay, sum w omega sin(remaining phase) = 0,
+    estimated from the remaining phases (the sandwich estimator of Huber, "The behavior of maximum
+    likelihood estimates under nonstandard conditions", 1967). It holds for noise that is independent
+    between frequencies, with any spectrum. It does not include the risk of a wrong peak.
 
     Args:
-        late: (samples,), the signal of the microphone where the sound comes later.
-        early: (samples,), that of the other, over the same time.
-        rate_hz: samples a second.
-        band_hz: the lowest and the highest frequency that count.
-        longest_s: no delay is longer, in s.
-        weighting: how frequencies count, see `Weighting`.
+        late: (samples,), the signal of the microphone that the sound reaches later.
+        early: (samples,), the signal of the other microphone, over the same time.
+        rate_hz: sampling rate.
+        band_hz: lowest and highest frequency to use.
+        longest_s: longest possible delay, in s.
+        weighting: weights of frequencies, see `Weighting`.
 
     Returns:
-        The delay in s, its variance in s^2, and how alike the phases are.
+        The delay in s, its variance in s^2, and the similarity of the phases.
 
     >>> rng = np.random.default_rng(1)
     >>> sound, noise = rng.normal(size=2000), 0.1 * rng.normal(size=(2, 1900))
@@ -98,10 +99,10 @@ def delay_between(
     for _ in range(STEPS):
         left = weighted * np.exp(1j * omega * delay_s)
         bend = float(omega**2 @ left.real)
-        if bend <= 0.0:  # no maximum: there is nothing but noise
+        if bend <= 0.0:  # no maximum: the signals are only noise
             return Delay(delay_s, np.inf, 0.0)
         delay_s -= float(omega @ left.imag) / bend
-    repeated = size / samples  # padding makes so many frequencies of each
+    repeated = size / samples  # padding interpolates the spectrum by this factor
     variance_s2 = repeated * float(omega**2 @ left.imag**2) / bend**2
     return Delay(delay_s, variance_s2, float(left.real.sum() / weight.sum()))
 
@@ -113,23 +114,23 @@ def arrivals(
     longest_s: Floats,
     weighting: Weighting = "phat",
 ) -> Arrivals:
-    """Measure when a sound came at each of n microphones, from recordings (n, samples) of the same time.
+    """Measure arrival times of a sound at n microphones from simultaneous recordings (n, samples).
 
-    Delays between all pairs are at most `longest_s` (n, n). A microphone's variance is the sum of three:
-    of noise, two of which are the variance of a pair's delay; of echoes and neighbouring peaks, by how
-    little the delays of three microphones add up to zero, in the median; and of a clock that is known to
-    half a sample either way.
-    The reference is the microphone whose delays to all others have the least variance.
+    Delays of all pairs are at most `longest_s` (n, n). A microphone's variance is the sum of three: a
+    part due to noise, fitted so that the parts of two microphones add up to the variance of their delay;
+    a part due to echoes and neighbouring peaks, from the median closure error of the delays of three
+    microphones; and a part due to a clock offset of up to half a sample. The reference is the microphone
+    whose delays to all others have the smallest total variance.
 
     Args:
-        recordings: (n, samples), of the same time.
-        rate_hz: samples a second.
-        band_hz: the lowest and the highest frequency that count.
-        longest_s: (n, n), no delay of a pair is longer, in s.
-        weighting: how frequencies count, see `Weighting`.
+        recordings: (n, samples), simultaneous recordings.
+        rate_hz: sampling rate.
+        band_hz: lowest and highest frequency to use.
+        longest_s: (n, n), longest possible delay of each pair, in s.
+        weighting: weights of frequencies, see `Weighting`.
 
     Returns:
-        When the sound came at each microphone, beside the reference.
+        The arrival times at each microphone, relative to the reference.
     """
     count = len(recordings)
     pairs, triples = (np.array(list(combinations(range(count), size))) for size in (2, 3))
@@ -145,7 +146,7 @@ def arrivals(
         noise_s2[i, k] = noise_s2[k, i] = min(each.variance_s2, longest_s[i, k] ** 2)
     first, second, third = triples.T
     open_s = delays[first, second] + delays[second, third] + delays[third, first]
-    # six shares in three delays; the median of the square of a Gaussian is .455 of its variance
+    # three delays have six parts; the median of a squared Gaussian is 0.455 of its variance
     of_peaks_s2 = np.median(open_s**2) / (12.0 * gammaincinv(0.5, 0.5))
     belongs = np.zeros((len(pairs), count))
     np.put_along_axis(belongs, pairs, 1.0, axis=1)

@@ -1,4 +1,4 @@
-"""Models what an acoustic sensor hears of a supersonic shot, in the plane.
+"""Models of the measurements of a supersonic shot by an acoustic sensor, in the plane.
 
 Osborne, Bar-Shalom, George and Kaplan, "Statistical Efficiency of Target Localization from Angle and
 Shockwave Measurements", JAIF 2014. Angles are anticlockwise from the x axis, in rad. Component-first:
@@ -12,24 +12,24 @@ import numpy as np
 
 from fuselog.recorders.models.planar import Component, Components, wrap_angle
 
-# The shooter's position and the bullet's direction in a state.
+# Components of a state: the shooter's position and the bullet's direction.
 SHOT_COMPONENTS = ("x_m", "y_m", "trajectory_rad")
 
 
 class Medium(NamedTuple):
-    """Describes the air, and the bullet's constant speed in multiples of that of sound."""
+    """Speed of sound in the air, and the bullet's constant speed as a Mach number."""
 
     speed_of_sound_mps: float = 342.0
     mach_number: float = 2.0
 
     @property
     def mach_angle_rad(self) -> float:
-        """Return half the opening of the shockwave's cone; eq (5)."""
+        """Return half the opening angle of the shockwave's cone; eq (5)."""
         return float(np.arcsin(1.0 / self.mach_number))
 
 
 class Noise(NamedTuple):
-    """Holds standard deviations of what a sensor measures; `position_m` is its GPS's, per axis."""
+    """Standard deviations of a sensor's measurements; `position_m` is that of its GPS, per axis."""
 
     muzzle_blast_rad: float
     shockwave_rad: float
@@ -46,10 +46,11 @@ def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, C
 def fired_from(
     place: Components, velocity: Components, sensor: Components, speed_of_sound_mps: Component
 ) -> tuple[Component, Component]:
-    """Find where something was whose sound a sensor hears now, when it is at `place` by now.
+    """Find the position of a source when it emitted the sound that a sensor hears now.
 
-    The sound's time of travel is that of the distance now, corrected once: what is left out is the
-    square of velocity over the speed of sound, 2 cm of 1 km at 1.5 m/s.
+    The source is at `place` now. The travel time of the sound is that from the current distance,
+    corrected once. The remaining error is of second order in velocity over the speed of sound: 2 cm at 1
+    km and 1.5 m/s.
     """
     x, y = place
     for _ in range(2):
@@ -59,10 +60,10 @@ def fired_from(
 
 
 def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
-    """Find on which side of the line of fire a sensor hears the shockwave: +1 or -1; 0 for none.
+    """Find the side of the line of fire on which a sensor hears the shockwave: +1 or -1; 0 if none.
 
-    It does within 90 deg less the Mach angle of the line, the line itself left out (figure 2). Eq (7)
-    says the same, but for angles that need wrapping.
+    A sensor hears the shockwave at angles to the line of fire between 0 and 90 deg minus the Mach angle,
+    both excluded (figure 2). Eq (7) agrees, except for angles that need wrapping.
     """
     off_line = wrap_angle(azimuth - np.pi - trajectory)
     return np.where(np.abs(off_line) < 0.5 * np.pi - medium.mach_angle_rad, np.sign(off_line), 0.0)
@@ -74,19 +75,20 @@ def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) ->
 
 
 def measured_side(azimuth: Component, shockwave: Component) -> Component:
-    """Return the side of the line of fire that follows from the two directions of arrival alone."""
+    """Return the side of the line of fire that follows from the two directions of arrival only."""
     return -np.sign(wrap_angle(azimuth - shockwave))
 
 
 def trajectory_from_shockwave(shockwave: Component, side: Component, medium: Medium) -> Component:
-    """Return the bullet's direction, eq (7) turned around."""
+    """Compute the bullet's direction by inverting eq (7)."""
     return wrap_angle(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
 
 
 def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Component:
-    """Return the side that a sensor works out; 0 where it cannot be sure, or heard no shockwave.
+    """Return the side that a sensor infers; 0 if it is ambiguous or no shockwave was heard.
 
-    That is where both directions of arrival are within three standard deviations of each other.
+    The side is ambiguous if the two directions of arrival are within three standard deviations of each
+    other.
     """
     unsure = 3.0 * np.hypot(noise.muzzle_blast_rad, noise.shockwave_rad)
     is_sure = np.abs(wrap_angle(azimuth - shockwave)) >= unsure
@@ -96,7 +98,7 @@ def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Compon
 def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:
     """Compute the time in s from shockwave to muzzle blast.
 
-    `separation` is the direction of the muzzle blast less that of the shockwave.
+    `separation` is the direction of the muzzle blast minus that of the shockwave.
     """
     return distance * (1.0 - np.cos(separation)) / medium.speed_of_sound_mps
 
@@ -104,20 +106,20 @@ def time_difference(distance: Component, separation: Component, medium: Medium) 
 def time_difference_gradient(
     distance: Component, separation: Component, medium: Medium
 ) -> tuple[Component, Component]:
-    """Compute derivatives of `time_difference` by distance and by separation."""
+    """Compute the derivatives of `time_difference` by distance and separation."""
     speed = medium.speed_of_sound_mps
     return (1.0 - np.cos(separation)) / speed, distance * np.sin(separation) / speed
 
 
 def range_from_time_difference(delay: Component, separation: Component, medium: Medium) -> Component:
-    """Return the distance to the shooter in m; eq (9)."""
+    """Compute the distance to the shooter in m; eq (9)."""
     return medium.speed_of_sound_mps * delay / (1.0 - np.cos(separation))
 
 
 def hear(
     shooter: Components, trajectory: Component, sensor: Components, medium: Medium
 ) -> tuple[Component, Component, Component]:
-    """Compute both directions of arrival and the time difference; NaN for a shockwave not heard."""
+    """Compute both directions of arrival and the time difference; NaN if the shockwave is not heard."""
     azimuth, distance = azimuth_range(shooter, sensor)
     side = shockwave_side(azimuth, trajectory, medium)
     shockwave = np.where(side == 0.0, np.nan, shockwave_azimuth(trajectory, side, medium))
@@ -145,7 +147,7 @@ def local_estimate_covariances(
 def local_estimate_covariance_gradients(
     distance: Component, separation: Component, noise: Noise, medium: Medium
 ) -> tuple[tuple[Component, Component], ...]:
-    """Compute derivatives of `local_estimate_covariances` by distance and by separation.
+    """Compute the derivatives of `local_estimate_covariances` by distance and separation.
 
     With the chain rule these are eqs (63)-(77).
     """
@@ -168,6 +170,6 @@ def sensor_components(sensor: int) -> list[str]:
 
 
 def stated_metadata(noise: Noise, medium: Medium) -> dict[str, str]:
-    """State noise (`sigma_muzzle_blast_rad`, ...) and medium as a channel of detections does."""
+    """Return noise (`sigma_muzzle_blast_rad`, ...) and medium as metadata of a detection channel."""
     stated = {f"sigma_{name}": value for name, value in noise._asdict().items()} | medium._asdict()
     return {name: repr(value) for name, value in stated.items()}

@@ -1,10 +1,10 @@
-"""Simulates shots of one shooter who moves, heard by sensors of known places; some detections err.
+"""Shots of a moving shooter, heard by sensors at known positions, with some wrong detections.
 
-The velocity changes by white acceleration, the aim from shot to shot by as much as a random walk of this
-density would; each shot is heard from where it was fired, when its sound arrives. A sensor may miss a
-shot; take an echo for the muzzle blast, which comes later and from anywhere; or join to it a shockwave
-of another shot. `/shooter/reports` is what all sensors tell a fusion centre, `/sensors` says where they
-are.
+The velocity changes by white acceleration, and the direction of the shots by a random walk. Each shot is
+heard from the position at which it was fired, when its sound arrives. A sensor may miss a shot; it may
+mistake an echo, which comes later and from any direction, for the muzzle blast; or it may combine the
+muzzle blast with the shockwave of another shot. `/shooter/reports` contains the reports of all sensors
+to a fusion centre, `/sensors` the positions of the sensors.
 """
 
 from typing import Annotated, NamedTuple
@@ -32,25 +32,25 @@ Floats = NDArray[np.float64]
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 STATE = (*SHOT_COMPONENTS, "vx_mps", "vy_mps")
-# How densely the path is simulated and told.
+# Time step of the simulated and recorded path.
 PATH_S = 0.1
 
 
 class ShotSequenceParameters(AcousticParameters):
-    """States the scenario of a shot, and how the shooter moves and sensors err.
+    """The scenario of a shot, with the motion of the shooter and the errors of the sensors.
 
-    The shooter begins near `shooter_position_m`, aiming near `trajectory_deg`.
+    The shooter begins near `shooter_position_m` and aims near `trajectory_deg`.
 
     Attributes:
-        start_sigma_m: standard deviation of the true start's position, per axis.
-        start_sigma_mps: standard deviation of the true start's velocity, per axis.
+        start_sigma_m: standard deviation of the true initial position, per axis.
+        start_sigma_mps: standard deviation of the true initial velocity, per axis.
         start_sigma_deg: standard deviation of the direction of the first shot.
         acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
         trajectory_density: random walk of the direction of shots, in rad/sqrt(s).
-        echo_probability: probability that a sensor takes an echo for the muzzle blast.
-        echo_delay_s: mean time by which an echo is later (exponential).
-        wrong_association_probability: probability that a sensor joins another shockwave to the muzzle
-            blast.
+        echo_probability: probability that a sensor mistakes an echo for the muzzle blast.
+        echo_delay_s: mean delay of an echo (exponential).
+        wrong_association_probability: probability that a sensor combines the muzzle blast with another
+            shockwave.
         wrong_delay_s: longest time between such a shockwave and the muzzle blast.
     """
 
@@ -68,9 +68,9 @@ class ShotSequenceParameters(AcousticParameters):
 
 
 class Heard(NamedTuple):
-    """Holds all sensors' measurements of all shots, (shots, sensors); NaN for an unheard shockwave.
+    """All sensors' measurements of all shots, (shots, sensors); NaN for a shockwave that is not heard.
 
-    `arrival_s` is since the epoch; `is_heard` is false of what a sensor missed.
+    `arrival_s` counts from the epoch; `is_heard` is false if a sensor missed the shot.
     """
 
     arrival_s: Floats
@@ -81,7 +81,7 @@ class Heard(NamedTuple):
 
 
 def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput where a shot is fired before the last one is heard everywhere."""
+    """Record one run; raise BadInput if a shot is fired before all sensors heard the last one."""
     path_rng, noise_rng, fault_rng = rng.spawn(3)
     shots_s = parameters.interval_s * np.arange(float(parameters.shots))
     path_s = PATH_S * np.arange(round((shots_s[-1] + parameters.interval_s) / PATH_S) + 1)
@@ -117,7 +117,7 @@ def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Re
 
 
 def _path(parameters: ShotSequenceParameters, steps: int, rng: np.random.Generator) -> Floats:
-    """Draw places and velocities (steps, 4) every `PATH_S`."""
+    """Draw positions and velocities (steps, 4) every `PATH_S`."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, PATH_S)
     noise = rng.multivariate_normal(
         np.zeros(2), [[place, mixed], [mixed, speed]], size=(steps, 2), method="eigh"
@@ -132,7 +132,7 @@ def _path(parameters: ShotSequenceParameters, steps: int, rng: np.random.Generat
 
 
 def _aims(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Floats:
-    """Draw the bullet's direction (shots,), not wrapped."""
+    """Draw the unwrapped directions of the bullets (shots,)."""
     sigma = np.full(parameters.shots, parameters.trajectory_density * np.sqrt(parameters.interval_s))
     sigma[0] = np.radians(parameters.start_sigma_deg)
     changes = sigma * rng.normal(size=parameters.shots)
@@ -146,7 +146,7 @@ def _heard(
     noise_rng: np.random.Generator,
     fault_rng: np.random.Generator,
 ) -> Heard:
-    """Simulate what sensors measure of shots that are fired in these states (shots, 5)."""
+    """Simulate the sensors' measurements of shots fired in these states (shots, 5)."""
     sensors = np.array(parameters.sensor_position_m).T[:, None]
     x, y, trajectory = fired.T[:3, :, None]
     noise, medium = parameters.noise, parameters.medium
@@ -173,7 +173,7 @@ def _heard(
 
 
 def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
-    """Compute what all sensors tell, in the order of arrival."""
+    """Make the reports of all sensors, in order of arrival."""
     noise, medium = parameters.noise, parameters.medium
     shot, sensor = np.nonzero(heard.is_heard)
     order = np.argsort(heard.arrival_s[shot, sensor], kind="stable")
@@ -196,7 +196,7 @@ def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
 
 
 def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -> Stream:
-    """Return what one sensor hears, a message for each shot that it does not miss."""
+    """Make one sensor's detections, one message per shot that it does not miss."""
     shots = np.flatnonzero(heard.is_heard[:, number - 1])
     of_sensor = shots, number - 1
     return make_stream(

@@ -1,7 +1,7 @@
-"""Simulates shots heard by acoustic sensors with position fixes: detections, fixes, truth.
+"""Shots heard by acoustic sensors with position fixes: detections, fixes, truth.
 
-Osborne, Bar-Shalom, George and Kaplan, JAIF 2014. Each shot is heard by each sensor when its muzzle
-blast arrives; the shockwave and its lead over the muzzle blast only where the geometry lets it be heard.
+Osborne, Bar-Shalom, George and Kaplan, JAIF 2014. Each sensor detects each shot when its muzzle blast
+arrives. The shockwave and its lead over the muzzle blast are measured only if the geometry allows it.
 """
 
 from typing import Annotated
@@ -30,16 +30,16 @@ Place = tuple[float, float]
 
 
 class AcousticParameters(Parameters):
-    """A shooter fires, and sensors hear the shot through the air.
+    """A shot through the air and the sensors that hear it.
 
     Attributes:
-        shooter_position_m: where the shooter stands (x, y).
+        shooter_position_m: position of the shooter (x, y).
         trajectory_deg: direction of the shot, anticlockwise from the x axis.
-        sensor_position_m: where the sensors stand (x, y).
-        mach_number: speed of the bullet, in speeds of sound.
+        sensor_position_m: positions of the sensors (x, y).
+        mach_number: Mach number of the bullet.
         speed_of_sound_mps: speed of sound in the air.
-        sigma_muzzle_blast_deg: standard deviation of the angle at which a sensor hears the muzzle blast.
-        sigma_shockwave_deg: standard deviation of the angle at which a sensor hears the shockwave.
+        sigma_muzzle_blast_deg: standard deviation of the direction of arrival of the muzzle blast.
+        sigma_shockwave_deg: standard deviation of the direction of arrival of the shockwave.
         sigma_time_difference_s: standard deviation of the time between shockwave and muzzle blast.
         sigma_position_m: standard deviation of a sensor's own position, per axis.
         shots: number of shots.
@@ -68,12 +68,12 @@ class AcousticParameters(Parameters):
 
     @property
     def medium(self) -> Medium:
-        """Return the air and the bullet."""
+        """Return the speeds of sound and bullet."""
         return Medium(self.speed_of_sound_mps, self.mach_number)
 
     @property
     def noise(self) -> Noise:
-        """Return what the sensors' errors are like."""
+        """Return the noise of the sensors, with angles in rad."""
         return Noise(
             float(np.radians(self.sigma_muzzle_blast_deg)),
             float(np.radians(self.sigma_shockwave_deg)),
@@ -83,7 +83,7 @@ class AcousticParameters(Parameters):
 
 
 def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput where a shot is fired before the last one is heard everywhere."""
+    """Record one run; raise BadInput if a shot is fired before all sensors heard the last one."""
     shooter = np.array(parameters.shooter_position_m)
     sensors = np.array(parameters.sensor_position_m)
     travel_s = np.linalg.norm(sensors - shooter, axis=1) / parameters.speed_of_sound_mps
@@ -99,7 +99,7 @@ def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Record
 
 
 def require_time_to_hear(interval_s: float, longest_s: float) -> None:
-    """Raise BadInput where the sound of a shot travels longer than it takes until the next one."""
+    """Raise BadInput if the sound of a shot travels longer than the interval between shots."""
     if longest_s >= interval_s:
         raise BadInput(
             f"interval_s = {interval_s}: the sound travels {longest_s:.3g} s to the "
@@ -108,7 +108,7 @@ def require_time_to_hear(interval_s: float, longest_s: float) -> None:
 
 
 def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> Stream:
-    """State where the shot and the sensors are, when it is fired and whenever it is heard."""
+    """Make the true state of the shot and the sensors, when a shot is fired and whenever it is heard."""
     places = np.ravel(parameters.sensor_position_m)
     numbers = range(1, len(travel_s) + 1)
     components = [*SHOT_COMPONENTS, *(name for s in numbers for name in sensor_components(s))]
@@ -125,7 +125,7 @@ def _fixes(
     shots_s: Array,
     rng: np.random.Generator,
 ) -> Stream:
-    """State where a sensor believes itself to be, a message for each shot."""
+    """Make a sensor's measured positions, one message per shot."""
     sigma = parameters.sigma_position_m
     measured = place + sigma * rng.normal(size=(len(shots_s), 2))
     return fix_stream(f"/sensor{number}/position", simulation_stamps_ns(shots_s), measured, sigma**2)
@@ -138,7 +138,7 @@ def _detections(
     heard_s: Array,
     rng: np.random.Generator,
 ) -> Stream:
-    """Simulate what a sensor hears, a message for each shot that it does not miss."""
+    """Simulate a sensor's detections, one message per shot that it does not miss."""
     shots = len(heard_s)
     trajectory = np.radians(parameters.trajectory_deg)
     noise, medium = parameters.noise, parameters.medium

@@ -1,11 +1,12 @@
-"""Imports sounds in synchronised recordings of microphones, as differences of their arrivals.
+"""Importer of sounds in synchronized recordings of microphones, as differences of arrival times.
 
-A folder as opensoundscape's: WAV files, a table of the microphones' places (CSV with the file first, x,
-y and perhaps z, in m), and tables of detections (CSV with the file first, start_time and end_time in s
-of that file, and a column for each kind of sound, 1 where it is). Tables are known by these columns.
-Every kind and time of a table is one sound; without such a table the whole recordings of an array are.
-A file's comment may say when it began (`recording_start_time`, as opensoundscape writes it); else all
-begin at once.
+The input is a folder as for opensoundscape: WAV files, a table of the microphones' positions (CSV with
+the file first, then x, y and optionally z, in m), and tables of detections (CSV with the file first,
+start_time and end_time in s from the start of the file, and a column for each kind of sound, 1 if
+present). Tables are recognized by these columns. Every kind and time in a table is one sound. Without
+such a table, the whole recordings of an array are one sound. A file's comment may state when it began
+(`recording_start_time`, as written by opensoundscape); without such comments, all recordings begin at
+the same time.
 """
 
 import re
@@ -41,16 +42,15 @@ AXES = ("x", "y", "z")
 
 
 class SoundRecordingsParameters(Parameters):
-    """States what the files do not: the air, the band that is used, and true positions of sounds.
+    """Settings that the files do not contain: the air, the frequency band, and true positions of sounds.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
-        band_hz: lowest and highest frequency that is used, in Hz; without them from 200 Hz to nine
-            tenths of half the sampling rate.
-        weighting: of frequencies when two recordings are correlated: all alike (phat), or by their
+        band_hz: lowest and highest frequency to use, in Hz; if not set, from 200 Hz to 90 % of half the
+            sampling rate.
+        weighting: weights of frequencies in the correlation of two recordings: equal (phat), or by
             strength (none).
-        clipped_share: a file is reported as clipped if a larger share of its samples have the greatest
-            value.
+        clipped_share: share of samples at the greatest value above which a file is reported as clipped.
         truth_m: true positions of sounds (x, y or x, y, z), by name.
     """
 
@@ -62,7 +62,7 @@ class SoundRecordingsParameters(Parameters):
 
 
 class Recorded(NamedTuple):
-    """Holds a file: its samples, how many a second, and when it began, ns since 1970, or None."""
+    """Samples of a file, its sampling rate, and when it began, ns since 1970, or None."""
 
     samples: Floats
     rate_hz: int
@@ -70,7 +70,7 @@ class Recorded(NamedTuple):
 
 
 class Sound(NamedTuple):
-    """Describes one sound: the files that may have it, its begin and end there, ns since 1970."""
+    """One sound: the files that may contain it, its begin and end, ns since 1970."""
 
     name: str
     files: list[str]
@@ -79,7 +79,7 @@ class Sound(NamedTuple):
 
 
 class Array(NamedTuple):
-    """Holds the microphones of one table, by file: places (3,), numbers in the log, and recordings."""
+    """Microphones of one table by file: positions (3,), numbers in the log, and recordings."""
 
     path: Path
     places: dict[str, Floats]
@@ -88,10 +88,10 @@ class Array(NamedTuple):
 
 
 def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
-    """Read a folder; microphones that are left out and what is doubtful is told in the notes.
+    """Read a folder; the notes list skipped microphones and doubtful findings.
 
-    Sounds that too few microphones heard are left out, too. Raises BadInput that names the file where
-    one cannot be used at all, or no sound is left.
+    Sounds that too few microphones heard are skipped too. Raises BadInput with the name of the file if a
+    file cannot be used or no sound remains.
     """
     if not folder.is_dir():
         raise BadInput(
@@ -131,7 +131,7 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
 
 
 def _array(folder: Path, path: Path, table: pd.DataFrame, first_id: int, notes: dict[str, str]) -> Array:
-    """Read what an array's files hold, and where they are; microphones count from `first_id` on."""
+    """Read the files and positions of an array; number its microphones from `first_id`."""
     places = _places(path, table)
     files = _recordings(folder, places, notes)
     if not files:
@@ -158,7 +158,7 @@ def _table(path: Path) -> pd.DataFrame:
 
 
 def _places(path: Path, table: pd.DataFrame) -> dict[str, Floats]:
-    """Read the places (3,) of microphones by file; z is 0 where the table has none."""
+    """Read the positions (3,) of microphones by file; z is 0 if the table has none."""
     axes = [axis for axis in AXES if axis in table.columns]
     found: dict[str, Floats] = {}
     for name, row in zip(table.iloc[:, 0], table[axes].to_numpy(), strict=True):
@@ -181,7 +181,7 @@ def _number(value: Any) -> float:
 
 
 def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -> dict[str, Recorded]:
-    """Read an array's files, by name; what is not there or silent is left out, and told."""
+    """Read an array's files by name; skip missing and silent files with a note."""
     found: dict[str, Recorded] = {}
     for name in at:
         path = folder / name
@@ -205,7 +205,7 @@ def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -
 
 
 def _read(path: Path) -> Recorded:
-    """Read a WAV file of one channel; raises BadInput where it is none, or not whole."""
+    """Read a WAV file with one channel; raise BadInput if it cannot be read or is incomplete."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", wavfile.WavFileWarning)
         warnings.filterwarnings("ignore", r"Chunk \(non-data\)", wavfile.WavFileWarning)
@@ -215,7 +215,7 @@ def _read(path: Path) -> Recorded:
             raise BadInput(f"{path}: cannot be read as a WAV file ({error})") from None
     if samples.ndim != 1:
         raise BadInput(f"{path}: has {samples.shape[1]} channels; give one file for each microphone")
-    if samples.dtype.kind == "u":  # of 8 bits, whose middle is 128
+    if samples.dtype.kind == "u":  # 8-bit samples are centred at 128
         samples = samples.astype(float) - 128.0
     samples = samples.astype(float)
     if not np.isfinite(samples).all():
@@ -224,7 +224,7 @@ def _read(path: Path) -> Recorded:
 
 
 def _begin_ns(path: Path) -> int | None:
-    """Read when a recording began, as its comment says; None where it does not."""
+    """Read when a recording began from its comment; None if it has none."""
     stated = re.search(rb'"recording_start_time": "([^"]+)"', path.read_bytes())
     if stated is None:
         return None
@@ -242,13 +242,13 @@ def _begin_ns(path: Path) -> int | None:
 
 
 def _span_ns(recorded: Recorded, epoch_ns: int) -> tuple[int, int]:
-    """Return when a recording begins and ends; at the epoch where it does not say."""
+    """Return begin and end of a recording; it begins at the epoch if the file does not state a time."""
     begin_ns = epoch_ns if recorded.begin_ns is None else recorded.begin_ns
     return begin_ns, begin_ns + round(len(recorded.samples) / recorded.rate_hz * 1e9)
 
 
 def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) -> Iterator[Sound]:
-    """Yield the sounds of an array: those of the tables of detections, or of its recordings."""
+    """Yield the sounds of an array: those in tables of detections, or its whole recordings."""
     spans = {name: _span_ns(each, epoch_ns) for name, each in array.files.items()}
     has_one = False
     for path, table in tables.items():
@@ -279,7 +279,7 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
 
 
 def _topic(name: str) -> str:
-    """Make a name that a topic may have as one of its parts."""
+    """Replace characters that a topic name cannot have."""
     return re.sub(r"[^\w-]+", "_", name)
 
 
@@ -290,10 +290,10 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """Yield the differences of one sound, and the truth where known; nothing where too few heard it.
+    """Yield the differences of one sound, and the truth if known; nothing if too few microphones hear.
 
-    It is looked for a little longer than it lasts on both sides, as long as sound travels between the
-    microphones. A file that does not cover the sound itself, or is silent there, is left out.
+    The search window is longer than the sound on both sides by the sound's travel time between the
+    microphones. Files that do not cover the sound, or are silent during it, are skipped.
     """
     name = sound.name
     kept: dict[str, Floats] = {}

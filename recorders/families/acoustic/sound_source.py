@@ -1,7 +1,7 @@
-"""Simulates a sound in noise at microphones: recordings, and differences of arrivals in them.
+"""A sound in noise at microphones: simulated recordings, and differences of arrival times from them.
 
-The sound is Gaussian noise in a band that swells and fades; it is weaker with the distance, and comes
-after it by the speed of sound, to a fraction of a sample. Clocks are off by up to half a sample.
+The sound is band-limited Gaussian noise that swells and fades. It gets weaker with distance and is
+delayed by the speed of sound, with sub-sample resolution. Clocks are off by up to half a sample.
 """
 
 from typing import Annotated
@@ -26,12 +26,12 @@ Point = tuple[float, float, float]
 
 
 class SoundSourceParameters(Parameters):
-    """Microphones record a sound.
+    """A sound and the microphones that record it.
 
     Attributes:
-        microphones_m: where the microphones are (x, y, z).
-        reach_m: the source is in a box about the microphones' middle, so far to each side; where all
-            microphones have one height, it has that too.
+        microphones_m: positions of the microphones (x, y, z).
+        reach_m: half side of the box about the microphones' mean position that contains the source; if
+            all microphones have the same height, the source has it too.
         sound_s: length of the sound.
         rate_hz: sampling rate.
         band_hz: lowest and highest frequency of the sound, in Hz.
@@ -55,7 +55,7 @@ class SoundSourceParameters(Parameters):
 
 
 def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Recording:
-    """Record one sound; raises BadInput where its band is none that the rate can hold."""
+    """Record one sound; raise BadInput if the band does not fit the sampling rate."""
     low, high = parameters.band_hz
     if not low < high <= 0.5 * parameters.rate_hz:
         raise BadInput(
@@ -84,7 +84,7 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
 def _recordings(
     parameters: SoundSourceParameters, places: Floats, source: Floats, rng: np.random.Generator
 ) -> Floats:
-    """Simulate what microphones at places (n, 3) record (n, samples), of the same time."""
+    """Simulate simultaneous recordings (n, samples) of microphones at positions (n, 3)."""
     rate_hz, distance_m = parameters.rate_hz, np.linalg.norm(places - source, axis=1)
     arrival_s = distance_m / parameters.speed_of_sound_mps
     sounding = round(parameters.sound_s * rate_hz)

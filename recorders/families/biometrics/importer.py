@@ -1,13 +1,13 @@
-"""Imports score matrices of biometric matchers, as NIST's Biometric Scores Set: a CSV per matcher.
+"""Importer of score matrices of biometric matchers, as in NIST's Biometric Scores Set: one CSV each.
 
-The first row holds the gallery's user ids, the first column the probes'. Matchers are named in the
-parameters, or in a file `matchers.toml` of the folder:
+The first row contains the gallery's user ids, the first column the probes' user ids. Matchers are listed
+in the parameters, or in a file `matchers.toml` in the folder:
 
     [[matchers]]
     name = "face-C"          # the file is face-C.csv
     modality = "face"
     score = "similarity"     # or "distance"
-    failure = -1             # the score of what could not be enrolled
+    failure = -1             # the score of a failure to enrol
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ from fuselog.recorders.recording import Importer, Recording, simulation_stamps_n
 
 
 class Matchers(Parameters):
-    """Holds what matchers.toml says.
+    """Content of matchers.toml.
 
     Attributes:
         matchers: the matchers, in the order of their files.
@@ -43,7 +43,7 @@ class Matchers(Parameters):
 
 
 class ScoreMatricesParameters(Matchers):
-    """States the matchers, and when probes arrive: the data say no times.
+    """The matchers, and the times between probes, which the data do not contain.
 
     Attributes:
         probe_interval_s: time between probes.
@@ -53,7 +53,7 @@ class ScoreMatricesParameters(Matchers):
 
 
 class Matrix(NamedTuple):
-    """Holds one file: ids of probes and gallery, scores (probes, gallery)."""
+    """Content of one file: ids of probes and gallery, scores (probes, gallery)."""
 
     probes: list[str]
     gallery: list[str]
@@ -63,8 +63,8 @@ class Matrix(NamedTuple):
 def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     """Read one matrix per matcher; users are numbered in the order of the files.
 
-    Raises BadInput that names the file where it is missing, malformed, has other users than the first,
-    or contradicts the sense that is declared for its scores.
+    Raises BadInput with the name of the file if it is missing or malformed, has other users than the
+    first file, or contradicts the declared sense of its scores.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: not a folder; give the folder that holds a CSV per matcher")
@@ -125,7 +125,7 @@ def _matrix(path: Path) -> Matrix:
 
 
 def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> None:
-    """Raise BadInput where a matcher tells nothing, or its scores go the other way than declared."""
+    """Raise BadInput if a matcher's scores are uninformative or contradict their declared sense."""
     valid = scores != matcher.failure if matcher.failure is not None else np.ones(scores.shape, bool)
     genuine = np.eye(len(scores), dtype=bool)
     if not valid.any() or np.ptp(scores[valid]) == 0:

@@ -1,7 +1,7 @@
-"""Describes biometric matchers and their scores: each probe with each gallery entry, as columns.
+"""Biometric matchers and their scores of each probe with each gallery entry, as columns.
 
-Probe i and gallery entry i are of the same user. A score stands as the matcher gave it; the stream's
-metadata say which matchers are distances, and what a matcher gives where it could not enrol an image.
+Probe i and gallery entry i are of the same user. Scores are stored as the matcher gave them; the
+stream's metadata state which matchers give distances, and the score that marks a failure to enrol.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,18 +16,18 @@ from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.parameters import Parameters
 
 TOPIC = "/scores"
-# Part of a file's name, of a topic's and of a list.
+# Used in file names, topics and comma-separated lists.
 Name = Annotated[str, Field(pattern=r"^[^/,\s]+$")]
 
 
 class Matcher(Parameters):
-    """Describes a matcher of biometric samples.
+    """A matcher of biometric samples.
 
     Attributes:
-        name: its name.
-        modality: what it looks at, such as face.
-        score: whether a larger score says that two are alike, or that they differ.
-        failure: the score that stands for a failure; without one there are no failures.
+        name: name of the matcher.
+        modality: kind of biometric sample, such as face.
+        score: whether a larger score means more similar or more different samples.
+        failure: score that marks a failure to enrol; if not set, there are no failures.
     """
 
     name: Name
@@ -37,10 +37,10 @@ class Matcher(Parameters):
 
 
 class Comparisons(NamedTuple):
-    """Holds all comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
+    """All comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
 
-    Distances are negated: greater is more alike. `failed` marks the failures to enrol; `arrival_ns`
-    (users,) says when each probe came.
+    Distances are negated, so that a greater score means more similar. `failed` marks failures to enrol;
+    `arrival_ns` (users,) are the arrival times of the probes.
     """
 
     matchers: tuple[Matcher, ...]
@@ -52,12 +52,12 @@ class Comparisons(NamedTuple):
 def score_stream(
     matchers: Sequence[Matcher], scores: NDArray[np.float64], arrival_ns: ArrayLike
 ) -> Stream:
-    """Return the stream of scores (users, users, matchers), probe by probe as they arrive (users,).
+    """Make the stream of scores (users, users, matchers), probe by probe in order of arrival (users,).
 
     Args:
         matchers: the matchers, in the order of the scores' last axis.
         scores: (users, users, matchers), by probe and gallery entry.
-        arrival_ns: (users,), when each probe arrives.
+        arrival_ns: (users,), arrival times of the probes.
 
     Returns:
         The stream, whose metadata describe the matchers.
@@ -83,7 +83,7 @@ def score_stream(
 
 
 def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
-    """Return the matchers that a score stream's metadata name; raises BadInput where they do not fit."""
+    """Return the matchers in a score stream's metadata; raise BadInput if these are inconsistent."""
     keys = ("matchers", "modalities", "senses", "failure_scores")
     try:
         rows = zip(*(metadata[key].split(",") for key in keys), strict=True)
@@ -99,7 +99,7 @@ def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
 
 
 def comparisons_of(stream: Stream) -> Comparisons:
-    """Read a score stream as matrices; raises BadInput where a pair of users lacks or is there twice."""
+    """Read a score stream as matrices; raise BadInput if a pair of users is missing or repeated."""
     matchers = matchers_of(stream.metadata)
     probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
     users = int(max(probe.max(initial=-1), gallery.max(initial=-1))) + 1

@@ -1,7 +1,8 @@
-"""Simulates scores of two face and two finger matchers, alike to NIST BSSR1 set 1.
+"""Simulated scores of two face and two finger matchers, similar to NIST BSSR1 set 1.
 
-A standard normal per comparison goes through a table of knots to a score. The normals have a part of
-the probe's user, a part of the gallery's user and a rest; the tables were fitted to the real scores.
+A standard normal number per comparison is mapped to a score by a table of knots. The normal numbers are
+sums of a part for the probe's user, a part for the gallery's user and a remainder. The tables were
+fitted to the real scores.
 """
 
 from typing import Annotated, NamedTuple
@@ -51,7 +52,7 @@ LOW_GALLERY_SCORES = _knots(
     "54.8 55 55.7 56.5 57.3 57.9 58.5 59.1 59.7 60.3 61.9 70.9 72.2 73 73.8 74.6 75.2 75.5 75.6"
 )
 
-# By matcher: variances of the probe's part, the gallery's and the rest; corr(e_ij, e_ji).
+# By matcher: variances of the parts of probe, gallery and remainder; corr(e_ij, e_ji).
 PROBE_VARIANCE = np.array([0.11, 0.26, 0.15, 0.17])
 GALLERY_VARIANCE = np.array([0.10, 0.08, 0.145, 0.175])
 REST_VARIANCE = np.array([0.79, 0.66, 0.705, 0.655])
@@ -60,7 +61,7 @@ REST_CORRELATION = {"CG": 0.41, "LR": 0.10}
 OTHER_REST_CORRELATION = 0.01
 REST_SPREAD = 0.25
 
-# Of the effects of one user: g on the genuine score, a as a probe, b as a gallery entry.
+# Correlations of a user's effects: g on the genuine score, a as a probe, b as a gallery entry.
 USER_CORRELATION = {
     "gC gG": 0.74, "gC gL": -0.11, "gC gR": -0.04, "gG gL": -0.13, "gG gR": -0.06, "gL gR": 0.45,
     "gC aC": 0.11, "gG aG": 0.24, "gL aL": 0.37, "gR aR": 0.38, "gR aL": 0.22,
@@ -72,15 +73,15 @@ LOWEST = 0.1
 
 
 class BiometricScoresParameters(Parameters):
-    """States how many users and special ones among them there are: by default as of the real 517.
+    """Numbers of users and of special users among them; the defaults are those of the 517 real users.
 
     Attributes:
         users: number of users.
         probe_interval_s: mean time between probes (exponential).
-        failures_to_enrol: how many users of the gallery the first face matcher fails to enrol.
-        low_galleries: for how many users of the gallery the second face matcher has low scores.
+        failures_to_enrol: number of gallery users that the first face matcher fails to enrol.
+        low_galleries: number of gallery users with low scores of the second face matcher.
         poor_fingers_share: share of the users with poor fingers.
-        broken_probes: how many probes have fingers that match nobody.
+        broken_probes: number of probes whose fingers match nobody.
     """
 
     users: Annotated[int, Field(ge=20, le=5000)] = 517
@@ -92,7 +93,7 @@ class BiometricScoresParameters(Parameters):
 
 
 class Users(NamedTuple):
-    """Holds what each user brings to every matcher: standard normals (users, matchers)."""
+    """Effects of each user on every matcher: standard normal numbers (users, matchers)."""
 
     genuine: Floats
     probe: Floats
@@ -100,7 +101,7 @@ class Users(NamedTuple):
 
 
 def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Recording:
-    """Record one run: probes arrive at random times, each compared with the whole gallery."""
+    """Record one run: probes arrive at random times and are compared with the whole gallery."""
     users = _users(parameters, rng)
     count = parameters.users
     scores = np.empty((count, count, len(MATCHERS)))
@@ -124,7 +125,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Draw effects of users; a few have poor fingers, others better ones, so that marginals hold."""
+    """Draw effects of users; a few have poor fingers, the others better ones, to keep the marginals."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
@@ -132,7 +133,7 @@ def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> U
     share = parameters.poor_fingers_share
     quantile = norm.cdf(genuine[:, FINGERS])
     low = (LOWEST - share) / (1 - share)
-    below = quantile * LOWEST / (low or 1.0)  # at the greatest share there are none
+    below = quantile * LOWEST / (low or 1.0)  # zero users at the greatest share
     others = np.where(quantile < low, below, LOWEST + (quantile - low) * (1 - share))
     poor = np.zeros((parameters.users, 1), bool)
     poor[rng.permutation(parameters.users)[: round(share * parameters.users)]] = True
@@ -142,7 +143,7 @@ def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> U
 
 
 def _impostors(users: Users, rng: np.random.Generator) -> Floats:
-    """Draw standard normals (users, users, matchers) of all comparisons, by rank exactly normal."""
+    """Draw standard normal numbers (users, users, matchers) of all comparisons, normalized by rank."""
     from scipy.stats import norm, rankdata  # which take long to import
 
     count = len(users.probe)
@@ -167,7 +168,7 @@ def _impostors(users: Users, rng: np.random.Generator) -> Floats:
 
 
 def _user_correlation() -> Floats:
-    """Return the correlation (12, 12) of g, a and b, made positive semidefinite."""
+    """Return the correlation (12, 12) of g, a and b, projected to a positive semidefinite matrix."""
     names = [effect + matcher for effect in "gab" for matcher in "CGLR"]
     correlation = np.eye(len(names))
     for pair, value in USER_CORRELATION.items():
@@ -180,7 +181,7 @@ def _user_correlation() -> Floats:
 
 
 def _rest_correlation() -> Floats:
-    """Find the correlation (4, 4) of both parts of the rest, so that their sum has the stated one."""
+    """Find the correlation (4, 4) of both parts of the remainder that gives their sum the stated one."""
     correlation = np.full((4, 4), OTHER_REST_CORRELATION)
     for pair, value in REST_CORRELATION.items():
         row, column = ("CGLR".index(name) for name in pair)

@@ -1,7 +1,7 @@
-"""Imports BROAD, the Berlin Robust Orientation Estimation Assessment Dataset: inertial samples, truth.
+"""Importer of BROAD, the Berlin Robust Orientation Estimation Assessment Dataset.
 
-Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021, CC BY 4.0. A trial is one HDF5 file; a file or a folder
-of them is one run, in which every trial has its own topics under the file's name.
+Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021, CC BY 4.0. A trial is one HDF5 file. A file or a folder
+of files is one run, in which every trial has its own topics, prefixed by the name of the file.
 """
 
 from pathlib import Path
@@ -20,16 +20,16 @@ from fuselog.recorders.models.states import ORIENTATION
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording, simulation_stamps_ns
 
-# Dataset and width; None for a plain column.
+# Width of each dataset; None for a one-dimensional one.
 DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement": None}
 
 
 class BroadParameters(Parameters):
-    """States what is refused, and what is reported.
+    """Limits of what is rejected and reported.
 
     Attributes:
-        unit_tolerance: how far the length of a true quaternion may be from 1.
-        gap_s: longer gaps of inertial samples and of truth are counted in the notes.
+        unit_tolerance: largest deviation of a true quaternion's length from 1.
+        gap_s: gaps of inertial samples and of truth longer than this are counted in the notes.
     """
 
     unit_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3
@@ -37,10 +37,10 @@ class BroadParameters(Parameters):
 
 
 def read(path: Path, parameters: BroadParameters) -> Recording:
-    """Read a trial or a folder of trials; samples that are not finite are dropped and told in the notes.
+    """Read a trial or a folder of trials; drop samples that are not finite and count them in the notes.
 
-    The files have no clock of their own: all trials start at the same epoch.
-    Raises BadInput that names the file where it is no HDF5, or lacks or contradicts the truth.
+    The files have no absolute time, so all trials start at the same epoch. Raises BadInput with the name
+    of the file if it is not HDF5, or if the truth is missing or invalid.
     """
     files = sorted(path.glob("*.hdf5")) if path.is_dir() else [path]
     if not files:
@@ -89,7 +89,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
 
 
 def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
-    """Read the datasets of one file, all of one length, and the sampling rate."""
+    """Read the datasets of one file, all of the same length, and the sampling rate."""
     with extra("papers", f"{file}, a file of HDF5"):
         import h5py  # which takes long to import
 
@@ -120,7 +120,7 @@ def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
 def _tell_gaps(
     notes: dict[str, str], what: str, time_ns: NDArray, kept: NDArray[np.bool_], gap_s: float
 ) -> None:
-    """Note how much was dropped, and the gaps that are longer than `gap_s`."""
+    """Note the number of dropped samples, and the gaps that are longer than `gap_s`."""
     if kept.all():
         return
     ends = [time_ns[:1], time_ns[kept], time_ns[-1:]]

@@ -1,4 +1,4 @@
-"""Models two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
+"""Models of two angles modulo 2 pi. Component-first for scalars and arrays, in rad and not wrapped."""
 
 from typing import Annotated
 
@@ -14,9 +14,9 @@ Correlation = Annotated[float, Field(gt=-1, lt=1)]
 def turn_together(
     x1: Component, x2: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """Return two headings that turn with each other, x+ = x + c (cos x2, sin x1) + drift, without noise.
+    """Compute the next values of two coupled headings, x + c (cos x2, sin x1) + drift, without noise.
 
-    The system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular
+    This is the system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular
     Estimation", 2016, section IV.
     """
     return x1 + coupling * np.cos(x2) + drift1, x2 + coupling * np.sin(x1) + drift2
@@ -25,13 +25,13 @@ def turn_together(
 def turn_on(
     direction: Component, turn: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """Return a direction a step later, and its turn, of which a part remains; without noise.
+    """Compute the next direction, and the next turn, of which a part remains; without noise.
 
-    The turn is an angle too: by how much more than half a turn cannot be told from the other way round.
+    The turn is an angle too: a turn by more than half a revolution is the same as the opposite turn.
     """
     return direction + turn + drift1, coupling * np.sin(turn) + drift2
 
 
 def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
-    """Return the covariance (2, 2) of two numbers with one standard deviation."""
+    """Return the covariance (2, 2) of two numbers with the same standard deviation."""
     return sigma**2 * np.array([[1.0, correlation], [correlation, 1.0]])

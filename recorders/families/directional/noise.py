@@ -1,4 +1,4 @@
-"""Draws exact noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
+"""Exact noise of axes and orientations: Bingham distributions, and Gaussians projected to the sphere."""
 
 from typing import Literal, Self
 
@@ -13,13 +13,13 @@ _MOST_NEWTON_STEPS = 50
 
 
 def saddlepoint(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """Find the root t > 0 (...) of sum_k 1 / (2 (t - z_k)) = 1 for concentrations z (..., d), max 0.
+    """Find the root t > 0 (...) of sum_k 1 / (2 (t - z_k)) = 1 for concentrations z (..., d), maximum 0.
 
-    It centres the saddlepoint approximation of the normalisation constant (Kume and Wood, Biometrika 92,
-    2005) and, as b = 2 t, tunes the envelope of the sampler below.
+    It is the centre of the saddlepoint approximation of the normalization constant (Kume and Wood,
+    Biometrika 92, 2005) and, with b = 2 t, tunes the envelope of the sampler below.
     """
     z = np.asarray(concentrations, float)
-    # the sum is convex and falling, so that Newton's steps from 1/2, left of the root, never overshoot
+    # the sum is convex and decreasing, so Newton steps from 1/2, left of the root, never overshoot
     t = np.full(z.shape[:-1], 0.5)
     for _ in range(_MOST_NEWTON_STEPS):
         inverse = 0.5 / (t[..., None] - z)
@@ -33,19 +33,20 @@ def saddlepoint(concentrations: ArrayLike) -> NDArray[np.float64]:
 def sample_bingham(
     axes: ArrayLike, concentrations: ArrayLike, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw one (..., d) of each Bingham distribution, axes (..., d, d) and concentrations (..., d).
+    """Draw one sample (..., d) from each Bingham distribution.
 
     Exact rejection sampling under an angular central Gaussian envelope (Kent, Ganeiban, Mardia, "A new
-    unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018);
-    at least 44 % of the proposals are taken. For many samples of one distribution broadcast it.
+    unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018),
+    which accepts at least 44 % of the proposals. To draw many samples from one distribution, broadcast
+    it.
 
     Args:
         axes: (..., d, d), the principal axes as columns.
-        concentrations: (..., d), those along the axes, finite.
-        generator: draws the proposals.
+        concentrations: (..., d), finite, along these axes.
+        generator: random numbers for the proposals.
 
     Returns:
-        (..., d), of unit length.
+        Unit vectors (..., d).
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):
@@ -79,28 +80,28 @@ def sample_projected_gaussian(
     shape: tuple[int, ...],
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Draw (*shape, d) of a Gaussian in R^d, each scaled to unit length.
+    """Draw (*shape, d) samples from a Gaussian in R^d, each scaled to unit length.
 
     Args:
         mean: (d,).
         covariance: (d, d).
-        shape: how many are drawn.
-        generator: draws them.
+        shape: shape of the samples.
+        generator: random numbers.
 
     Returns:
-        (*shape, d), of unit length.
+        Unit vectors (*shape, d).
     """
     drawn = generator.multivariate_normal(mean, covariance, shape, method="eigh")
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
 class DirectionalNoise(Parameters):
-    """Describes a distribution of unit vectors, along the components of a complex number or quaternion.
+    """A distribution of unit vectors, along the components of a complex number or quaternion.
 
     Attributes:
-        distribution: of which kind it is; samples of a Gaussian are scaled to unit length.
-        diagonal: of a Bingham distribution the concentrations: 0 for its mode, at most 0 for the others;
-            of a Gaussian the variances about the identity (1, 0, ...).
+        distribution: kind of distribution; samples of a Gaussian are scaled to unit length.
+        diagonal: concentrations of a Bingham distribution, 0 for the mode and at most 0 for the others;
+            or variances of a Gaussian about the identity (1, 0, ...).
     """
 
     distribution: Literal["bingham", "gaussian"] = "bingham"

@@ -1,7 +1,7 @@
-"""Simulates axes in the plane and orientations in space that turn at random, measured with noise.
+"""Axes in the plane and orientations in space that rotate at random, measured with noise.
 
-x+ = x (+) w and z = x (+) v, with Bingham noise or Gaussian noise scaled to unit length; the evaluation
-of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, section 7. The
+x+ = x (+) w and z = x (+) v, with Bingham noise or Gaussian noise scaled to unit length: the evaluation
+in Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, section 7. The
 measurements' channel states the noise and the prior as JSON.
 """
 
@@ -20,15 +20,15 @@ from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_
 
 
 class AxisParameters(Parameters):
-    """Describes the paper's two-dimensional evaluation, (54)-(56); truth starts off the prior's mode.
+    """The paper's two-dimensional evaluation, (54)-(56); the true start differs from the prior's mode.
 
     Attributes:
         steps: number of time steps.
         step_s: length of a time step.
         start: true orientation at the start, a unit vector.
         prior: distribution of the orientation at the start, as filters assume it.
-        system: distribution of what a step turns by.
-        measurement: distribution of what a measurement is turned by.
+        system: distribution of the rotation in a step.
+        measurement: distribution of the rotation by which a measurement is wrong.
     """
 
     steps: PositiveInt = 100
@@ -56,7 +56,7 @@ class AxisParameters(Parameters):
 
 
 class OrientationParameters(AxisParameters):
-    """Describes the paper's four-dimensional evaluation, (61)-(65)."""
+    """The paper's four-dimensional evaluation, (61)-(65)."""
 
     start: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
     prior: DirectionalNoise = DirectionalNoise(diagonal=(-1.0, -1.0, -1.0, 0.0))

@@ -1,4 +1,4 @@
-"""Simulates two headings that turn with each other, and correlated measurements of both, mod 2 pi.
+"""Two coupled headings, and correlated measurements of both, modulo 2 pi.
 
 x+ = x + c (cos x2, sin x1) + drift + w and z = x + v: the system of Kurz and Hanebeck, "Deterministic
 Sampling on the Torus for Bivariate Circular Estimation", 2016, section IV, with noise. The measurements'
@@ -21,15 +21,15 @@ HEADINGS = ("heading1_rad", "heading2_rad")
 
 
 class HeadingsParameters(Parameters):
-    """Two headings turn each other.
+    """Two coupled headings and their measurements.
 
     Attributes:
         steps: number of time steps.
         step_s: length of a time step.
-        coupling_rad: per step the first heading turns by this times the cosine of the second, the second
-            by this times the sine of the first.
-        drift1_rad: by how much the first heading turns per step besides.
-        drift2_rad: by how much the second heading turns per step besides.
+        coupling_rad: in each step, the first heading turns by this times the cosine of the second, and
+            the second by this times the sine of the first.
+        drift1_rad: additional turn of the first heading per step.
+        drift2_rad: additional turn of the second heading per step.
         system_sigma_rad: standard deviation of a heading's noise per step.
         system_correlation: correlation of the two headings' noises.
         measurement_sigma_rad: standard deviation of a measured heading.

@@ -1,8 +1,8 @@
-"""Models the line of sight of an optical sensor whose attitude may be biased.
+"""Models of the line of sight of an optical sensor whose attitude may be biased.
 
-Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements
-with Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an
-array whose first axis is the component; components are numbers or arrays and broadcast.
+Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements with
+Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an array
+whose first axis is the component; components are numbers or arrays and broadcast.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from fuselog.recorders.models.planar import Component, Components
 
 Triple = tuple[Component, Component, Component]
 ANGLES = ("yaw", "pitch", "roll")
-SENSORS, TARGETS = 3, 2  # that move; those that stand may be as many as wanted
+SENSORS, TARGETS = 3, 2  # moving ones; the number of static ones is not limited
 
 
 def azimuth_elevation(x: Components) -> tuple[Component, Component]:
-    """Compute angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3), atan2."""
+    """Compute the angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3), atan2."""
     return np.arctan2(x[0], x[2]), np.arctan2(x[1], np.hypot(x[0], x[2]))
 
 
 def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
-    """Compute gradients in rad/m of azimuth, elevation by `x`; eqs (71)-(76), (74) root mended."""
+    """Compute gradients (rad/m) of azimuth and elevation by `x`; eqs (71)-(76), with (74) corrected."""
     ground = np.hypot(x[0], x[2])
     squared = ground**2 + x[1] ** 2
     azimuth = (x[2] / ground**2, 0.0 * x[1], -x[0] / ground**2)
@@ -29,10 +29,10 @@ def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
 
 
 def rotate(attitude: Components, x: Components) -> Triple:
-    """Turn `x` into the frame of a sensor with attitude (yaw, pitch, roll) in rad.
+    """Rotate `x` into the frame of a sensor with attitude (yaw, pitch, roll) in rad.
 
-    That is Rz(yaw) Ry(pitch) Rx(roll) x with active rotations, as the paper's appendix and tables have
-    it; its eq (1) is this with every angle negated.
+    That is Rz(yaw) Ry(pitch) Rx(roll) x with active rotations, as in the paper's appendix and tables;
+    its eq (1) has every angle negated.
     """
     yaw, pitch, roll = attitude
     return _about_z(yaw, _about_y(pitch, _about_x(roll, x)))
@@ -50,8 +50,8 @@ def line_of_sight_gradients(
 ) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
     """Compute gradients of azimuth and elevation by target (rad/m) and yaw, pitch, roll (rad/rad).
 
-    The chain rule backwards through the three rotations; equals eqs (45)-(103) of the appendix once
-    its misprints in (67), (74), (89), (92) and (102) are mended.
+    The chain rule is applied backwards through the three rotations. The result equals eqs (45)-(103) of
+    the appendix with the misprints in (67), (74), (89), (92) and (102) corrected.
     """
     yaw, pitch, roll = attitude
     offset = _subtract(target, sensor)
@@ -73,7 +73,7 @@ def line_of_sight_gradients(
 
 
 def direction(azimuth: Component, elevation: Component, attitude: Components) -> Triple:
-    """Compute the unit vector, in the common frame, along which a sensor sees these angles."""
+    """Compute the unit vector in the common frame along which a sensor sees these angles."""
     yaw, pitch, roll = attitude
     level = np.cos(elevation)
     seen = (level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth))
@@ -83,8 +83,8 @@ def direction(azimuth: Component, elevation: Component, attitude: Components) ->
 def turning_vector(attitude: Components, change: Components) -> Triple:
     """Compute the small rotation of the scene, in the common frame, that a change of attitude hides.
 
-    When the scene turns by it about the sensor while the attitude changes by `change` (yaw, pitch,
-    roll), the sensor sees what it saw before.
+    If the scene rotates by it about the sensor while the attitude changes by `change` (yaw, pitch,
+    roll), the sensor's measurements stay the same.
     """
     _, pitch, roll = attitude
     yawed, pitched, rolled = change
@@ -129,5 +129,5 @@ def moving_target_components(target: int) -> list[str]:
 
 
 def clock_component(sensor: int) -> str:
-    """Return the name of how far a sensor's clock is ahead, in a state."""
+    """Return the name of a sensor's clock offset (positive if ahead) in a state."""
     return f"sensor_{sensor}_clock_s"

@@ -1,9 +1,9 @@
-"""Simulates optical sensors on aircraft: each has its own clock, and is turned by biases that drift.
+"""Optical sensors on aircraft, with clock offsets and drifting attitude biases.
 
-Sensors fly at known poses, straight or weaving, and see the targets in turn, each at times of its own.
-The frame is that of `fuselog.recorders.families.los.models`: y points up, and a sensor looks ahead,
-along its own z. All white noise that drives targets and biases is continuous, so that they are exact at
-any time.
+Sensors fly at known poses, straight or weaving, and see the targets in turn, each sensor at its own
+times. The frame is that of `fuselog.recorders.families.los.models`: y points up, and a sensor looks
+ahead, along its own z. The white noise that drives targets and biases is continuous, so that they are
+exact at any time.
 """
 
 from typing import Annotated, NamedTuple
@@ -35,30 +35,30 @@ Triple = tuple[float, float, float]
 Sensors = Annotated[list[Triple], Field(min_length=2, max_length=SENSORS)]
 Targets = Annotated[list[Triple], Field(min_length=TARGETS, max_length=TARGETS)]
 
-FIRST_S = 0.5  # before the first sighting, and so before any clock that is off
+FIRST_S = 0.5  # time before the first sighting, longer than any clock offset
 
 
 class MovingOpticalParameters(Parameters):
-    """Sensors on aircraft see targets; their attitudes and clocks err.
+    """Sensors on aircraft with attitude and clock errors, and the targets that they see.
 
     Attributes:
         duration_s: length of the run.
-        sensor_position_m: where the sensors start (x, y, z).
+        sensor_position_m: initial positions of the sensors (x, y, z).
         velocity_mps: mean velocity of all sensors (x, y, z).
-        weave_m: by how much each sensor weaves to both sides; it turns with its course.
-        weave_period_s: time of one weave.
-        target_position_m: where the targets are expected to start (x, y, z).
-        target_velocity_mps: velocities of the targets that are expected at the start (x, y, z).
+        weave_m: amplitude of each sensor's weaving; the sensor turns with its course.
+        weave_period_s: period of the weaving.
+        target_position_m: expected initial positions of the targets (x, y, z).
+        target_velocity_mps: expected initial velocities of the targets (x, y, z).
         prior_sigma_m: standard deviation of a target's position in the prior, per axis.
         prior_sigma_mps: standard deviation of a target's velocity in the prior, per axis.
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
-        sightings_hz: how many times a second every sensor sees a target, one after the other.
+        sightings_hz: sightings per second of each sensor, of one target after the other.
         sigma_rad: standard deviation of azimuth and elevation.
-        bias_sigma_rad: standard deviation of the true biases of attitude, per axis.
+        bias_sigma_rad: standard deviation of the true attitude biases, per axis.
         bias_drift: random walk of these biases, in rad/sqrt(s).
-        clock_sigma_s: standard deviation of the true offset of every sensor's clock but the first's.
-        known_sigma_m: the first target reports its position once a second with this standard deviation
-            per axis; without one it does not.
+        clock_sigma_s: standard deviation of the true clock offset of every sensor except the first.
+        known_sigma_m: standard deviation per axis of the position that the first target reports once a
+            second; if not set, it does not report.
     """
 
     duration_s: Annotated[float, Field(gt=1)] = 60.0
@@ -80,19 +80,19 @@ class MovingOpticalParameters(Parameters):
 
 
 class Course(NamedTuple):
-    """Holds the truth at some times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
+    """The truth at times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
 
     times_s: Floats
     targets: Floats
     bias_rad: Floats
 
     def rows(self, times_s: Floats) -> NDArray[np.int64]:
-        """Return the rows of times that are among its own."""
+        """Return the rows of some of its times."""
         return np.searchsorted(self.times_s, times_s)
 
 
 def simulate(parameters: MovingOpticalParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput where there is not one weave for each sensor."""
+    """Record one run; raise BadInput if there is not one weave amplitude per sensor."""
     sensors = len(parameters.sensor_position_m)
     if len(parameters.weave_m) != sensors:
         raise BadInput(
@@ -130,10 +130,10 @@ def _course(
     bias_rad: Floats,
     rng: np.random.Generator,
 ) -> Course:
-    """Draw targets under white accelerations and biases that walk at random, from the start on."""
+    """Draw targets with white accelerations and biases with random walks, from given initial values."""
     steps_s = np.diff(times_s)
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, steps_s)
-    roots = np.zeros((len(steps_s), 2, 2))  # of a place and its velocity: root root' is their covariance
+    roots = np.zeros((len(steps_s), 2, 2))  # root root' is the covariance of a position and its velocity
     roots[:, 1, 1] = np.sqrt(speed)
     with np.errstate(invalid="ignore"):
         roots[:, 0, 1] = np.nan_to_num(mixed / np.sqrt(speed))
@@ -155,7 +155,7 @@ def _target_names() -> list[str]:
 
 
 def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
-    """Make the stream of targets, biases and clocks."""
+    """Make the stream of true targets, biases and clock offsets."""
     rows, sensors = course.rows(times_s), len(clocks_s)
     names = [
         *_target_names(),
@@ -170,7 +170,7 @@ def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
 
 
 def _fixes(course: Course, times_s: Floats, sigma_m: float | None, rng: np.random.Generator) -> Stream:
-    """Simulate where the first target says that it is: a topic without messages where it does not."""
+    """Simulate the first target's reported positions; the topic is empty if it does not report."""
     rows, known_m = (course.rows(times_s), sigma_m) if sigma_m else (np.empty(0, np.int64), 1.0)
     measured = course.targets[rows, 0, :3] + known_m * rng.normal(size=(len(rows), 3))
     return fix_stream("/target1/fix", simulation_stamps_ns(course.times_s[rows]), measured, known_m**2)
@@ -207,7 +207,7 @@ def _sightings(
 
 
 def _poses(parameters: MovingOpticalParameters, number: int, times_s: Floats) -> tuple[Floats, Rotation]:
-    """Compute places (n, 3) of a sensor, and how it is turned: ahead along its course."""
+    """Compute the positions (n, 3) of a sensor, and its attitude along its course."""
     velocity, turn_radps = np.array(parameters.velocity_mps), 2.0 * np.pi / parameters.weave_period_s
     aside = np.cross([0.0, 1.0, 0.0], velocity / np.linalg.norm(velocity))
     phase = turn_radps * times_s[:, None]

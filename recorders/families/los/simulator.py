@@ -1,8 +1,8 @@
-"""Simulates optical sensors with biased attitudes that see targets: lines of sight, truth.
+"""Optical sensors with biased attitudes that see targets: lines of sight, truth.
 
-Belfadel, Osborne and Bar-Shalom, JAIF 2014. Sensors stand at known places; their true attitude is the
-nominal one plus a bias. Targets are points, seen one after another, as those of one trajectory, or all
-at once. The frame is the paper's: y points up.
+Belfadel, Osborne and Bar-Shalom, JAIF 2014. Sensors are at known positions; their true attitude is the
+nominal attitude plus a bias. Targets are points, seen one after another (as the points of one
+trajectory) or all at the same time. The frame is the paper's: y points up.
 """
 
 from typing import Annotated
@@ -26,21 +26,20 @@ Triples = Annotated[list[Triple], Field(min_length=1)]
 
 
 class OpticalParameters(Parameters):
-    """States sensors, targets and what is seen.
+    """Sensors, targets and sightings.
 
     Attributes:
-        sensor_position_m: where the sensors are (x, y, z).
-        target_position_m: where the targets are (x, y, z).
-        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row for each or for all;
-            without any all are 0.
+        sensor_position_m: positions of the sensors (x, y, z).
+        target_position_m: positions of the targets (x, y, z).
+        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row for each or for all; 0
+            if not set.
         bias_deg: yaw, pitch and roll by which each sensor's true attitude differs, one row for each or
-            for all; without any all are 0.
+            for all; 0 if not set.
         sigma_rad: standard deviation of azimuth and elevation.
         interval_s: time between sightings.
         passes: number of passes over all targets.
-        all_at_once: whether all targets are seen at once; else one after the other.
-        field_of_view_deg: a sensor sees what is inside a cone of this angle about the middle of the
-            targets.
+        all_at_once: whether all targets are seen at the same time; otherwise one after another.
+        field_of_view_deg: opening angle of the cone about the centre of the targets that a sensor sees.
         dropout_probability: probability that a sighting is lost.
     """
 
@@ -57,12 +56,12 @@ class OpticalParameters(Parameters):
 
     @property
     def nominal_attitude_rad(self) -> Array:
-        """Return how the sensors were meant to be turned, (sensors, 3)."""
+        """Return the nominal attitudes of the sensors, (sensors, 3)."""
         return self._per_sensor("nominal_attitude_deg", self.nominal_attitude_deg)
 
     @property
     def bias_rad(self) -> Array:
-        """Return by how much they are turned otherwise, (sensors, 3)."""
+        """Return the attitude biases of the sensors, (sensors, 3)."""
         return self._per_sensor("bias_deg", self.bias_deg)
 
     def _per_sensor(self, name: str, given_deg: list[Triple] | None) -> Array:
@@ -76,7 +75,7 @@ class OpticalParameters(Parameters):
 
 
 def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput where there is not one attitude and one bias for each sensor."""
+    """Record one run; raise BadInput if the numbers of attitudes or biases do not match the sensors."""
     sensors = np.array(parameters.sensor_position_m)
     targets = np.array(parameters.target_position_m)
     nominal, bias = parameters.nominal_attitude_rad, parameters.bias_rad
@@ -91,14 +90,14 @@ def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recordi
 
 
 def _look_times(parameters: OpticalParameters, targets: int) -> NDArray[np.int64]:
-    """Choose when each target is looked at in each pass, (passes, targets)."""
+    """Compute when each target is seen in each pass, (passes, targets)."""
     per_pass = 1 if parameters.all_at_once else targets
     look = np.arange(parameters.passes)[:, None] * per_pass + np.arange(targets) % per_pass
     return simulation_stamps_ns(look * parameters.interval_s)
 
 
 def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
-    """State where all targets are, and the biases, at every look."""
+    """Make the stream of true target positions and biases, at the time of every sighting."""
     components = [
         *(name for number in range(1, len(targets) + 1) for name in target_components(number)),
         *(name for number in range(1, len(bias) + 1) for name in bias_components(number)),
@@ -109,7 +108,7 @@ def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
 
 
 def _mounting(number: int, place: Array, attitude: Array) -> list[Stream]:
-    """State where a sensor stands, known exactly, and how it was meant to be turned."""
+    """Make the streams of a sensor's position, known exactly, and of its nominal attitude."""
     to_sensor = Rotation.from_euler("ZYX", attitude)
     start_ns = [SIMULATION_EPOCH_NS]
     return [
@@ -132,7 +131,7 @@ def _sightings(
     looks_ns: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Stream:
-    """Simulate the lines of sight of one sensor, a message per target seen."""
+    """Simulate the lines of sight of one sensor, one message per target seen."""
     true = np.stack(line_of_sight(targets.T, place[:, None], attitude), axis=-1)
     noise = parameters.sigma_rad * rng.normal(size=(*looks_ns.shape, 2))
     seen = _in_view(parameters, place, targets) & (
@@ -155,7 +154,7 @@ def _sightings(
 
 
 def _in_view(parameters: OpticalParameters, place: Array, targets: Array) -> NDArray[np.bool_]:
-    """Tell which targets (n,) a sensor can see; never one that it stands on."""
+    """Find the targets (n,) that a sensor can see; a target at its own position is never visible."""
     offset = targets - place
     distance = np.linalg.norm(offset, axis=1)
     away = distance > 0.0

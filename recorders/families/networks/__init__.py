@@ -1,5 +1,4 @@
-"""Simulates a room of networked nodes that follow one target; begin with `ispace`.
+"""Simulator of a room of networked nodes that track one target; begin with `ispace`.
 
-It has nothing else: robots and inertial units that share estimates are imported by
-`fuselog.recorders.importers`.
+Robots and inertial units that share estimates are imported by `fuselog.recorders.importers`.
 """

@@ -1,8 +1,9 @@
-"""Simulates a room of networked sensor nodes that follow one moving thing: DIND nodes.
+"""A room of networked sensor nodes that track one moving target: DIND nodes.
 
-Jin, Lee, Hashimoto, DIND networks, sections 3 to 5; the room's numbers are ours, the paper prints none.
-Every node hears the thing with a sensor and at a rate of its own, sends what it knows over directed
-links, and loses messages. What it sends depends on the estimator, so the log holds the link events only.
+Jin, Lee, Hashimoto, DIND networks, sections 3 to 5. The paper states no numbers for the room, so these
+are ours. Every node observes the target with its own sensor and rate, sends its estimate over directed
+links, and loses messages. The content of a message depends on the estimator, so the log contains only
+the link events.
 """
 
 from typing import Annotated
@@ -24,14 +25,14 @@ Index = Annotated[int, Field(ge=1)]
 
 
 class Node(Parameters):
-    """States what the sensor of a node is like.
+    """The sensor of a node.
 
     Attributes:
-        components: those of the state that it measures.
+        components: measured components of the state.
         sigmas: standard deviations of these components, in their units.
-        every_steps: it measures at the first step and then at every so many.
-        acceleration_density: power spectral density of the acceleration that the node's own motion model
-            assumes, in m^2/s^3; without one, the true one.
+        every_steps: number of steps between measurements, the first of which is at the first step.
+        acceleration_density: power spectral density of the acceleration in the node's own motion model,
+            in m^2/s^3; the true density if not set.
     """
 
     components: tuple[str, ...] = ("x_m", "y_m")
@@ -49,12 +50,12 @@ ROOM = (
 
 
 class NodeOutage(Parameters):
-    """During this span a node neither measures nor sends nor receives.
+    """A time span in which a node neither measures nor sends nor receives.
 
     Attributes:
         node: number of the node, from 1.
-        start_s: when the span begins, since the run's epoch.
-        end_s: when the span ends, since the run's epoch.
+        start_s: begin of the span, since the run's epoch.
+        end_s: end of the span, since the run's epoch.
     """
 
     node: Index
@@ -63,24 +64,24 @@ class NodeOutage(Parameters):
 
 
 class IspaceParameters(Parameters):
-    """Sensor nodes in a room, with links between them, follow a target that moves there.
+    """Sensor nodes in a room with links between them, and the target that they track.
 
     Attributes:
         steps: number of time steps.
         step_s: length of a time step.
         acceleration_density: power spectral density of the target's acceleration, in m^2/s^3.
-        start: mean of the target's start (x, y, vx, vy), in m and m/s.
-        start_sigma: standard deviations of the start, in m and m/s.
+        start: mean of the target's initial state (x, y, vx, vy), in m and m/s.
+        start_sigma: standard deviations of the initial state, in m and m/s.
         nodes: the sensor of each node.
         links: pairs of nodes, by number from 1, that are linked in both directions.
-        random_nodes: above 0 every run has another graph instead: a ring of so many nodes, which have
-            the sensors of `nodes` in turn.
-        random_chords: number of further links in a random graph.
+        random_nodes: number of nodes of a random graph; if above 0, every run has another ring of this
+            many nodes, which use the sensors of `nodes` in turn.
+        random_chords: number of additional links in a random graph.
         loss_probability: probability that a message over a link is lost.
         duplicate_probability: probability that a message over a link arrives twice.
-        delay_s: least time that a message takes over a link.
-        delay_jitter_s: mean of the random time that a message takes beyond this (exponential).
-        outages: spans in which a node is out of work.
+        delay_s: shortest delay of a message over a link.
+        delay_jitter_s: mean of the random delay in addition to this (exponential).
+        outages: time spans in which a node is out of service.
     """
 
     steps: PositiveInt = 100
@@ -100,7 +101,7 @@ class IspaceParameters(Parameters):
 
 
 def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recording:
-    """Record one run. Raises BadInput where a link or an outage names a node that is not there."""
+    """Record one run; raise BadInput if a link or an outage refers to an unknown node."""
     truth_rng, sensor_rng, link_rng, graph_rng = rng.spawn(4)
     nodes, links = _network(parameters, graph_rng)
     _check(parameters, len(nodes), links)
@@ -142,7 +143,7 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
 def _network(
     parameters: IspaceParameters, rng: np.random.Generator
 ) -> tuple[list[Node], NDArray[np.int64]]:
-    """Draw the nodes, and the directed links (m, 2) by number."""
+    """Return the nodes, and the directed links (m, 2) by number; draw them if the graph is random."""
     count = parameters.random_nodes
     if count == 0:
         nodes = list(parameters.nodes)
@@ -190,7 +191,7 @@ def _link_events(
     times_s: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Stream:
-    """Simulate the messages of every link at every step; lost ones have the time of their loss."""
+    """Simulate the messages of every link at every step; a lost message has the time of its loss."""
     sender, receiver = np.tile(links, (len(times_s), 1)).T
     sent_s = np.repeat(times_s, len(links))
     delay_s = parameters.delay_s + parameters.delay_jitter_s * rng.exponential(size=len(sent_s))

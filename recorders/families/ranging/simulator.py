@@ -1,8 +1,8 @@
-"""Simulates a trolley in a warehouse whose tags measure ranges to anchors on the walls.
+"""A trolley in a warehouse whose tags measure ranges to anchors on the walls.
 
-It moves as the model `ranging-pose` says: accelerations are white. Ranges err by white noise, by a
-common bias, by an error of each anchor that lasts for seconds (a first-order Gauss-Markov process, the
-same for all tags), and where something stands in the line of sight: then they are too long.
+It moves as in the model `ranging-pose`, with white accelerations. Ranges have white noise, a common
+bias, a slowly varying error per anchor (a first-order Gauss-Markov process, the same for all tags), and
+an excess if the line of sight is blocked.
 """
 
 from typing import Annotated
@@ -26,13 +26,13 @@ POSE = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "turn_radps")
 
 
 class Blocked(Parameters):
-    """Lines of sight are blocked at times; an anchor is blocked for all tags at once.
+    """Temporarily blocked lines of sight; an anchor is blocked for all tags at the same time.
 
     Attributes:
         times_per_minute: mean number of times per minute that an anchor is blocked.
-        duration_s: mean time for which it is.
-        least_m: by how much ranges are then too long at least.
-        most_m: by how much ranges are then too long at most; uniformly between.
+        duration_s: mean duration of a blockage.
+        least_m: smallest excess of a blocked range.
+        most_m: largest excess of a blocked range; excesses are uniform between both.
     """
 
     times_per_minute: NonNegativeFloat = 0.0
@@ -42,28 +42,28 @@ class Blocked(Parameters):
 
 
 class RangingParameters(Parameters):
-    """Tags on a trolley measure ranges to anchors, with errors, while it moves.
+    """Tags on a moving trolley that measure ranges to anchors, and their errors.
 
-    Anchors and tags are numbered from 0; all tags measure ranges to all anchors at once. Channels state
-    the white noise of ranges alone.
+    Anchors and tags are numbered from 0. All tags measure ranges to all anchors at the same time.
+    Channels state only the white noise of ranges.
 
     Attributes:
         duration_s: length of the run.
         rate_hz: measurements per second.
-        anchors_m: where the anchors are (x, y, z).
-        tags_m: where the tags are on the trolley (forward, left, up).
+        anchors_m: positions of the anchors (x, y, z).
+        tags_m: positions of the tags on the trolley (forward, left, up).
         height_m: height of the trolley.
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
         sigma_range_m: standard deviation of a range's white noise.
-        bias_range_m: all ranges are too long by so much.
-        error_sigma_m: standard deviation of a lasting error of every pair of anchor and tag.
-        error_time_s: for about how long such an error lasts.
+        bias_range_m: bias of all ranges.
+        error_sigma_m: standard deviation of the slowly varying error of every anchor.
+        error_time_s: correlation time of such an error.
         blocked: blocked lines of sight.
-        start_sigma_m: standard deviation of the position at the start, per axis.
-        start_sigma_rad: standard deviation of the heading at the start.
-        start_sigma_mps: standard deviation of the velocity at the start, per axis.
-        start_sigma_radps: standard deviation of the turn rate at the start.
+        start_sigma_m: standard deviation of the initial position, per axis.
+        start_sigma_rad: standard deviation of the initial heading.
+        start_sigma_mps: standard deviation of the initial velocity, per axis.
+        start_sigma_radps: standard deviation of the initial turn rate.
     """
 
     duration_s: Annotated[float, Field(gt=0)] = 60.0
@@ -92,7 +92,7 @@ class RangingParameters(Parameters):
 
 
 def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput without anchors or tags."""
+    """Record one run; raise BadInput if there are no anchors or no tags."""
     for name in ("anchors_m", "tags_m"):
         if not getattr(parameters, name):
             raise BadInput(f"{name} is empty; give one point or more, such as [[0, 0, 2]]")
@@ -186,7 +186,7 @@ def _lasting(
 
 
 def _excess(blocked: Blocked, times_s: Floats, anchors: int, rng: np.random.Generator) -> Floats:
-    """Draw by how much blocked ranges are too long (times, anchors)."""
+    """Draw the excess of blocked ranges (times, anchors)."""
     excess = np.zeros((len(times_s), anchors))
     for anchor in range(anchors):
         count = rng.poisson(blocked.times_per_minute * times_s[-1] / 60.0)

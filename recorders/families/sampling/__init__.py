@@ -1,4 +1,4 @@
-"""Simulates the systems of the S2KF paper: a batch reactor and an extended target.
+"""Simulators of the systems in the S2KF paper: a batch reactor and an extended target.
 
-Begin with `reactor`. The samplings are in `fuselog.replay.inference.sampling`.
+Begin with `reactor`. The sampling schemes are in `fuselog.replay.inference.sampling`.
 """

@@ -1,4 +1,4 @@
-"""Models an axis-aligned rectangle of which a sensor sees one noisy point at a time.
+"""Models of an axis-aligned rectangle of which a sensor sees one noisy point at a time.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION
@@ -11,15 +11,15 @@ SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 
 
 def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
-    """Return the rectangle's point at `scale` times the half sides, each in [-1, 1], from the centre."""
+    """Compute the rectangle's point at `scale` times the half sides from the centre, each in [-1, 1]."""
     return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
 
 
 def quadratic(point: Components) -> tuple[Component, Component, Component, Component]:
-    """Return a point and its squares, without which a linear filter learns nothing of the size."""
+    """Return a point and its squares, which a linear filter needs to estimate the size."""
     return point[0], point[1], point[0] * point[0], point[1] * point[1]
 
 
 def area_m2(target: Components) -> Component:
-    """Compute the rectangle's area; a half side's sign, which no sensor sees, changes its sign."""
+    """Compute the rectangle's area; its sign follows the half sides' signs, which are unobservable."""
     return 4.0 * target[0] * target[1]

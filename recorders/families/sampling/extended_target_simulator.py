@@ -1,7 +1,7 @@
-"""Simulates a rectangle that stands still, of which one noisy surface point is seen per time step.
+"""A static rectangle of which a sensor sees one noisy surface point per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section VI.B: points are uniform over the surface, their noise is Gaussian.
+section VI.B: points are uniform over the surface with Gaussian noise.
 """
 
 from typing import Annotated
@@ -20,7 +20,7 @@ Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
 class ExtendedTargetParameters(Parameters):
-    """States a rectangle, the points that are measured of it, and what a filter assumes.
+    """A rectangle, its measured points, and the assumptions of a filter.
 
     Attributes:
         points: number of points, one per time step.

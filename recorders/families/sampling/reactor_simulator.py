@@ -1,4 +1,4 @@
-"""Simulates a batch reactor whose total pressure is read once per time step.
+"""A batch reactor whose total pressure is measured once per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A. The prior is the paper's, far from the truth and the same in every run.
@@ -21,7 +21,7 @@ Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
 class ReactorParameters(Parameters):
-    """States partial pressures of a gas reaction, in the paper's units.
+    """Partial pressures of a gas reaction, in the paper's units.
 
     Attributes:
         steps: number of time steps.

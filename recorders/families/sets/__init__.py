@@ -1,4 +1,4 @@
-"""Simulates relative bearings with bounded errors; begin with `simulator`.
+"""Simulator of relative bearings with bounded errors; begin with `simulator`.
 
-How bounds follow from real recordings is in `fuselog.pipeline.families.sets.error_bounds`.
+`fuselog.pipeline.families.sets.error_bounds` derives bounds from real recordings.
 """

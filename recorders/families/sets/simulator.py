@@ -1,7 +1,7 @@
-"""Simulates a robot at rest that measures relative bearings, whose errors keep a known bound.
+"""A robot at rest that measures relative bearings whose errors have a known bound.
 
 Briechle, Hanebeck (2004), section V, and random scenes. Every look measures all pairs of landmarks, or
-the pairs given.
+the given pairs.
 """
 
 from typing import Annotated, Literal
@@ -22,18 +22,18 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """Chooses the scene of section V of the paper (without noise, its first pairs), or random scenes.
+    """The scene of section V of the paper (without noise, its first pairs), or random scenes.
 
     Attributes:
-        scene: which of the two.
-        paper_pairs: how many of the paper's pairs of landmarks are measured in its scene.
+        scene: the paper's scene or random scenes.
+        paper_pairs: number of the paper's pairs of landmarks to measure in its scene.
         bound_deg: bound of the error of a relative bearing; the channel states it.
-        error_share: an error is uniform within this share of the bound.
+        error_share: share of the bound within which errors are uniform.
         landmarks: number of landmarks of a random scene.
-        arena_m: side of the square arena about the middle that the log states.
-        spread_m: landmarks of a random scene are within this of the middle in x and in y.
-        robot_spread_m: the robot of a random scene is within this of the middle in x and in y.
-        looks: how many times all pairs are measured.
+        arena_m: side of the square arena about the centre that the log states.
+        spread_m: largest distance of a random scene's landmarks from the centre in x and in y.
+        robot_spread_m: largest distance of a random scene's robot from the centre in x and in y.
+        looks: number of times that all pairs are measured.
         rate_hz: looks per second.
         misidentified_probability: probability that a pair has another landmark in place of its first
             one.

@@ -1,9 +1,9 @@
-"""Imports AIS position reports of vessels: tables with one row per report (CSV, also compressed).
+"""Importer of AIS position reports of vessels: tables with one row per report (CSV, also compressed).
 
-The columns are Time, MMSI, Latitude_degrees, Longitude_degrees, COG_degrees and SOG_knots; others are
-not read. Codes for what a transponder does not know are those of ITU-R M.1371-5, table 48. /reports says
-who is where without saying who, as a radar or a listener without the decoder would; /identity says of
-each of them whose it is, and /geodetic where it is on the ellipsoid.
+The columns are Time, MMSI, Latitude_degrees, Longitude_degrees, COG_degrees and SOG_knots; other columns
+are ignored. Codes for values that a transponder does not know are those of ITU-R M.1371-5, table 48.
+/reports contains positions without identities, as a radar or a listener without the decoder would have
+them; /identity has the vessel of each report, and /geodetic its position on the ellipsoid.
 """
 
 import lzma
@@ -25,7 +25,7 @@ from fuselog.recorders.recording import Importer, Recording
 Floats = NDArray[np.float64]
 KNOT_MPS = 1852.0 / 3600.0
 NUMBERS = ("MMSI", "Latitude_degrees", "Longitude_degrees", "COG_degrees", "SOG_knots")
-# Least and greatest of what the columns may hold, with the codes for "not available".
+# Smallest and largest valid value of each column, including the codes for "not available".
 BOUNDS = {
     "MMSI": (1.0, 999_999_999.0),
     "Latitude_degrees": (-90.0, 91.0),
@@ -37,13 +37,13 @@ NO_COURSE, NO_SPEED = 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """States where the tangent plane is, and what is reported as unlikely.
+    """The origin of the tangent plane, and the limits of what is reported as unlikely.
 
     Attributes:
-        origin_deg: latitude and longitude of the tangent plane's origin; without one the median of the
+        origin_deg: latitude and longitude of the tangent plane's origin; if not set, the median of the
             positions, rounded to 0.01 deg.
-        top_speed_mps: speeds above this are counted in the notes.
-        gap_s: gaps above this between a vessel's reports are counted in the notes.
+        top_speed_mps: speed above which a vessel's position is reported as wrong in the notes.
+        gap_s: gaps between a vessel's reports longer than this are counted in the notes.
     """
 
     origin_deg: (
@@ -54,7 +54,7 @@ class AisParameters(Parameters):
 
 
 class Reports(NamedTuple):
-    """Holds the rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN where not available."""
+    """Rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN if not available."""
 
     time_ns: NDArray[np.int64]
     mmsi: NDArray[np.int64]
@@ -69,11 +69,11 @@ class Reports(NamedTuple):
 
 
 def read(path: Path, parameters: AisParameters) -> Recording:
-    """Read a file; what is dropped or doubtful is counted in the notes.
+    """Read a file; the notes count dropped and doubtful rows.
 
-    Dropped are repeated rows, positions that are not available and such as lie beyond the horizon of
-    the tangent plane's half of the earth. Wrong positions are kept: real sensors have them.
-    Raises BadInput that names file, row and column where the table is not as it should be.
+    Repeated rows, unavailable positions, and positions on the other half of the earth from the tangent
+    plane are dropped. Wrong positions are kept, because real sensors produce them. Raises BadInput with
+    file, row and column if the table is invalid.
     """
     notes: dict[str, str] = {}
     reports = _without_repetitions(_with_positions(_reports(path), path, notes), notes)
@@ -114,7 +114,7 @@ def read(path: Path, parameters: AisParameters) -> Recording:
 
 
 def _reports(path: Path) -> Reports:
-    """Read all rows of a file, checked."""
+    """Read and check all rows of a file."""
     table = _table(path)
     numbers = table[list(NUMBERS)].apply(pd.to_numeric, errors="coerce")
     for name in NUMBERS:
@@ -169,7 +169,7 @@ def _refuse(path: Path, table: pd.DataFrame, name: str, bad: pd.Series, wanted: 
 
 
 def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Reports:
-    """Keep those whose position is known; count also what else is not."""
+    """Keep reports with a known position; note how many values are not available."""
     unknown = (reports.latitude_deg > 90.0) | (reports.longitude_deg > 180.0)
     if unknown.all():
         raise BadInput(
@@ -186,7 +186,7 @@ def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Repo
 
 
 def _without_repetitions(reports: Reports, notes: dict[str, str]) -> Reports:
-    """Keep every row once."""
+    """Drop repeated rows."""
     repeated = pd.DataFrame(reports._asdict()).duplicated().to_numpy()
     if repeated.any():
         notes["repeated rows"] = f"{repeated.sum()} dropped"
@@ -194,7 +194,7 @@ def _without_repetitions(reports: Reports, notes: dict[str, str]) -> Reports:
 
 
 def _middle(reports: Reports) -> tuple[float, float]:
-    """Compute the median of the positions; on the circle of longitudes it is about their mean."""
+    """Compute the median of the positions, with longitudes taken relative to their circular mean."""
     longitude = np.radians(reports.longitude_deg)
     mean = np.degrees(np.arctan2(np.sin(longitude).mean(), np.cos(longitude).mean()))
     about = (reports.longitude_deg - mean + 180.0) % 360.0 - 180.0
@@ -205,18 +205,18 @@ def _middle(reports: Reports) -> tuple[float, float]:
 def _tell_doubts(
     reports: Reports, place: Floats, parameters: AisParameters, notes: dict[str, str]
 ) -> None:
-    """Count vessels, those that never move, wrong positions and gaps."""
+    """Note the numbers of vessels, of vessels that never move, of wrong positions and of gaps."""
     order = np.lexsort((reports.time_ns, reports.mmsi))
     mmsi, time_s = reports.mmsi[order], reports.time_ns[order] * 1e-9
     same = mmsi[1:] == mmsi[:-1]
     silent_s = np.diff(time_s)[same]
-    # a transponder repeats itself at once: the second allows for that
+    # one second of tolerance, since a transponder may repeat a report immediately
     too_far = np.hypot(*np.diff(place[order], axis=0).T) > parameters.top_speed_mps * (
         np.diff(time_s) + 1.0
     )
     leaps = too_far & same
     wrong = np.zeros(len(mmsi), bool)
-    # only what leaps there and back is wrong: after a single leap nobody knows which side is
+    # a jump there and back is wrong; after a single jump, either side may be wrong
     wrong[1:-1] = leaps[:-1] & leaps[1:]
     fastest = pd.Series(reports.speed_mps).groupby(reports.mmsi).max()
     notes["vessels"] = f"{len(fastest)}, {(fastest < KNOT_MPS).sum()} of them never at a knot or more"

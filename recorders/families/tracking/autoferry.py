@@ -1,13 +1,13 @@
-"""Imports Autoferry: lidar, radar and camera detections of vessels from a moving one, GPS as truth.
+"""Importer of Autoferry: lidar, radar and camera detections of vessels from a moving one, GPS as truth.
 
 Helgesen et al., "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a littoral
 environment", Ocean Engineering 252, 2022; data CC0 1.0. A scenario is a folder with a list of scans,
-NAME_detections.json, and one of the targets' positions, NAME_groundTruth.json.
+NAME_detections.json, and a list of the targets' positions, NAME_groundTruth.json.
 
-The log's plane has x east and y north. Detections are places relative to the ownship (/ownship/fix, a
-message for every scan), bearings anticlockwise from east; both are turned to the plane's axes, since the
-files do not state a heading. A scan reaches the log at the latest stamp so far: one that comes after a
-younger one is late by the difference. Every scan is there, empty ones too.
+In the log's plane, x points east and y north. Detections are positions relative to the ownship
+(/ownship/fix, one message per scan), bearings are anticlockwise from east. Both are in the plane's axes,
+since the files state no heading. A scan arrives in the log at the latest stamp so far: a scan after one
+with a later stamp is out of sequence by the difference. All scans are recorded, including empty ones.
 """
 
 from collections.abc import Callable, Iterator
@@ -40,19 +40,18 @@ PLANE = ("x_m", "y_m")
 
 
 class PlaceSensor(Parameters):
-    """States what is assumed of a sensor of positions; its channels state it to trackers.
+    """Assumed properties of a sensor of positions, which its channels state for trackers.
 
     Attributes:
         sigma_m: standard deviation of a position along the line of sight.
-        sigma_across_rad: standard deviation across the line of sight, per m of range, that is added
-            there.
-        lag_s: detections are where a target was so long ago.
+        sigma_across_rad: additional standard deviation across the line of sight, per m of range.
+        lag_s: age of the positions in a scan at its stamp.
         detection_probability: probability that a near target is detected.
-        near_range_m: up to this range a target is near; beyond it the probability falls linearly.
-        far_range_m: from this range on the probability falls no further.
-        far_detection_probability: probability that a target is detected from `far_range_m` on.
+        near_range_m: range up to which a target is near; beyond it the probability falls linearly.
+        far_range_m: range beyond which the probability is constant.
+        far_detection_probability: probability that a target beyond `far_range_m` is detected.
         clutter_per_m2: mean number of false detections in a scan, per area.
-        joined_within_m: detections within this of each other count as one target.
+        joined_within_m: distance within which detections are merged into one target.
         gate_probability: probability that a target's detection is inside its gate.
     """
 
@@ -69,16 +68,16 @@ class PlaceSensor(Parameters):
 
 
 class Camera(Parameters):
-    """States what is assumed of a camera's bearings; its channels state it to trackers.
+    """Assumed properties of a camera's bearings, which its channels state for trackers.
 
     Attributes:
         sigma_rad: standard deviation of a bearing.
-        sigma_across_m: standard deviation across the line of sight that is added, since a box may lie
+        sigma_across_m: additional standard deviation across the line of sight, since a box may be
             anywhere on a hull.
         detection_probability: probability that a target is detected.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         gate_probability: probability that a target's detection is inside its gate.
-        interval_s: a track uses one bearing in this time, since errors last for seconds.
+        interval_s: time between bearings that a track uses, since errors last for seconds.
     """
 
     sigma_rad: PositiveFloat = 0.04
@@ -90,11 +89,11 @@ class Camera(Parameters):
 
 
 class AutoferryParameters(Parameters):
-    """States what the files do not: the sensors' properties, the same in all scenarios.
+    """Properties of the sensors, which the files do not state, the same in all scenarios.
 
     Attributes:
-        lidar, radar: what is assumed of this sensor's detections.
-        infrared, electro_optical: what is assumed of these cameras' bearings.
+        lidar, radar: assumed properties of this sensor's detections.
+        infrared, electro_optical: assumed properties of this camera's bearings.
     """
 
     lidar: PlaceSensor = PlaceSensor(
@@ -121,9 +120,10 @@ class AutoferryParameters(Parameters):
 
 
 class Scans(NamedTuple):
-    """Holds the scans (n,) of a file in order: sensor, stamp, arrival, ownship (n, 2), what was seen.
+    """Scans (n,) of a file in order: sensor, stamp, arrival, ownship (n, 2), and detections.
 
-    What was seen is (detections, 2) places east and north of the ownship, or (detections, 1) bearings.
+    The detections of a scan are (detections, 2) positions east and north of the ownship, or (detections,
+    1) bearings.
     """
 
     sensor: Integers
@@ -134,9 +134,9 @@ class Scans(NamedTuple):
 
 
 def read(folder: Path, parameters: AutoferryParameters) -> Recording:
-    """Read a scenario; the notes count its scans, and those that are empty or late.
+    """Read a scenario; the notes count its scans, and the empty and late ones.
 
-    Raises BadInput that names the file and the entry where one is missing or not as published.
+    Raises BadInput with the file and the entry if one is missing or not as published.
     """
     scans = _scans(_file(folder, "detections"))
     truths = _truths(_file(folder, "groundTruth"))
@@ -164,7 +164,7 @@ def read(folder: Path, parameters: AutoferryParameters) -> Recording:
 
 
 def _file(folder: Path, kind: str) -> Path:
-    """Find the one file of a kind in a scenario's folder."""
+    """Find the only file of a kind in a scenario's folder."""
     found = sorted(folder.glob(f"*_{kind}.json")) if folder.is_dir() else []
     if len(found) != 1:
         raise BadInput(
@@ -205,7 +205,7 @@ def _scans(path: Path) -> Scans:
 
 
 def _places(measurement: Any, where: str) -> Floats:
-    """Read places (n, 2) east and north: none is [], one is [N, E], more are [[N ...], [E ...]]."""
+    """Read positions (n, 2) east and north: zero as [], one as [N, E], several as [[N ...], [E ...]]."""
     if measurement == []:
         return np.empty((0, 2))
     rows = measurement if isinstance(measurement, list) else [measurement]
@@ -222,14 +222,14 @@ def _places(measurement: Any, where: str) -> Floats:
 
 
 def _bearings(measurement: Any, where: str) -> Floats:
-    """Read bearings (n, 1) anticlockwise from east; one is a bare number, clockwise from north."""
+    """Read bearings (n, 1), anticlockwise from east; a single bearing is a plain number."""
     values = measurement if isinstance(measurement, list) else [measurement]
     clockwise = _numbers(values, where, "measurement", len(values))
     return np.pi - (clockwise[:, None] + np.pi / 2.0) % (2.0 * np.pi)
 
 
 def _truths(path: Path) -> dict[int, tuple[Integers, Floats]]:
-    """Read by target the distinct stamps (n,), ascending, and the places (n, 2) then."""
+    """Read the distinct stamps (n,), ascending, and positions (n, 2) by target."""
     found: dict[int, dict[int, tuple[float, ...]]] = {}
     for number, entry in enumerate(_entries(path)):
         where = f"{path}: entry {number}"
@@ -256,7 +256,7 @@ def _of(entry: Any, key: str, where: str) -> Any:
 
 
 def _stamp_ns(entry: Any, where: str) -> int:
-    """Read the time of an entry; whole seconds apart, as a double of 1e9 s has no nanoseconds."""
+    """Read the time of an entry, whole seconds separately, as a double of 1e9 s does not resolve ns."""
     [time_s] = _numbers([_of(entry, "time", where)], where, "time", 1)
     if not 0.0 <= time_s < 9e9:
         raise BadInput(f"{where}: time is {time_s:g}; expected seconds since 1970")
@@ -273,7 +273,7 @@ def _numbers(values: Any, where: str, name: str, count: int) -> Floats:
 def _sensor_streams(
     prefix: str, rows: Integers, scans: Scans, stated: dict[str, str]
 ) -> Iterator[Stream]:
-    """Yield the scans of one sensor, and what it saw."""
+    """Yield the scans of one sensor and their detections."""
     counts = np.array([len(scans.seen[row]) for row in rows])
     owner, seen = np.repeat(rows, counts), np.concatenate([scans.seen[row] for row in rows])
     scan_id = np.repeat(np.arange(len(rows)), counts)

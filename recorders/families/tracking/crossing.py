@@ -1,7 +1,7 @@
-"""Simulates targets that cross, go side by side and manoeuvre, seen by a radar in scans with clutter.
+"""Targets that cross, move side by side and manoeuvre, seen by a radar in scans with clutter.
 
-Two targets meet at an angle in the middle of the run, two go side by side, and one turns left and right.
-The whole scene is turned at random, so that no run is like another.
+Two targets cross at an angle in the middle of the run, two move side by side, and one turns left and
+right. The whole scene is rotated at random, so that all runs differ.
 """
 
 from typing import Annotated
@@ -21,12 +21,12 @@ Floats = NDArray[np.float64]
 Probability = Annotated[float, Field(gt=0, le=1)]
 
 PLANE = ("x_m", "y_m")
-# The targets that turn stay on one course for so long, and turn by so much.
+# Duration of a straight course and angle of a turn of the turning target.
 STRAIGHT_S, TURN_RAD = 15.0, np.pi / 2
 
 
 class CrossingParameters(Parameters):
-    """Five targets move in a square, which a radar in its middle scans.
+    """Five targets that move in a square, and the radar in its centre.
 
     Attributes:
         duration_s: length of the run.
@@ -34,7 +34,7 @@ class CrossingParameters(Parameters):
         side_m: side of the square.
         speed_mps: speed of every target.
         crossing_rad: angle at which two targets cross.
-        gap_m: distance between the two targets that go side by side.
+        gap_m: distance between the two targets that move side by side.
         turn_radps: turn rate of the target that turns left and right.
         sigma_m: standard deviation of a detection, per axis.
         detection_probability: probability that a scan detects a target.
@@ -91,7 +91,7 @@ def _states(parameters: CrossingParameters, times_s: Floats, turned_rad: float) 
 
 
 def _weaving(parameters: CrossingParameters, times_s: Floats, begin: tuple[float, float]) -> Floats:
-    """Compute poses (3, n) of the target that goes straight on, and turns left and right in turn."""
+    """Compute poses (3, n) of the target that alternates straight courses with turns left and right."""
     poses, pose, begin_s = np.empty((3, len(times_s))), (*begin, 0.0), 0.0
     way = -1.0
     while begin_s <= times_s[-1]:
@@ -113,7 +113,7 @@ def _radar(
     places: Floats,
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """Simulate the scans and their detections, in random order; `places` are (targets, n, 2)."""
+    """Simulate the scans and their detections in random order; `places` are (targets, n, 2)."""
     half_m, scans = 0.5 * parameters.side_m, []
     for scan in range(len(stamps_ns)):
         is_seen = rng.uniform(size=len(places)) < parameters.detection_probability

@@ -1,7 +1,7 @@
-"""Simulates a vehicle that drives on, turns, brakes, stands and starts again, and tells its place.
+"""A vehicle that drives, turns, brakes, stands and starts again, and its position fixes.
 
-It drives at one speed between manoeuvres; a turn is an arc at that speed, and stops are on the straight.
-How long it drives and stands is drawn anew each time.
+It drives at a constant speed between manoeuvres. A turn is an arc at that speed; the vehicle stops only
+on straight parts. The durations of driving and standing are random.
 """
 
 from typing import NamedTuple
@@ -20,18 +20,18 @@ Floats = NDArray[np.float64]
 
 
 class ManoeuvresParameters(Parameters):
-    """A vehicle drives straight, turns, stops and starts, and gets position fixes.
+    """A vehicle that drives straight, turns, stops and starts, and its position fixes.
 
-    A turn is by a sixth to five twelfths of a circle to either side.
+    A turn is one sixth to five twelfths of a circle to either side.
 
     Attributes:
         duration_s: length of the run.
-        speed_mps: speed where it does not brake, stand or start.
-        straight_s: mean time of a straight part (exponential).
+        speed_mps: speed except while braking, standing or starting.
+        straight_s: mean duration of a straight part (exponential).
         turn_radps: turn rate in a turn.
-        brake_mps2: deceleration when it stops.
-        start_mps2: acceleration when it starts again.
-        standing_s: mean time of a stop (exponential).
+        brake_mps2: deceleration when stopping.
+        start_mps2: acceleration when starting again.
+        standing_s: mean duration of a stop (exponential).
         acceleration_sigma_mps2: standard deviation of the acceleration that the prior's channel states
             for driving straight; the truth has none.
         fix_rate_hz: position fixes per second.
@@ -55,7 +55,7 @@ class ManoeuvresParameters(Parameters):
 
 
 class Part(NamedTuple):
-    """Describes a part of a drive: how long, and its turn rate and acceleration along the track."""
+    """A part of a drive: duration, turn rate, and acceleration along the track."""
 
     duration_s: float
     turn_radps: float
@@ -90,7 +90,7 @@ def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Ge
     pose, speed = (0.0, 0.0, rng.uniform(-np.pi, np.pi)), parameters.speed_mps
 
     def after(part: Part, span_s: Floats) -> tuple[Floats, ...]:
-        """Compute poses and speeds so long after a part's beginning."""
+        """Compute poses and speeds at times after the beginning of a part."""
         mean_mps = speed + 0.5 * part.acceleration_mps2 * span_s
         moved = drive(pose, (mean_mps, part.turn_radps), span_s)
         return *moved, speed + part.acceleration_mps2 * span_s
@@ -108,7 +108,7 @@ def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Ge
 
 
 def _parts(parameters: ManoeuvresParameters, rng: np.random.Generator) -> list[Part]:
-    """Draw a straight and what follows it: a turn, or a stop and a start."""
+    """Draw a straight part and the manoeuvre after it: a turn, or a stop and a start."""
     straight = Part(rng.exponential(parameters.straight_s), 0.0, 0.0)
     if rng.uniform() < 0.5:
         way, angle = rng.choice([-1.0, 1.0]), rng.uniform(np.pi / 3, 5 * np.pi / 6)

@@ -1,7 +1,7 @@
-"""Models how vehicles move in the plane; state = (x, vx, y, vy).
+"""Motion of vehicles in the plane; state = (x, vx, y, vy).
 
-Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
-the symmetric measurement equation filter", 2016, (12)-(14). Component-first: scalars or arrays.
+Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
+symmetric measurement equation filter", 2016, (12)-(14). Component-first: scalars or arrays.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from fuselog.recorders.models.planar import Component, Components
 def turn(
     state: Components, turn_rate_radps: Component, duration_s: Component
 ) -> tuple[Component, Component, Component, Component]:
-    """Return the state after a coordinated turn (14); a turn rate of zero is constant velocity (12)."""
+    """Compute the state after a coordinated turn (14), or by constant velocity (12) if the rate is 0."""
     angle = turn_rate_radps * duration_s
     along = duration_s * np.sinc(angle / np.pi)
     across = duration_s * 0.5 * angle * np.sinc(0.5 * angle / np.pi) ** 2
@@ -29,10 +29,10 @@ def turn(
 def noise_moments(
     acceleration_sigma_mps2: Component, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """Compute the position's variance, its covariance with the velocity, the velocity's variance.
+    """Compute the position's variance, its covariance with the velocity, and the velocity's variance.
 
-    The acceleration is white and constant over the duration. (13) with T^4/4, T^3/2 and T^2, where the
-    paper prints T^2/4, T^2/2 and T: the same for its T = 1.
+    The acceleration is random and constant over the duration. This is (13) with T^4/4, T^3/2 and T^2;
+    the paper prints T^2/4, T^2/2 and T, which is equal for its T = 1.
     """
     velocity = (acceleration_sigma_mps2 * duration_s) ** 2
     return 0.25 * velocity * duration_s**2, 0.5 * velocity * duration_s, velocity

@@ -1,9 +1,9 @@
-"""Simulates vehicles that tell a network their places, and a sensor by the road of unknown place.
+"""Vehicles that send their positions to a network, and a roadside sensor of unknown pose.
 
-Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
-the symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on
-/vehicleN/fix; /network has the same fixes as they arrive, without identity and in no order;
-/infrastructure has the detections in the sensor's own frame, in no order either.
+Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
+symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on /vehicleN/fix;
+/network has the same fixes as they arrive, without identity and unordered; /infrastructure has unordered
+detections in the sensor's own frame.
 """
 
 from typing import Annotated, NamedTuple
@@ -41,11 +41,11 @@ PAPER_START: tuple[State, ...] = (
 
 
 class Delayed(Parameters):
-    """States how late messages arrive.
+    """Delays of messages.
 
     Attributes:
-        latency_s: least time from measurement to arrival.
-        latency_jitter_s: mean of the random time beyond this (exponential).
+        latency_s: shortest delay from measurement to arrival.
+        latency_jitter_s: mean of the random delay in addition to this (exponential).
     """
 
     latency_s: NonNegativeFloat = 0.0
@@ -53,7 +53,7 @@ class Delayed(Parameters):
 
 
 class Fixes(Delayed):
-    """Vehicles get position fixes.
+    """Position fixes of vehicles.
 
     Attributes:
         rate_hz: fixes per second of each vehicle.
@@ -67,7 +67,7 @@ class Fixes(Delayed):
 
 
 class Scans(Delayed):
-    """Detections come in unordered scans.
+    """Unordered scans of detections.
 
     Attributes:
         detection_probability: probability that a scan detects a vehicle.
@@ -79,10 +79,10 @@ class Scans(Delayed):
 
 
 class Infrastructure(Scans):
-    """A sensor by the road sees the vehicles.
+    """A roadside sensor that sees the vehicles.
 
     Attributes:
-        rate_hz: scans per second; 0 has it never report.
+        rate_hz: scans per second; 0 for no scans.
         variance_m2: variance of a detection, per axis.
         pose: true pose of the sensor (x, y, heading), in m and rad.
     """
@@ -93,24 +93,24 @@ class Infrastructure(Scans):
 
 
 class VehiclesParameters(Parameters):
-    """Vehicles drive in the plane, and sensors detect them.
+    """Vehicles in the plane and the sensors that detect them.
 
     Attributes:
         duration_s: length of the run.
-        step_s: length of a time step, during which an acceleration holds.
-        stochastic: whether starts are drawn from the prior and accelerations act. Filters assume both in
-            any case; without them, as in the paper, their covariances are too large.
-        start: states (x, vx, y, vy) of the vehicles at the start, in m and m/s.
-        vehicles: above 0, so many start anywhere in the field instead.
-        speed_mps: speed of vehicles that start anywhere.
-        turn_rate_radps: turn rate of each vehicle; without any they go straight.
+        step_s: length of a time step with constant acceleration.
+        stochastic: whether initial states are drawn from the prior and vehicles accelerate. Filters
+            assume both in any case; without them, as in the paper, their covariances are too large.
+        start: initial states (x, vx, y, vy) of the vehicles, in m and m/s.
+        vehicles: number of vehicles with random initial positions in the field; 0 to use `start`.
+        speed_mps: speed of vehicles with random initial positions.
+        turn_rate_radps: turn rate of each vehicle; if not set, vehicles drive straight.
         acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
         prior_variance: variances of the prior (x, vx, y, vy), in m^2 and m^2/s^2.
-        field_m: the field (least x, greatest x, least y, greatest y).
+        field_m: limits of the field (smallest x, largest x, smallest y, largest y).
         origin_deg: latitude and longitude of the plane's origin.
         fix: position fixes of the vehicles.
-        network: scans of the fixes, without names, as the network has them.
-        infrastructure: the sensor by the road.
+        network: scans of the fixes without identity, as they arrive in the network.
+        infrastructure: the roadside sensor.
     """
 
     duration_s: PositiveFloat = 100.0
@@ -130,16 +130,16 @@ class VehiclesParameters(Parameters):
 
     @property
     def field_area_m2(self) -> float:
-        """Return how large the field is."""
+        """Return the area of the field."""
         west, east, south, north = self.field_m
         return (east - west) * (north - south)
 
 
 class Drive(NamedTuple):
-    """Holds what all vehicles did.
+    """Motion of all vehicles.
 
-    `nominal` starts (vehicles, 4) are what is known before, `states` (steps + 1, vehicles, 4) the truth,
-    `accelerations` (steps, vehicles, 2) hold for a step each.
+    `nominal` are the initial states (vehicles, 4) known in advance, `states` (steps + 1, vehicles, 4)
+    the truth, and `accelerations` (steps, vehicles, 2) are constant during each step.
     """
 
     step_s: float
@@ -149,13 +149,13 @@ class Drive(NamedTuple):
     accelerations: Floats
 
     def states_at(self, times_s: Floats) -> Floats:
-        """Return the exact states (n, vehicles, 4) at any times within the drive."""
+        """Compute the exact states (n, vehicles, 4) at any times within the drive."""
         steps = len(self.accelerations)
         step = np.minimum((times_s / self.step_s + 1e-9).astype(int), steps - 1)
         return self.after(step, times_s - step * self.step_s)
 
     def after(self, step: Integers, duration_s: Floats) -> Floats:
-        """Return the states (n, vehicles, 4) so long (n,) after the beginning of steps (n,)."""
+        """Compute the states (n, vehicles, 4) at durations (n,) after the beginning of steps (n,)."""
         span_s, acceleration = duration_s[:, None], self.accelerations[step]
         moved = turn(np.moveaxis(self.states[step], -1, 0), self.turn_rate_radps, span_s)
         states = np.stack(moved, axis=-1)
@@ -165,14 +165,14 @@ class Drive(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Holds unordered scans: how many detections each has, and all of them (n, 2), scan after scan."""
+    """Unordered scans: the number of detections of each, and all detections (n, 2), scan after scan."""
 
     counts: Integers
     places: Floats
 
 
 def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raises BadInput where the turn rates do not fit the vehicles."""
+    """Record one run; raise BadInput if the number of turn rates does not match the vehicles."""
     drive_rng, fix_rng, network_rng, sensor_rng, delay_rng = rng.spawn(5)
     drive = _drive(parameters, drive_rng)
     fix_s = _times(parameters, parameters.fix.rate_hz)
@@ -209,7 +209,7 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
 
 
 def _times(parameters: VehiclesParameters, rate_hz: float) -> Floats:
-    """Return a sensor's times: none where it never reports."""
+    """Return a sensor's times; an empty array if it does not report."""
     return np.arange(1, int(parameters.duration_s * rate_hz + 1e-9) + 1) / (rate_hz or 1.0)
 
 
@@ -234,7 +234,7 @@ def _drive(parameters: VehiclesParameters, rng: np.random.Generator) -> Drive:
 
 
 def _start(parameters: VehiclesParameters, rng: np.random.Generator) -> Floats:
-    """Return the nominal starts (vehicles, 4)."""
+    """Return the nominal initial states (vehicles, 4)."""
     if not parameters.vehicles:
         return np.array(parameters.start)
     west, east, south, north = parameters.field_m
@@ -251,7 +251,7 @@ def _scan(
     offered: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> Detections:
-    """Make unordered scans of places (scans, vehicles, 2): some are missed, false ones are added."""
+    """Make unordered scans of positions (scans, vehicles, 2) with missed and false detections."""
     kept = offered & (rng.uniform(size=offered.shape) < sensor.detection_probability)
     false = rng.poisson(sensor.clutter_per_scan, len(places))
     west, east, south, north = parameters.field_m
@@ -264,7 +264,7 @@ def _scan(
 
 
 def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floats) -> list[Stream]:
-    """Make prior and truth of every vehicle; the prior's channel states how the vehicle moves."""
+    """Make prior and truth of every vehicle; the prior's channel states its motion parameters."""
     states, stamps_ns = drive.states_at(truth_s), simulation_stamps_ns(truth_s)
     covariance = np.diag(parameters.prior_variance)
     streams = []
@@ -324,7 +324,7 @@ def _scan_streams(
     detections: Detections,
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """Make scans with counts, and their detections; the channels state what a filter must know."""
+    """Make scans with counts and their detections; the channels state the parameters for a filter."""
     published, logged = _clocks(sensor, times_s, rng)
     scan = np.repeat(np.arange(len(times_s)), detections.counts)
     variance_m2 = (sensor if isinstance(sensor, Infrastructure) else parameters.fix).variance_m2
@@ -358,7 +358,7 @@ def _scan_streams(
 
 
 def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple[Integers, Integers]:
-    """Return when messages are published, and when they reach the recorder."""
+    """Return the publish times of messages and their arrival times at the recorder."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
     return simulation_stamps_ns(times_s), simulation_stamps_ns(times_s + delay_s)
 
