@@ -645,10 +645,10 @@ def test_a_million_rows_in_five_seconds(tmp_path: Path) -> None:
 
 
 BAD = [
-    (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; there are: time, ax"),
+    (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; available: time, ax"),
     (ROWS, INERTIAL, '"g"', '"m/s"', "the unit 'm/s' does not fit: specific_force_mps2 is in m/s^2"),
     (ROWS, INERTIAL, '"g"', '"0 g"', "the unit '0 g': its number must not be zero"),
-    (ROWS, INERTIAL, '"g"', '"gee"', "no unit 'gee'; there are: m, mm"),
+    (ROWS, INERTIAL, '"g"', '"gee"', "unknown unit 'gee'; available: m, mm"),
     (ROWS, INERTIAL, '"time"', '"note"', "column note has cells that are not numbers"),
     (ROWS, INERTIAL, '"ax"', '"note"', "table.csv: column note holds 'a'; expected numbers"),
     (ROWS, INERTIAL, "InertialSample", "Inertial", "did you mean 'InertialSample'?"),
