@@ -194,7 +194,7 @@ def test_the_nearest_name_is_offered_else_all() -> None:
             "a=" + "1" * 5000,
             "--set a: the value cannot be used: it has a whole number of more than 4300",
         ),
-        (".".join("a" * 100_000) + "=1", "...: has more than 50 names with dots between"),
+        (".".join("a" * 100_000) + "=1", "...: has more than 50 levels of nested names"),
     ],
     ids=["brackets", "tables", "dotted key", "digits", "name"],
 )

@@ -64,8 +64,8 @@ NANOSECONDS, UPTIME_NS = 1305031102160407123, 1200_000_000_000
         (UPTIME_NS, 50_000_000, ",", "euroc"),
         (0, 1, " ", "tum"),
         (0, 20_000, " ", "tum"),  # with spaces it is no EuRoC
-        (0, 100_000, ",", "may be in s or ns: give --format tum or --format euroc"),
-        (NANOSECONDS, 50_000_000, " ", "in ns, with spaces"),
+        (0, 100_000, ",", "may be in s or ns; give --format tum or --format euroc"),
+        (NANOSECONDS, 50_000_000, " ", "in ns, and it has no commas"),
         (1305031102160, 50, ",", "in ms"),
         (1305031102160407, 1_000_000, ",", "in us"),
     ],
