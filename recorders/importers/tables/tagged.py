@@ -1,4 +1,4 @@
-"""Picks one kind of row out of receivers' logs whose lines begin with what they are."""
+"""Selection of one kind of row from receivers' logs whose lines begin with their kind."""
 
 import re
 from collections import Counter
@@ -27,9 +27,9 @@ _INSPVA_UNITS = {
 
 
 class Tagged(NamedTuple):
-    """Describes the rows of one kind: how they begin, between which marks, columns and their units.
+    """Rows of one kind: their beginnings, the marks around the cells, the columns and their units.
 
-    `invalid` is found in rows that say that they have no solution.
+    `invalid` matches rows that report that there is no solution.
     """
 
     what: str
@@ -41,7 +41,7 @@ class Tagged(NamedTuple):
     invalid: re.Pattern[bytes] | None = None
 
     def rows(self, blocks: Iterable[bytes], left_out: Counter[str]) -> Iterator[bytes]:
-        """Yield the cells of this kind's rows, block by block; count the lines of others."""
+        """Yield the cells of this kind's rows, block by block; count other lines."""
         for block in blocks:
             lines = block.splitlines()
             own = [line for line in lines if line.startswith(self.begins)]
@@ -55,9 +55,9 @@ class Tagged(NamedTuple):
 
 
 def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
-    """Return which rows of a receiver's log are read, by its first lines; None for another file.
+    """Recognise a receiver's log by its first lines, and return the rows to read; None for other files.
 
-    Raises BadInput if it is such a log of other rows.
+    Raises BadInput if it is such a log, but without rows that can be read.
     """
     lines = [line.rstrip() for line in islice(lines_of(file), 1)]
     first = lines[0] if lines else b""
