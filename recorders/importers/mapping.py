@@ -254,8 +254,8 @@ class _Maker(NamedTuple):
         if name in mapping.cross_deviations:
             if width != 3:
                 raise BadInput(
-                    f"{self.where}: cross_deviations of {name} need 3 deviations beside them, found "
-                    f"{width}"
+                    f"{self.where}: cross_deviations of {name} need 3 standard deviations, "
+                    f"found {width} in `deviations`"
                 )
             crossed = self._numbers(mapping.cross_deviations[name])
             for column, (row, other) in enumerate(((0, 1), (0, 2), (1, 2))):
@@ -296,7 +296,7 @@ class _Maker(NamedTuple):
         """Repeat a single value for each entry of a vector."""
         values = _listed(given)
         if len(values) not in (1, width):
-            raise BadInput(f"{self.where}: {what}: found {len(values)} values; give one, or {width}")
+            raise BadInput(f"{self.where}: {what}: found {len(values)} values; give 1 or {width}")
         return np.array(values * (width // len(values)))
 
 
@@ -314,8 +314,8 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
     for name in vectors:
         if columns[name].shape[1] != 3:
             raise BadInput(
-                f"{where}: field {name} has 2 columns, and mounting_deg turns vectors of 3; leave "
-                "mounting_deg out"
+                f"{where}: field {name} has 2 columns, but mounting_deg rotates vectors of 3; remove "
+                "mounting_deg"
             )
         columns[name] = columns[name] @ turn.as_matrix().T
     width = 3 * len(vectors)
@@ -330,8 +330,8 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
         columns["state"][:, which] = _turned_back(columns["state"][:, which], turn)
     elif not vectors:
         raise BadInput(
-            f"{where}: {schema.name} has no vector in the body's axes that could be turned; leave "
-            "mounting_deg out"
+            f"{where}: {schema.name} has no vector in the body's axes that could be rotated; remove "
+            "mounting_deg"
         )
 
 
@@ -403,8 +403,8 @@ def off_unit(
             count = int(is_off.sum())
             raise BadInput(
                 f"{where}: {count} of its quaternions {'is' if count == 1 else 'are'} not of unit "
-                f"length, the first of length {length[is_off.argmax()]:.9g}; check what they are, scale "
-                "them with --set quaternions=normalise, or leave them out with --set quaternions=skip"
+                f"length, the first of length {length[is_off.argmax()]:.9g}; check the columns, scale "
+                "the quaternions with --set quaternions=normalise, or use --set quaternions=skip"
             )
         off |= is_off
         zero |= is_off & (length == 0.0)

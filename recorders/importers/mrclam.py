@@ -144,7 +144,7 @@ def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArr
     _refuse(~np.isfinite(numbers), path, table, "expected a number")
     is_identifier = (numbers >= 0) & (numbers < 2**32) & (numbers == np.floor(numbers))
     is_identifier[:, [column not in identifiers for column in range(columns)]] = True
-    _refuse(~is_identifier, path, table, "expected a whole number from zero up")
+    _refuse(~is_identifier, path, table, "expected a whole number, zero or more")
     return numbers
 
 

@@ -645,8 +645,8 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     streams, notes = imported(path)
     assert len(streams["/fix"]) == 5
     assert np.isnan(streams["/fix"]["altitude_m"]).all()
-    assert notes["/fix: stamps repeat, and are kept"] == "1"
-    assert notes["/fix: stamps go back, and are sorted"] == "1"
+    assert notes["/fix: stamps repeat, but are kept"] == "1"
+    assert notes["/fix: stamps go back in time, so they are sorted"] == "1"
     assert notes["/gps: fix dropped: NaN or infinite"] == "1"
     assert notes["/gps: fix dropped: without a fix"] == "1"
     assert notes["not taken, /scan"] == "3 sensor_msgs/msg/LaserScan"

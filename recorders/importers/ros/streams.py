@@ -223,8 +223,8 @@ class StreamMaker:
         steps_ns = np.diff(
             published, prepend=published[0] - 1 if written.last_ns < 0 else written.last_ns
         )
-        self.tell(topic, "stamps repeat, and are kept", int((steps_ns == 0).sum()))
-        self.tell(topic, "stamps go back, and are sorted", int((steps_ns < 0).sum()))
+        self.tell(topic, "stamps repeat, but are kept", int((steps_ns == 0).sum()))
+        self.tell(topic, "stamps go back in time, so they are sorted", int((steps_ns < 0).sum()))
         if not written.messages:
             self._state_noise(topic, written, np.diff(np.sort(published)))
         written.last_ns = int(published[-1])

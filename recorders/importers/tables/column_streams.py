@@ -404,7 +404,7 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
         yield from stream_lines(f"{table.prefix}/truth", "TruthState", why, *lines)
     if columns:
         rest = ", ".join(each.name for each in columns)
-        yield f"# True columns, not taken, so that no filter reads them: {rest}"
+        yield f"# True columns that are not imported, so that no filter reads them: {rest}"
 
 
 def _truth(

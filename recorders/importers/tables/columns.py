@@ -296,7 +296,7 @@ def direction_of(
             if likeness[best] > 0.5 * whole:
                 other = likeness[best[0], not best[1]]
                 is_sure = usual is None or bool(likeness[best] - other > _CLEAR * whole)
-                return Direction(*best, "so it goes with the course", is_sure=is_sure)
+                return Direction(*best, "which agrees with the course", is_sure=is_sure)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
 

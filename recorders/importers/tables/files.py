@@ -183,7 +183,9 @@ def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
     twice = [name for name in source_of if name in table.columns]
     if twice or len(source_of) < sum(map(len, parts.values())):
         names = ", ".join(twice or source_of)
-        raise BadInput(f"{table.path}: `split` gives a name twice, or one of a column: {names}")
+        raise BadInput(
+            f"{table.path}: `split` gives a name twice, or the name of another column: {names}"
+        )
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         sources = {source_of[name]: True for name in wanted if name in source_of}
@@ -228,7 +230,7 @@ def _reason(error: Exception, table: Table) -> str:
     if not found:
         return f"is damaged ({_first_line(error)})"
     name = table.columns[int(found[1])]
-    return f"column {name} holds '{found[2]}'; expected numbers: mend the cell, or empty it"
+    return f"column {name} holds '{found[2]}'; expected numbers: correct or empty the cell"
 
 
 def open_decompressed(path: Path) -> BinaryIO:
@@ -265,7 +267,7 @@ def _open_joined(paths: Sequence[Path]) -> Iterator[BinaryIO]:
 
 def _check_width(path: Path, width: int) -> None:
     if width > MOST_COLUMNS:
-        raise BadInput(f"{path}: has {width} columns, of which at most {MOST_COLUMNS} can be read")
+        raise BadInput(f"{path}: has {width} columns; at most {MOST_COLUMNS} can be read")
 
 
 # Text.
@@ -323,7 +325,7 @@ def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
     """Name the columns; numbers from 1 replace empty, repeated and missing names."""
     if len(names) > width:
         raise BadInput(
-            f"{path}: `columns` names {len(names)} columns, and the rows have {width}; name each once"
+            f"{path}: `columns` names {len(names)} columns, but the rows have {width}; name each once"
         )
     counts = Counter(names)
     padded = [*names, *[""] * (width - len(names))]

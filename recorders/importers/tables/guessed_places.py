@@ -178,7 +178,7 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         _refuse(
             table,
             place,
-            "longitudes seem to count from 0 to 360 deg, so subtract 360 from those beyond 180"
+            "longitudes seem to be from 0 to 360 deg; subtract 360 from those above 180"
             if whole_turn
             else "no unit fits",
         )
@@ -187,13 +187,13 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     if stated and stated in fitting and not (stated == "deg" and _MINUTES in fitting):
         chosen, why = stated, "as its name says"
     elif len(by_speed) == 1 < len(fitting):
-        chosen, why = by_speed[0], "by which places move as fast as the speed says"
+        chosen, why = by_speed[0], "in which positions agree with the speed"
     elif by_speed == [] and len(fitting) > 1 and "deg" not in fitting:
-        _refuse(table, place, f"as {' or '.join(fitting)} they do not move as fast as the speed says")
+        _refuse(table, place, f"as {' or '.join(fitting)} they do not agree with the speed")
     else:
         chosen, why = _by_name(table, place, [each for each in fitting if each in by_speed] or fitting)
         if not chosen:
-            _refuse(table, place, f"they may be {', '.join(fitting)}")
+            _refuse(table, place, f"they may be in {', '.join(fitting)}")
     if chosen not in ("deg", stated):
         comment = f"{ASSUMED}{names}: in {chosen}, {why}"
     units = (chosen, own if chosen == stated else chosen)
@@ -230,11 +230,10 @@ def _how(chosen: str) -> str:
 def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> None:
     largest = [float(np.nanmax(np.abs(column.values))) for column in place]
     raise BadInput(
-        f"{table.path}: it is not certain what {place[0].name} and {place[1].name}, up to "
-        f"{largest[0]:.9g} and {largest[1]:.9g}, are in: {why}; write a mapping by hand with `units` "
-        "of latitude_deg and "
-        'longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` for '
-        "ddmm.mmmm, or `missing` for codes of missing values"
+        f"{table.path}: the unit of {place[0].name} and {place[1].name}, up to {largest[0]:.9g} and "
+        f"{largest[1]:.9g}, is ambiguous: {why}; write a mapping yourself with `units` of latitude_deg "
+        'and longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` '
+        "for ddmm.mmmm, or `missing` for codes of missing values"
     )
 
 
@@ -415,9 +414,8 @@ def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) 
         said = f"{ASSUMED}{height.name}: in mm, as {largest:.6g} m is above any receiver; units"
         return [said, 'units.altitude_m = "mm"']
     raise BadInput(
-        f"{table.path}: it is not certain what {height.name}, up to {largest:.6g}, is in; write a "
-        "mapping by "
-        'hand with units.altitude_m, such as "ft" or "mm"'
+        f"{table.path}: the unit of {height.name}, up to {largest:.6g}, is ambiguous; write a mapping "
+        'yourself with units.altitude_m, such as "ft" or "mm"'
     )
 
 
@@ -430,8 +428,8 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
         return [f"{ASSUMED}{accuracy.name}: in m, as no unit is stated; units"]
     if not re.search("acc", accuracy.plain):
         raise BadInput(
-            f"{table.path}: it is not certain what {accuracy.name}, up to {known.max():.6g}, is "
-            "in: whole numbers may be m, mm, or a dilution times 100; write a mapping by hand with "
+            f"{table.path}: the unit of {accuracy.name}, up to {known.max():.6g}, is ambiguous: whole "
+            "numbers may be m, mm, or a dilution times 100; write a mapping yourself with "
             "`deviations` and `factors` of covariance_m2"
         )
     said = f"{ASSUMED}{accuracy.name}: in mm, as receivers with positions of 1e-7 deg have it; units"
@@ -454,7 +452,7 @@ def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tup
         if ratio is not None:
             nearest = min(_SPEEDS, key=lambda each: abs(np.log(_SPEEDS[each] / ratio)))
             if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
-                return nearest, "so places move as fast"
+                return nearest, "which agrees with the positions"
     return "m/s", f"a guess: the largest is {np.nanmax(length):.4g}"
 
 

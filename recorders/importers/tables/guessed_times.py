@@ -261,7 +261,7 @@ def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         if re.fullmatch(_NAMELESS, column.plain) and _is_steady(column.values):
             raise BadInput(
                 f"{table.path}: column {column.name} rises steadily, and could be the time; write a "
-                f'mapping by hand, with time = {{ column = "{column.name}", unit = ... }}, or with '
+                f'mapping yourself, with time = {{ column = "{column.name}", unit = ... }}, or with '
                 "`rate_hz` in `time`"
             )
     _check_frames(table)
@@ -283,11 +283,11 @@ def _check_frames(table: _Table) -> None:
     if not (frames or of_several):
         return
     whose = f', and in the table vehicle = "{table.vehicle}"' if table.vehicle else ""
-    of_frames = f"column {frames} counts frames, whose rate is not in the file" if frames else ""
+    of_frames = f"column {frames} counts frames, but the frame rate is not in the file" if frames else ""
     column = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
     raise BadInput(
         f"{table.path}: {of_frames or 'no column could be the time of rows of ' + of_several}; write a "
-        f"mapping by hand with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
+        f"mapping yourself with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
     )
 
 
@@ -335,8 +335,8 @@ def _tried(
         if len(known) > 1:
             refusals.append(
                 BadInput(
-                    f"{label} could be the time, and is the same in all rows; write a mapping by hand "
-                    "with the `time` of the rows, as docs/your-log.md says"
+                    f"{label} could be the time, but is the same in all rows; write a mapping yourself "
+                    "with the `time` of the rows, as docs/your-log.md explains"
                 )
             )
         return None
@@ -349,7 +349,7 @@ def _tried(
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
             comments = [
                 *comments,
-                f"{ASSUMED}{columns[0]}: begins again at {rollover}, and is continued; rollover",
+                f"{ASSUMED}{columns[0]}: rolls over at {rollover}, and is unwrapped; rollover",
             ]
             stamps = _stamps(table, mapping)
         elif back == 1 and not vehicle:
@@ -357,7 +357,10 @@ def _tried(
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
     if back == -1:
-        comments = [*comments, f"{ASSUMED}rows: newest first, as their times fall, so reversed; order"]
+        comments = [
+            *comments,
+            f"{ASSUMED}rows: newest first, as their times decrease, so reversed; order",
+        ]
     try:
         for part in parts:
             order = Order(label, mapping)
@@ -454,7 +457,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
                 cell = first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
-                    f"'{cell}', whose format is not known; write a mapping by hand, with time = "
+                    f"'{cell}' in an unknown format; write a mapping yourself, with time = "
                     f'{{ column = ["{days[0]}", "{names[0]}"], unit = "date", format = ... }}'
                 )
             dated |= {*names}
@@ -482,13 +485,12 @@ def _check_texts(table: _Table, dated: set[str]) -> None:
             if odd and _is_number(cell):
                 raise BadInput(
                     f"{table.path}: column {name} holds times such as '{cell}', but '{odd[0]}' in row "
-                    f"{texts.index(odd[0]) + 1} is no number; correct it, or leave the row out"
+                    f"{texts.index(odd[0]) + 1} is not a number; correct it, or remove the row"
                 )
             raise BadInput(
-                f"{table.path}: column {name} holds times such as '{cell}', whose format is not known; "
-                "write "
-                f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
-                "as docs/your-log.md says"
+                f"{table.path}: column {name} holds times such as '{cell}' in an unknown format; write "
+                f'a mapping yourself, with time = {{ column = "{name}", unit = "date", format = ... }}, '
+                "as docs/your-log.md explains"
             )
 
 
@@ -529,7 +531,7 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
             raise Undecided(
                 f"{table.path}: column {name} states offsets from UTC such as "
                 f"'{first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
-                "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
+                "write a mapping yourself, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
             f"{ASSUMED}{' and '.join(names)}: in UTC, as no zone is stated; zone or utc_offset_h"
@@ -558,7 +560,7 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     others = [each for each in fitting if not np.array_equal(fitting[each], fitting[pattern])]
     if others:
         comments.append(
-            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as rows leap with "
+            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as times jump with "
             f"{_first_part(others[0])} first; format"
         )
     return TimeMapping.model_validate({**given, "format": pattern}), comments
@@ -595,7 +597,7 @@ def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Sta
         first, second = (pd.Timestamp(int(stamps_by[each][row])) for each in (best, alike[0]))
         raise BadInput(
             f"{table.path}: column {' and '.join(names)} holds dates such as '{cell}', which may be "
-            f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping by hand with `format` in `time`, "
+            f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping with `format` in `time`, "
             f'"{best}" or "{alike[0]}"'
         )
     return best
@@ -676,9 +678,9 @@ def _check_calendars(table: _Table) -> None:
     parts = _parts_of_date(table)
     if [letters for letters in ("%Y", "%j", "%m", "%d") if letters in parts] in _DAYS_IN_PARTS:
         raise BadInput(
-            f"{table.path}: columns {', '.join(parts.values())} hold the date in parts, and the time of "
-            "day is in no form that is known; add a column of times such as 2026-05-03T10:00:00Z, or "
-            'state in `time` of a mapping the columns and their format, such as "%Y %j %H %M %S"'
+            f"{table.path}: columns {', '.join(parts.values())} hold the date in parts, but the time of "
+            "day has an unknown format; add a column of times such as 2026-05-03T10:00:00Z, or write a "
+            'mapping with the columns and their `format` in `time`, such as "%Y %j %H %M %S"'
         )
 
 
@@ -835,9 +837,9 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             unit, why = _relative_unit(table, column, step)
         if largest * _SIZES[unit] > _LONGEST_S:
             raise BadInput(
-                f"{table.path}: column {column.name} could be the time, and reaches {largest:.6g}, "
-                f"which in {unit} is neither a date since 1970 nor less than a year; write a mapping by "
-                'hand with the `unit` and `zero` of `time`, such as zero = "1904-01-01"'
+                f"{table.path}: column {column.name} could be the time, but reaches {largest:.6g}, "
+                f"which in {unit} is neither a date since 1970 nor less than a year; write a mapping "
+                'yourself with the `unit` and `zero` of `time`, such as zero = "1904-01-01"'
             )
         comments = [
             f"# Stamps begin at {known[0]:g}.",
@@ -859,16 +861,16 @@ def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[s
     if (ratio := _seconds_a_count(table, column)) is not None:
         nearest = min(_LIKELY, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
         if abs(np.log10(_SIZES[nearest] / ratio)) < 1.0:
-            return nearest, ", by which places move as fast as the speed says,"
+            return nearest, ", in which positions agree with the speed,"
     least_s = _STEPS_S[table.kind]
     fitting = [unit for unit in _LIKELY if least_s <= step * _SIZES[unit] < 1000 * least_s]
     unit = fitting[0] if fitting else "s" if step >= 1 else "ns"
     rate_hz = 1.0 / (step * _SIZES[unit])
     if not 1e-5 < rate_hz < 2e4:
         raise BadInput(
-            f"{table.path}: column {column.name} could be the time, and goes in steps of {step:.3g}, "
-            "which are those of no unit; write a mapping by hand with the `unit` and `zero` of `time`; "
-            "convert days, as Excel and MATLAB count them, to seconds or dates first"
+            f"{table.path}: column {column.name} could be the time, but its steps of {step:.3g} fit no "
+            "unit; write a mapping yourself with the `unit` and `zero` of `time`; convert days, as in "
+            "Excel and MATLAB, to seconds or dates first"
         )
     return unit, f", {rate_hz:.4g} rows a second,"
 

@@ -66,7 +66,7 @@ _STAMP = "timestamp"
 # The beginning of the line on a file that is left out.
 _NOT_TAKEN = "# not taken: "
 # Reasons of a guess that leave no doubt.
-_SURE = ("as its name says", "so places move as fast")
+_SURE = ("as its name says", "which agrees with the positions")
 
 
 def guess(paths: Sequence[Path]) -> str:
@@ -94,7 +94,7 @@ def guess(paths: Sequence[Path]) -> str:
             else f"{paths[0]}: has no table among its files; give a folder or files of tables"
         )
     head = [
-        "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
+        "# Guessed by fuselog; correct it where needed: docs/your-log.md explains how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
         *(f"{_NOT_TAKEN}{note}" for note in notes),
         *_warnings("\n".join(tables)),
@@ -120,13 +120,13 @@ def _warnings(text: str) -> Iterator[str]:
     """Write what the user still has to state for streams that belong together: vehicle and origin."""
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
-        yield f"# The topics lie in {len(namespaces)} namespaces, {', '.join(namespaces)}."
-        yield "# They are taken for one vehicle's while none of a kind is there twice; better give all"
-        yield "# of one vehicle the same, such as /car/odometry, /car/fix and /car/truth."
+        yield f"# The topics are in {len(namespaces)} namespaces, {', '.join(namespaces)}."
+        yield "# They are taken as one vehicle's unless a kind of topic occurs twice; better give all"
+        yield "# topics of a vehicle one namespace, such as /car/odometry, /car/fix and /car/truth."
     becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
     if {"GeodeticFix", "TruthState"} <= {*becomes}:
-        yield "# The truth is in a plane, fixes are latitudes and longitudes. Without where the plane"
-        yield "# touches, here or as --origin LATITUDE,LONGITUDE,HEIGHT, the truth judges nothing:"
+        yield "# The truth is in a local tangent plane, but fixes are latitudes and longitudes."
+        yield "# The truth is not used unless the plane's origin is given, here or with --origin:"
         yield "# [origin]"
         yield "# latitude_deg = "
         yield "# longitude_deg = "
@@ -158,7 +158,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
     used = time.used if time else set()
     is_timed = bool(used or exported or source.stamps)
     unread = [
-        f"column {text} holds places such as '{found}', which are no numbers; convert them to degrees"
+        f"column {text} holds places such as '{found}', which are not numbers; convert them to degrees"
         for text in texts
         if re.search(_PLACE, parted(text)[0])
         and (
@@ -170,7 +170,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
     if not columns or (not is_timed and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
-            "mapping by hand, as docs/your-log.md says"
+            "mapping yourself, as docs/your-log.md explains"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}"]
     if exported:
@@ -221,18 +221,18 @@ def _table(source: Source, *, is_alone: bool) -> str:
     streams += [*_rest(rest), *truth_lines(true)]
     rest.made.extend(_unknown_units([each for each in every.whole if each.name not in plain_numbers]))
     if not streams:
-        nothing = "has no column of numbers beside its time; write a mapping by hand"
+        nothing = "has no column of numbers except its time; write a mapping yourself"
         raise BadInput(f"{path}: {unread[0] if unread else nothing}")
     if not any(line.startswith("topic =") for line in streams) and rest.has_truth:
         raise BadInput(
-            f"{path}: its name or columns say that it is the truth, and it has no position or heading; "
-            "if it was measured, write a mapping by hand"
+            f"{path}: its name or columns mark it as the truth, but it has no position or heading; if "
+            "it was measured, write a mapping yourself"
         )
     lines += [f"{_NOT_TAKEN}{path}: {each}" for each in unread]
     prepared = list(prepared_lines(rest))
     sides = rest.prepared.get("hemispheres", {}).values()
     if not_taken := [text for text in texts if text not in used and text not in sides]:
-        lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
+        lines.append(f"# Columns with texts that are not imported: {', '.join(not_taken)}")
     return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
 
 
@@ -260,7 +260,7 @@ def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
         if column.unknown.lower() not in _NO_UNITS:
             unknown.setdefault(column.unknown, []).append(column.name)
     for text, names in unknown.items():
-        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, so ignored; units"
+        yield f"{ASSUMED}{', '.join(names)}: '{text}' is not a known unit, so it is ignored; units"
 
 
 def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:

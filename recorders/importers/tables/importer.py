@@ -70,8 +70,8 @@ def read(path: Path, parameters: TableParameters) -> Blocks:
     """
     if not parameters.mapping:
         raise BadInput(
-            f"{path}: say what its columns are with --mapping, a file or one of {', '.join(shipped())}; "
-            "--guess -o FILE.toml writes a mapping to start from"
+            f"{path}: state the meaning of its columns with --mapping, a file or one of "
+            f"{', '.join(shipped())}; --guess -o FILE.toml writes a mapping to start from"
         )
     paths = [path, *map(Path, parameters.more)]
     for each in paths:
@@ -100,8 +100,8 @@ def _blocks(
     }
     if not firsts:
         raise BadInput(
-            f"{paths[0]}: no row has a time that can be read, so that nothing can be imported; check "
-            "`time` in the mapping"
+            f"{paths[0]}: no row has a readable time, so nothing can be imported; check `time` in the "
+            "mapping"
         )
     result.epoch_ns = min(firsts.values())
     _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)

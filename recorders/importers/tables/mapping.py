@@ -120,14 +120,14 @@ class TableStream(StreamMapping):
     @model_validator(mode="after")
     def _has_fields_of_noise(self) -> Self:
         if unknown := self.noise.keys() - self.fields.keys():
-            raise ValueError(f"`noise` names {', '.join(sorted(unknown))}, which `fields` does not have")
+            raise ValueError(f"`noise` names {', '.join(sorted(unknown))}, which are not in `fields`")
         return self
 
 
 def _once(pattern: str) -> str:
     twice = [name for name, count in Counter(names_in(pattern)).items() if count > 1]
     if twice:
-        raise ValueError(f"{{{twice[0]}}} is there twice; give each a name of its own")
+        raise ValueError(f"{{{twice[0]}}} occurs twice; give each a different name")
     return pattern
 
 
@@ -282,8 +282,8 @@ def adapted(
             raise BadInput(f"delays_s: the mapping has no topic '{topic}'; {choices(topic, topics)}")
     if mounting_deg is not None and all(stream.mounting_deg is None for stream in streams):
         raise BadInput(
-            "mounting_deg: no stream of the mapping has a mounting to replace; write mounting_deg into "
-            "the mapping first"
+            "mounting_deg: no stream of the mapping has a mounting to replace; add mounting_deg to the "
+            "mapping first"
         )
 
     def changed(stream: TableStream) -> TableStream:
@@ -310,7 +310,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
     if not folders:
         patterns = some_of([table.files for table in mapping.tables if not table.optional])
         raise BadInput(
-            f"{place}: neither it nor a folder in it has the files that the mapping names ({patterns})"
+            f"{place}: neither this folder nor one in it has all files of the mapping ({patterns})"
         )
     return folders
 
@@ -378,7 +378,7 @@ def _joined(
             if stamps is None:
                 raise BadInput(
                     f"{own[0].path}: there is no file {table.time.file} with its times; give the folder "
-                    "that has both, or another `file` in `time`"
+                    "that has both, or change `file` in `time`"
                 )
             own = [each for each in own if each.path != stamps]
             others = [path for path in others if path != stamps]

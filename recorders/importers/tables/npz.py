@@ -67,7 +67,7 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
         )
     width = sum(each.width for each in arrays.values())
     if width > most_columns:
-        raise ValueError(f"it has {width} columns, of which at most {most_columns} can be read")
+        raise ValueError(f"it has {width} columns; at most {most_columns} can be read")
     columns = {
         f"{name}.{index}" if len(array.shape) == 2 else name: _Column(array, index)
         for name, array in arrays.items()
@@ -121,10 +121,10 @@ def _described(archive: zipfile.ZipFile, member: str) -> _Array:
     with archive.open(member) as file:
         version = npy.read_magic(file)
         if version not in _HEADERS:
-            raise ValueError(f"{member} is of NumPy's format {version}, which is none of numbers")
+            raise ValueError(f"{member} has NumPy's format version {version}, which is not supported")
         shape, by_column, kind = _HEADERS[version](file)
         if kind.hasobject or kind.names is not None or kind.itemsize == 0:
-            raise ValueError(f"{member} holds {kind}, no numbers")
+            raise ValueError(f"{member} holds {kind}, not numbers")
         return _Array(member, file.tell(), shape, kind, bool(by_column and len(shape) == 2))
 
 

@@ -80,11 +80,9 @@ class Order:
         unwrap = f"`rollover = {rollover}` if the counter rolled over, " if rollover else ""
         raise BadInput(
             f"{self._label}: at row {row + 1} the time falls from {_written(high)} to {_written(low)}; "
-            "state "
-            f'in `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or in the '
-            "table "
-            '`vehicle = "COLUMN"` if a column says whose row it is; if the clock was restarted or set '
-            "back, split the file there"
+            f'add to `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or to the '
+            'table `vehicle = "COLUMN"` if a column names the vehicle of each row; if the clock was '
+            "restarted or set back, split the file there"
         )
 
     def _rollover(self, high_ns: int, low_ns: int) -> int:

@@ -151,13 +151,13 @@ class Rows:
             count += len(stamps)
             if len(stamps) < _size(batch):
                 raise BadInput(
-                    f"{self._stamps_path}: has {count} times, and there are more rows in {self.path} "
+                    f"{self._stamps_path}: has {count} times, but there are more rows in {self.path} "
                     "and the files after it; give a time for each row"
                 )
             yield {**batch, _STAMP: pa.array(stamps, pa.string())}
         if rest := sum(1 for _ in lines):
             raise BadInput(
-                f"{self._stamps_path}: has {count + rest} times, and there are {count} rows in "
+                f"{self._stamps_path}: has {count + rest} times, but there are {count} rows in "
                 f"{self.path} and the files after it; give a row for each time"
             )
 
@@ -230,7 +230,9 @@ class Rows:
         if self.table.is_text:
             is_odd |= np.isnan(found) & cells.is_valid().to_numpy(zero_copy_only=False)
         self._tell(
-            f"{self.path.name}: {column}", "cells that are no numbers, missing", int(is_odd.sum())
+            f"{self.path.name}: {column}",
+            "cells that are not numbers, read as missing",
+            int(is_odd.sum()),
         )
         return np.where(is_odd, np.nan, found)
 
@@ -238,7 +240,9 @@ class Rows:
         """Remove codes of missing values from a column (n,), convert minutes, and apply hemispheres."""
         for code in self._missing.get(column, []):
             is_missing = found == code
-            self._tell(f"{self.path.name}: {column}", f"{code:g} is missing", int(is_missing.sum()))
+            self._tell(
+                f"{self.path.name}: {column}", f"{code:g}, read as missing", int(is_missing.sum())
+            )
             found = np.where(is_missing, np.nan, found)
         if column in self._in_minutes:
             size = np.abs(found)
@@ -246,8 +250,8 @@ class Rows:
             if np.any(minutes >= 60.0):
                 row = int(np.argmax(minutes >= 60.0))
                 raise BadInput(
-                    f"{self.path}: column {column} holds {found[row]:.9g}, which are no degrees and "
-                    "minutes (ddmm.mmmm); leave it out of degrees_minutes"
+                    f"{self.path}: column {column} holds {found[row]:.9g}, which is not in degrees and "
+                    "minutes (ddmm.mmmm); remove it from degrees_minutes"
                 )
             found = np.copysign(np.floor(size / 100.0) + minutes / 60.0, found)
         if sides is not None:
@@ -258,12 +262,14 @@ class Rows:
             if np.any(is_north & (found < 0.0)):
                 row = int(np.argmax(is_north & (found < 0.0)))
                 raise BadInput(
-                    f"{self.path}: column {column} holds {found[row]:.9g} where {self._halves[column]} "
-                    f"says '{letters[row]}'; leave it out of hemispheres if it has signs already"
+                    f"{self.path}: column {column} holds {found[row]:.9g}, but {self._halves[column]} "
+                    f"says '{letters[row]}'; remove it from hemispheres if it already has signs"
                 )
             unknown = ~(is_south | is_north) & np.isfinite(found)
             self._tell(
-                f"{self.path.name}: {column}", "without a hemisphere, missing", int(unknown.sum())
+                f"{self.path.name}: {column}",
+                "without a hemisphere, read as missing",
+                int(unknown.sum()),
             )
             found = np.where(is_south, -np.abs(found), np.where(is_north, found, np.nan))
         return found
@@ -284,8 +290,8 @@ class Rows:
             plain = re.sub(r"\W+", "_", name).strip("_") or "_"
             if (other := self._vehicles.setdefault(plain, name)) != name:
                 raise BadInput(
-                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which are both "
-                    f"{plain} in topics; give them names of letters and digits"
+                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which both become "
+                    f"{plain} in topics; give them different names of letters and digits"
                 )
             self._names["vehicle"] = plain
             self._numbers_of.clear()
@@ -377,7 +383,7 @@ class Rows:
             streams += self._streams(batch, rows, plane)
         self.count += size
         if self._is_reversed:
-            self._tell(self.path.name, "rows are newest first, and are reversed", size)
+            self._tell(self.path.name, "rows are newest first, so they are reversed", size)
         if self.is_done:
             self._end()
         return streams
@@ -389,7 +395,7 @@ class Rows:
             if len(self._clocks) == _MOST_VEHICLES:
                 raise BadInput(
                     f"{self.path}: column {self._vehicle} has more than {_MOST_VEHICLES} values; name "
-                    "the column of the vehicle, or leave `vehicle` out"
+                    "the column of the vehicle, or remove `vehicle`"
                 )
             label = f"{self.path}: column {' and '.join(self._time.columns)}"
             self._clocks[vehicle] = (
@@ -400,8 +406,8 @@ class Rows:
         if self._is_reversed:  # the rows of a block are earlier than those of the previous block
             if self._time.rollover and not (self.is_done and self.count == 0):
                 raise BadInput(
-                    f"{self.path}: its rows are newest first, and its counter begins again at "
-                    f"{self._time.rollover:g}; sort the file by its rows, the last one first"
+                    f"{self.path}: its rows are newest first, and its counter rolls over at "
+                    f"{self._time.rollover:g}; reverse the rows of the file"
                 )
             order = Order(f"{self.path}: column {' and '.join(self._time.columns)}", self._time)
             for reading in readings.values():
@@ -434,7 +440,7 @@ class Rows:
                 continue
             if own.only_first and self._is_reversed and not self.is_done:
                 raise BadInput(
-                    f"{self.path}: its rows are newest first, and `only_first` of {own.topic} needs the "
+                    f"{self.path}: its rows are newest first, but `only_first` of {own.topic} needs the "
                     "earliest one; sort the file by its times"
                 )
             found = self._mapped(own, batch, made_of)
@@ -456,10 +462,12 @@ class Rows:
             return
         reached = self._reached.get(vehicle, int(stamps[0]) - 1)
         steps = np.diff(stamps, prepend=reached)
-        self._tell(self.path.name, "stamps repeat, and are kept", int((steps == 0).sum()))
+        self._tell(self.path.name, "stamps repeat, but are kept", int((steps == 0).sum()))
         if not self._is_reversed or len(stamps) > 1:
             back = steps[1:] if self._is_reversed else steps
-            self._tell(self.path.name, "stamps go back, and are sorted", int((back < 0).sum()))
+            self._tell(
+                self.path.name, "stamps go back in time, so they are sorted", int((back < 0).sum())
+            )
         self.reached_ns = self._reached[vehicle] = int(stamps[-1])
         low, high = self.span_ns or (self.reached_ns, self.reached_ns)
         self.span_ns = min(low, int(stamps.min())), max(high, int(stamps.max()))
@@ -606,7 +614,7 @@ class Rows:
         notes = {name: f"{self.count} rows{files} as {topics}{of}"}
         used = self._texts | self._numbers
         if rest := [each for each in self.table.columns if each not in used]:
-            notes[f"{name}: columns not taken"] = some_of(rest)
+            notes[f"{name}: columns not imported"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, trajectory"] = self.table.mended
         for doubt in sorted(self.table.doubts):

@@ -49,7 +49,7 @@ class Tagged(NamedTuple):
             if len(own) < len(lines):
                 left_out[f"that are not {self.what}"] += len(lines) - len(own)
             if len(valid) < len(own):
-                left_out["that say that they have no solution"] += len(own) - len(valid)
+                left_out["without a solution"] += len(own) - len(valid)
             cells = (line.partition(self.after)[2].partition(self.before)[0] for line in valid)
             yield b"".join(each + b"\n" for each in cells)
 
@@ -63,7 +63,7 @@ def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
     first = lines[0] if lines else b""
     if _NMEA.match(first):
         raise BadInput(
-            f"{path}: holds sentences of NMEA, which are no table; convert it first, such as by "
+            f"{path}: holds NMEA sentences, which are not a table; convert them first, for example with "
             "gpsbabel -i nmea -f FILE -o unicsv -F track.csv"
         )
     if _NOVATEL.match(first):
@@ -79,8 +79,8 @@ def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
     names, units = said.get(("$COL", "GNSS")), said.get(("$UNIT", "GNSS"), [])
     if names is None:
         raise BadInput(
-            f"{path}: is a log of a FlySight without rows of GNSS; give its TRACK.CSV, or a table of "
-            "one kind of rows with their names above"
+            f"{path}: is a log of a FlySight without GNSS rows; give its TRACK.CSV, or a table with one "
+            "kind of rows and their names above"
         )
     of_columns = {name: unit for name, unit in zip(names, units, strict=False) if unit}
     return Tagged("GNSS of a FlySight", (b"$GNSS,",), b",", b"\r", tuple(names), of_columns)

@@ -107,23 +107,23 @@ class TimeMapping(Parameters):
             and (len(self.columns) > 1 or self.model_fields_set & _UNCOUNTED)
         ):
             raise ValueError(
-                "`rate_hz` beside `column` counts numbers of frames in one column; leave out `unit`, "
-                "`week` and `rollover`, or `rate_hz`"
+                "`rate_hz` with `column` counts frame numbers in one column; remove `unit`, `week` and "
+                "`rollover`, or `rate_hz`"
             )
         counted = len(self.columns) - bool(self.week)
         if isinstance(self.unit, list) and len(self.unit) != counted:
             raise ValueError(f"unit has {len(self.unit)} units for {counted} columns; give one for each")
         if counted > 1 and self.unit != "date" and not isinstance(self.unit, list):
             raise ValueError(
-                'several columns together are a date, unit = "date", or numbers that are added, such as '
-                'unit = ["s", "ns"]'
+                'several columns together need unit = "date", or a list of units of numbers to add, '
+                'such as unit = ["s", "ns"]'
             )
         if self.rollover and self.unit == "date":
-            raise ValueError('`rollover` is for counters; leave it out with unit = "date"')
+            raise ValueError('`rollover` is for counters; remove it if unit = "date"')
         if self.zone is not None:
             offset_of(self.zone)
             if self.utc_offset_h or self.unit != "date":
-                raise ValueError("`zone` is for dates, and in place of `utc_offset_h`; give one of them")
+                raise ValueError("`zone` is for dates, and replaces `utc_offset_h`; give one of the two")
         try:
             _date_ns(self.zero)
         except ValueError:
@@ -275,7 +275,7 @@ class Reading:
         values = counted[known]
         before = values[0] if self.count_ns == NOT_A_TIME else self.count_ns
         turns = self.turns + np.cumsum(-np.rint(np.diff(values, prepend=before) / rollover_ns))
-        self.facts["rollovers of the counter, which is continued"] += int(turns[-1]) - self.turns
+        self.facts["rollovers of the counter, which is unwrapped"] += int(turns[-1]) - self.turns
         self.count_ns, self.turns = int(values[-1]), int(turns[-1])
         continued = counted.copy()
         continued[known] = to_ns(turns, rollover_ns, values, where=label, mend=MEND)
@@ -392,7 +392,7 @@ def _dates_ns(
             first, other = int(np.argmax(local)), int(np.argmax(stated))
             raise Undecided(
                 f"{label}: row {rows[first] + 1} holds '{joined[first]}' without a zone, and row "
-                f"{rows[other] + 1} states one; state the zone of rows without, such as "
+                f"{rows[other] + 1} states one; give the zone of rows without one, such as "
                 'zone = "UTC", in `time`'
             )
     elif zone and own.any():
@@ -440,9 +440,9 @@ def _check_offsets(
     if is_other.any():
         first = int(np.argmax(is_other))
         raise BadInput(
-            f"{label}: row {rows[first] + 1} holds '{texts[first]}', which states another offset from "
-            f"UTC than the mapping, {zone_h[first]:+g} h; leave `zone` and `utc_offset_h` out of "
-            "`time`, as the cells have their own"
+            f"{label}: row {rows[first] + 1} holds '{texts[first]}', whose offset from UTC differs from "
+            f"that of the mapping, {zone_h[first]:+g} h; remove `zone` and `utc_offset_h` from `time`, "
+            "as the cells have their own"
         )
 
 
@@ -464,8 +464,8 @@ def _from_zone(
     if (skipped := first == NOT_A_TIME).any():
         index = int(np.argmax(skipped))
         raise BadInput(
-            f"{label}: row {rows[known[index]] + 1} is of {local[index]}, a time that the clocks of "
-            f"{zone.key} skip; if the logger's clock knows no summer time, give utc_offset_h in place "
+            f"{label}: row {rows[known[index]] + 1} has {local[index]}, a time that the clocks of "
+            f"{zone.key} skip; if the logger's clock has no summer time, give utc_offset_h instead "
             "of zone"
         )
     doubled = first != second
@@ -484,7 +484,7 @@ def _from_zone(
             is_second[index] = reading.is_second
         first = np.where(is_second, second, first)
         reading.facts[
-            f"times of the hour that comes twice in {zone.key}, placed by the order of rows"
+            f"times of the hour that occurs twice in {zone.key}, resolved by the order of rows"
         ] += int(doubled.sum())
     if len(known):
         reading.local_ns = int(local_ns[known[-1]])
@@ -542,8 +542,8 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Ticks:
     first, last = (int(every[0]), int(every.max())) if len(every) else (0, 0)
     if last <= first:
         raise BadInput(
-            f"{path}: its counter does not increase, so that {tag.name} does not give its times; give "
-            "the file as RTKLIB wrote it"
+            f"{path}: its counter does not increase, so {tag.name} does not give its times; give the "
+            "file as RTKLIB wrote it"
         )
     rate = float(last_ms) * 1e6 / float(last - first)
     cut_ns = int(every[-1]) if every[-1] < last else NOT_A_TIME
