@@ -253,7 +253,7 @@ def test_codes_of_ais_are_missing_values(tmp_path: Path) -> None:
     got = Got(path)
     assert len(got.streams["/fix"]) == len(got.streams["/heading"]) == 38
     assert np.abs(got.streams["/fix"]["longitude_deg"] - 91.0).max() < 0.01
-    assert got.notes["own.csv: heading: 511 is missing"] == "2"
+    assert got.notes["own.csv: heading: 511, read as missing"] == "2"
     assert "lat: 91 means not available, in 2 rows" in got.said
 
 
@@ -317,7 +317,7 @@ def test_skipped_local_times_are_refused_and_doubled_ones_are_told_by_their_orde
 ) -> None:
     zone = by_zone(", zone = 'America/New_York'")
     path = text_of(tmp_path, "time,v", lambda k: f"2025-03-09 0{1 + k // 20}:{3 * k % 60:02d}:00,{k}")
-    with pytest.raises(BadInput, match="row 21 is of 2025-03-09 02:00:00, a time that the clocks"):
+    with pytest.raises(BadInput, match="row 21 has 2025-03-09 02:00:00, a time that the clocks"):
         Got(path, zone)
     utc = pd.date_range("2025-11-02T04:30Z", periods=40, freq="5min")
     local = utc.tz_convert("America/New_York")
@@ -599,7 +599,7 @@ def test_an_orientation_that_its_covariance_denies_is_none(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("latitude", "longitude", "why"),
-    [(47.5, 351.5, "count from 0 to 360 deg"), (151.2, -33.8, "no unit fits")],
+    [(47.5, 351.5, "seem to be from 0 to 360 deg"), (151.2, -33.8, "no unit fits")],
 )
 def test_degrees_beyond_their_range_are_no_degrees_and_minutes(
     latitude: float, longitude: float, why: str, tmp_path: Path
@@ -857,7 +857,7 @@ def test_units_of_names_are_used_or_told(tmp_path: Path) -> None:
     assert np.degrees(twist["turn_rate_radps"][0]) == pytest.approx([0, 0, 10])
     row = lambda k: f"{EPOCH + k},5,0.1"  # noqa: E731
     assert (
-        "'furlong/h' is no known unit"
+        "'furlong/h' is not a known unit"
         in Got(text_of(tmp_path, "t,speed [furlong/h],yaw_rate", row)).said
     )
     assert set(Got(text_of(tmp_path, "t,engine_speed [rpm],yaw_rate", row)).streams) == {"/values"}
@@ -1055,7 +1055,7 @@ def test_a_clock_that_was_never_set_counts_from_1970(tmp_path: Path) -> None:
     [
         ("raw.nmea", "$GPGGA,100000.00,4806.1000,N,01130.2000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", "NMEA"),
         ("log.asc", "#BESTPOSA,COM1,0,1;SOL_COMPUTED,1.0,2.0*00000000\n", "has no rows of INSPVAA"),
-        ("sensor.csv", "$FLYS,1\n$COL,IMU,time,wx,wy,wz\n$DATA\n$IMU,1,2,3,4\n", "without rows of GNSS"),
+        ("sensor.csv", "$FLYS,1\n$COL,IMU,time,wx,wy,wz\n$DATA\n$IMU,1,2,3,4\n", "without GNSS rows"),
         (
             "dms.csv",
             "time,lat,lon\n2026-05-03 10:00:00,48°06'01\"N,11°30'02\"E\n",
