@@ -72,7 +72,7 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
     named, place = place, settled(place)
     if _clear_leftovers(place):
         raise BadInput(
-            f"{place}: another fuselog command is writing it; wait for it, or give another --out"
+            f"{place}: another fuselog command is writing it; wait until it ends, or give another --out"
         )
     if place.exists():
         check(place)
@@ -138,7 +138,7 @@ def _clear_leftovers(place: Path) -> bool:
             continue  # belongs to a destination with a longer name
         if not _is_ours(work):
             if os.path.lexists(work):  # otherwise its creator has removed it meanwhile
-                _LOG.warning("%s: was not written by this user's fuselog; it is left as it is", work)
+                _LOG.warning("%s: was not written by this user's fuselog, so it is not removed", work)
             continue
         with suppress(OSError):
             work.rmdir()  # its creator was killed before it wrote anything
@@ -179,7 +179,7 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
         try:
             old.rename(place)
         except OSError:
-            _LOG.warning("%s: was %s when a command was killed; move it back by hand", old, place)
+            _LOG.warning("%s: was %s when a command was killed; move it back yourself", old, place)
             lock.release()
             return
     for member in work.iterdir():

@@ -54,7 +54,7 @@ def check() -> None:
     for name, (is_valid, expected) in _EXPECTED.items():
         stated = os.environ.get(name)
         if stated is not None and not is_valid(stated):
-            raise BadInput(f"{name}={stated}: expected {expected}; correct the variable, or unset it")
+            raise BadInput(f"{name}={stated}: expected {expected}; correct or unset the variable")
     for name in [each for each in os.environ if re.fullmatch("MPLBACKEND|RERUN(_FLUSH_.*)?", each)]:
         del os.environ[name]
 
@@ -71,6 +71,6 @@ def _is_switch(text: str) -> bool:
 _EXPECTED: dict[str, tuple[Callable[[str], bool], str]] = {
     UNCOMPILED: (_is_switch, "1"),
     BOUNDSCHECK: (_is_switch, "1"),
-    CORES: (lambda text: _is_count(text) and int(text) > 0, "a number of cores, from 1 on"),
+    CORES: (lambda text: _is_count(text) and int(text) > 0, "a number of cores, 1 or more"),
     "SOURCE_DATE_EPOCH": (_is_count, "whole seconds since 1970"),
 }

@@ -30,7 +30,7 @@ def choices(name: str, known: Collection[str]) -> str:
     near = [each for each in known if each.lower() == name.lower()]
     near = near or (get_close_matches(name, known, n=1) if few else [])
     near = near or [each for each in known if name and name in each]
-    return f"did you mean '{near[0]}'?" if near else f"there are: {some_of(known) or 'none'}"
+    return f"did you mean '{near[0]}'?" if near else f"available: {some_of(known) or 'none'}"
 
 
 def some_of(names: Collection[object]) -> str:
@@ -42,7 +42,7 @@ def some_of(names: Collection[object]) -> str:
 def check_format(path: object, stated: object, read: int) -> None:
     """Raise BadInput if a file states a format other than the one that this version of fuselog reads."""
     if type(stated) is not int:
-        raise BadInput(f"{path}: its format {stated!r} is none of fuselog's; write it again")
+        raise BadInput(f"{path}: format {stated!r} is not a format of fuselog; write it again")
     if stated != read:
         age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
         raise BadInput(

@@ -22,7 +22,7 @@ def extra(name: str, what: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
         raise BadInput(
-            f"{what}: needs {missing}, which is not installed; pip install 'fuselog[{name}]'"
+            f"{what}: needs {missing}, which is not installed; run: pip install 'fuselog[{name}]'"
         ) from None
 
 

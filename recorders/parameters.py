@@ -151,8 +151,8 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
             for name in entry["names"].split(", "):
                 if name not in kind.model_fields:
                     raise BadInput(
-                        f"{base.__name__}: its docstring says what '{name}' means, and it has no such "
-                        f"parameter; {choices(name, kind.model_fields)}"
+                        f"{base.__name__}: its docstring describes a parameter '{name}' that is not "
+                        f"defined; {choices(name, kind.model_fields)}"
                     )
                 meaning_of[name] = " ".join(entry["meaning"].split())
     return meaning_of
@@ -378,7 +378,7 @@ def number_of(kind: type[BaseModel], name: str) -> Parameter:
         raise BadInput(f"no parameter '{name}'; {choices(name.rpartition('.')[2], sorted(known))}")
     found = _parameter(name, None, {**entries[0], "anyOf": tables}, schema.get("$defs", {}))
     if not found.role:
-        raise BadInput(f"parameter '{name}' is not a number, so that it cannot be searched for")
+        raise BadInput(f"parameter '{name}' is not a number, so it cannot be varied")
     return found
 
 
@@ -425,7 +425,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
             raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
         if len(parts) > DEEPEST:
             raise BadInput(
-                f"--set {key[:40]}...: has more than {DEEPEST} names with dots between; give fewer"
+                f"--set {key[:40]}...: has more than {DEEPEST} levels of nested names; give fewer"
             )
         try:
             value = parse_toml(f"value = {text}")["value"]
@@ -438,7 +438,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
             target = target.setdefault(part, {})
             if not isinstance(target, dict):
                 raise BadInput(
-                    f"--set {setting}: '{part}' already has a value of its own; leave out one of the two"
+                    f"--set {setting}: '{part}' already has a value; remove one of the two settings"
                 )
         target[parts[-1]] = value
     return values

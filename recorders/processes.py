@@ -71,8 +71,8 @@ def keep_off_settings_here() -> None:
     """
     if os.path.lexists(_OF_NUMBA):
         raise BadInput(
-            f"{_OF_NUMBA}: numba would take its settings from this file of the current folder, and "
-            "they can run programs; move it away, or run fuselog in another folder"
+            f"{_OF_NUMBA}: numba would read its settings from this file in the current folder, and they "
+            "can run programs; move the file, or run fuselog in another folder"
         )
     if os.path.lexists(_OF_MATPLOTLIB):
         with chdir(Path(__file__).parent):

@@ -37,7 +37,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     if not ((stamps_ns >= 0) & (stamps_ns < 2**63)).all():
         longest_s = float(np.max(np.abs(elapsed_s)))
         raise BadInput(
-            f"the run lasts {longest_s:.3g} s, and stamps end in the year 2262; make it shorter"
+            f"the run lasts {longest_s:.3g} s, but stamps end in the year 2262; make it shorter"
         )
     return SIMULATION_EPOCH_NS + elapsed_ns.astype(np.int64)
 
@@ -81,7 +81,7 @@ class Recording:
             raise BadInput("a recording has no streams; give it at least one")
         for topic, count in Counter(stream.topic for stream in self.streams).items():
             if count > 1:
-                raise BadInput(f"topic {topic}: is recorded as {count} streams; join them to one")
+                raise BadInput(f"topic {topic}: has {count} streams; join them into one")
 
 
 @dataclass
@@ -156,9 +156,9 @@ def record_run(
     """
     simulator: Recorder[Any] = load("recorders", scenario, Recorder)
     if not isinstance(simulator, Simulator):
-        raise BadInput(f"'{scenario}' imports real data; use: fuselog import {scenario} PATH")
+        raise BadInput(f"'{scenario}' imports real data; run: fuselog import {scenario} PATH")
     if seed < 0 or run < 0:
-        raise BadInput(f"seed {seed}, run {run}: give numbers from zero on")
+        raise BadInput(f"seed {seed}, run {run}: both must be zero or more")
     parameters = build(simulator.parameters, values, f"scenario {scenario}")
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,)))
     with foreign_code(f"scenario {scenario}"):
@@ -210,7 +210,7 @@ def import_log(
 def _importer(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Importer[Any], Parameters]:
     importer: Recorder[Any] = load("recorders", source, Recorder)
     if not isinstance(importer, Importer):
-        raise BadInput(f"'{source}' simulates; use: fuselog record {source}")
+        raise BadInput(f"'{source}' is a simulator; run: fuselog record {source}")
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder; give the {source} data as published")
     return importer, build(importer.parameters, values, f"importer {source}")

@@ -40,7 +40,7 @@ def load(kind: str, name: str, expected: type = object) -> Any:
     if not isinstance(found, expected):
         raise BadInput(
             f"{one} '{name}' ({known[name].value}) is {type(found).__name__}; "
-            f"the entry point must lead to {expected.__name__}"
+            f"the entry point must lead to an instance of {expected.__name__}"
         )
     return found
 
@@ -63,5 +63,5 @@ def foreign_code(what: str) -> Iterator[None]:
     except Exception as error:
         reason = shorten(str(error), 200)
         raise BadInput(
-            f"{what} raised {type(error).__name__}: {reason}; FUSELOG_TRACEBACK=1 shows where"
+            f"{what} raised {type(error).__name__}: {reason}; set FUSELOG_TRACEBACK=1 to see where"
         ) from error

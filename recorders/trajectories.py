@@ -33,9 +33,7 @@ _NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
 # Squares of larger positions, and sums of them, may overflow.
 FARTHEST_M = 1e100
 # For the last line of a text: a number that is cut off is still a number.
-NO_END = (
-    "the last line does not end with a newline, so it may be cut off within it; it was read as it is"
-)
+NO_END = "the last line does not end with a newline, so it may be truncated; it was read as it is"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +64,11 @@ class Trajectory:
                 raise BadInput(f"{self.name}: {what} has shape {values.shape}; expected {shape}")
         if np.any(np.abs(self.position_m) > FARTHEST_M):
             raise BadInput(
-                f"{self.name}: has a position beyond {FARTHEST_M:g} m, which cannot be compared; "
-                "leave such poses out"
+                f"{self.name}: has a position beyond {FARTHEST_M:g} m, which cannot be compared; remove "
+                "such poses"
             )
         if self.time_ns is not None and np.any(np.diff(self.time_ns) < 0):
-            raise BadInput(f"{self.name}: its stamps go back; sort the poses by time")
+            raise BadInput(f"{self.name}: its stamps go back in time; sort the poses by time")
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -231,24 +229,24 @@ def _recognised(
             return "euroc"
         if not unit:
             raise BadInput(
-                f"{path}: its stamps, from {rows[0][0]} to {rows[-1][0]}, may be s or ns: give "
+                f"{path}: its stamps, from {rows[0][0]} to {rows[-1][0]}, may be in s or ns; give "
                 '--format tum or --format euroc; in a mapping, format = "tum" or "euroc"'
             )
         if unit == "ns":
             raise BadInput(
-                f"{path}: its stamps are in ns, with spaces, where EuRoC has commas: give --format "
-                "euroc if the quaternion's w is first; otherwise import it as a table, with a mapping"
+                f"{path}: its stamps are in ns, and it has no commas, unlike EuRoC: give --format euroc "
+                "if the quaternion's w is first; otherwise import it as a table, with a mapping"
             )
         if unit != "s":
             raise BadInput(
-                f"{path}: its stamps are in {unit}, and those of TUM in s, of EuRoC in ns; import it as "
-                "a table, with a mapping"
+                f"{path}: its stamps are in {unit}, but TUM has s and EuRoC ns; import it as a table, "
+                "with a mapping"
             )
     layouts = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
-    numbered = "its first column numbers the poses: leave it out; or " if _is_numbered(rows) else ""
+    numbered = "its first column numbers the poses, so remove it; or " if _is_numbered(rows) else ""
     raise BadInput(
-        f"{path}: line {numbers[0]} is not a pose: it has {count} columns, where {layouts}; "
-        f"{numbered}fuselog import table makes a log of a table with other columns"
+        f"{path}: line {numbers[0]} is not a pose: it has {count} columns, but {layouts}; "
+        f"{numbered}import a table with other columns by fuselog import table"
     )
 
 
@@ -285,8 +283,8 @@ def _check_header(path: object, comment: str, name: Format) -> None:
     first, second = (place.start() if place else -1 for place in places)
     if name != "kitti" and min(first, second) >= 0 and (first < second) != (name == "euroc"):
         raise BadInput(
-            f"{path}: its header has the quaternion's w {'first' if first < second else 'last'}, where "
-            f"{_wanted(name)}; give another --format, or fuselog import table with a mapping"
+            f"{path}: its header has the quaternion's w {'first' if first < second else 'last'}, but "
+            f"{_wanted(name)}; give another --format, or use fuselog import table with a mapping"
         )
 
 
@@ -317,13 +315,13 @@ def _in_order(
     if not len(steps) or steps.min() > 0:
         return Trajectory(name, position_m, rotation, time_ns, notes)
     back, again = int((steps < 0).sum()), len(time_ns) - len(np.unique(time_ns))
-    notes = (*notes, f"{name}: {back} stamps go back, {again} repeat; the poses were sorted")
+    notes = (*notes, f"{name}: {back} stamps go back in time, {again} repeat; the poses were sorted")
     order = np.argsort(time_ns, kind="stable")
     return Trajectory(name, position_m[order], rotation[order], time_ns[order], notes)
 
 
 def tum_lines(trajectory: Trajectory) -> list[str]:
-    """Format poses as lines of a TUM file, with all digits; without rotations, the identity is used."""
+    """Format poses as lines of a TUM file, with all digits; the identity replaces missing rotations."""
     assert trajectory.time_ns is not None
     seconds = (f"{Decimal(time).scaleb(-9):f}" for time in trajectory.time_ns.tolist())
     quaternion = Rotation.from_matrix(_rotation(trajectory)).as_quat()
@@ -332,7 +330,7 @@ def tum_lines(trajectory: Trajectory) -> list[str]:
 
 
 def kitti_lines(trajectory: Trajectory) -> list[str]:
-    """Format poses as lines of a KITTI file, with all digits; without rotations, the identity is used."""
+    """Format poses as lines of a KITTI file, with all digits; missing rotations become the identity."""
     matrix = np.concatenate([_rotation(trajectory), trajectory.position_m[:, :, None]], axis=2)
     return [" ".join(map(repr, row)) for row in matrix.reshape(-1, 12).tolist()]
 

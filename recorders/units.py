@@ -69,7 +69,7 @@ def unit(text: str) -> Unit:
         found = _FACTOR.match(text, place)
         if not found or (found[4] and found[4] not in NAMED):
             name = found[4] if found else text
-            raise BadInput(f"no unit '{text}'; {choices(name, NAMED)}")
+            raise BadInput(f"unknown unit '{text}'; {choices(name, NAMED)}")
         factor = NAMED[found[4]] if found[4] else unit(found[3])
         power = (-1 if found[1] == "/" else 1) * int(found[5] or 1) * (0.5 if found[2] else 1)
         size *= factor.size**power
@@ -132,5 +132,7 @@ def conversion(given: str, name: str, *, is_root: bool = False) -> float:
     here, there = unit(given), unit(wanted)
     if here.powers != there.powers:
         is_in = f"is in {wanted}" if wanted else "has no unit"
-        raise BadInput(f"the unit '{given}' does not fit: {name} {is_in}; give a unit of that kind")
+        raise BadInput(
+            f"the unit '{given}' does not fit: {name} {is_in}; give a unit of the same quantity"
+        )
     return here.size / there.size

@@ -25,9 +25,7 @@ def _try(name: str | None, features: str | None) -> None:
         stated = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features}
         what = ", ".join(f"{each}={value}" for each, value in stated.items() if value)
         why = said.splitlines()[0] if said else f"exit code {process.returncode}"
-        raise BadInput(
-            f"{what}: LLVM cannot compile for this ({why}); correct the variable, or unset it"
-        )
+        raise BadInput(f"{what}: LLVM cannot compile for this ({why}); correct or unset the variable")
 
 
 def main() -> None:

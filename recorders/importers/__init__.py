@@ -1,5 +1,5 @@
-"""Imports real data of any kind: tables, ROS, ULog, and robots among landmarks.
+"""Importers of real data of any kind: tables, ROS, ULog, and robots among landmarks.
 
-Begin with `tables`, for CSV and its like. Data sets of families are imported in
+Begin with `tables`, for CSV and similar files. The importers for data sets of families are in
 `fuselog.recorders.families`.
 """

@@ -1,7 +1,7 @@
-"""Defines one language for mappings: how fields of fuselog's messages are made of what others log.
+"""The language of mappings: how fields of fuselog's messages are made from data in other formats.
 
-The mappings of ROS messages (`importers.ros.mapping`) and of tables (`importers.tables`) say this alike;
-what a source is, a field of a message or a column, is theirs.
+The mappings of ROS messages (`importers.ros.mapping`) and of tables (`importers.tables`) share it; each
+defines what a source is: a field of a message, or a column.
 
 becomes = "InertialSample"                        # one of fuselog's messages
 fields = { specific_force_mps2 = ["ax", "ay", "az"], turn_rate_radps = ["gx", "gy", "gz"] }
@@ -26,30 +26,31 @@ Floats = NDArray[np.float64]
 Value = TypeVar("Value")
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
-# Latitude and longitude in deg, and perhaps the height above the ellipsoid in m.
+# Latitude and longitude in deg, and optionally the height above the ellipsoid in m.
 Place = tuple[Latitude, Longitude] | tuple[Latitude, Longitude, float]
-# The name of a source, or a number that stands for every message.
+# The name of a source, or a constant for every message.
 Source = str | float
 OneOrMore: TypeAlias = Value | list[Value]
-# Gives the numbers (n,) or (n, width) of a source.
+# Reads the numbers (n,) or (n, width) of a source.
 Read = Callable[[str], NDArray]
-# Whether each of n messages is where a source has one of some values.
+# Tests for each of n messages whether a source has one of the given values.
 Holds = Callable[[str, Sequence[Source]], NDArray[np.bool_]]
 
-# What becomes of messages whose quaternions are far from unit length.
+# What to do with messages whose quaternions are far from unit length.
 Quaternions = Literal["refuse", "normalise", "skip"]
 NOT_UNIT = "a quaternion that is not of unit length"
 SCALED = "a quaternion that was scaled to unit length"
 
-# How many numbers a vector has that may be missing.
+# The width of vectors that may be missing.
 _WIDTHS = {"covariance_m2": 9, "covariance_m2ps2": 9, "covariance": 36, "covariance_ut2": 9}
 _WIDTHS |= {"magnetic_field_ut": 3}
-# How many numbers other vectors have; positions and velocities may be of the plane.
+# The widths of other vectors; positions and velocities may be two-dimensional.
 _LENGTHS: dict[str, tuple[int, ...]] = {
     "specific_force_mps2": (3,), "turn_rate_radps": (3,), "magnetic_field_ut": (3,),
     "position_m": (2, 3), "velocity_mps": (2, 3), "quaternion": (4,),
 }  # fmt: skip
-# Vectors whose components the channel states.
+# Vectors whose components are stated by the channel.
+# Fields in the axes of the body, by message, and the covariances of these fields.
 _STATED = ("value", "state", "mean")
 _UNIT_TOLERANCE = 1e-3
 # Fields in the axes of the body, by message, and the covariances of these.
@@ -61,11 +62,11 @@ _IN_BODY = {
 
 
 class Inflation(Parameters):
-    """States where standard deviations are larger than they say.
+    """Conditions under which standard deviations are larger than stated.
 
     Attributes:
-        where: for each source the values with which they are.
-        by: what standard deviations are multiplied by there.
+        where: the values of each source for which standard deviations are larger.
+        by: factor by which standard deviations are multiplied there.
     """
 
     where: dict[str, OneOrMore[Source]] = Field(min_length=1)
@@ -73,29 +74,29 @@ class Inflation(Parameters):
 
 
 class StreamMapping(Parameters):
-    """States what becomes one of fuselog's messages.
+    """What becomes one of fuselog's messages, and how.
 
     Attributes:
         becomes: name of the message.
-        fields: for each of its fields a source, or a list of them for a vector; numbers are constants,
-            and an empty list is a vector without numbers.
-        factors: what sources are multiplied by, by field.
-        offsets: what is added to sources then, by field.
-        units: what sources (with factors and offsets) are in, by field; without one, in fuselog's unit.
-        deviations: for a covariance the standard deviations, as `fields`.
-        cross_deviations: for a covariance the roots of its other entries with their signs: those of 1
-            and 2, 1 and 3, 2 and 3.
-        inflated: where standard deviations are larger than they say.
-        where: for each source the values that it must have for a row to be taken.
-        missing: numbers that stand for a value that is missing.
-        each: of every row one message for each of these, with further fields.
-        mounting_deg: roll, pitch, yaw that turn the sensor's axes into the body's (Rz Ry Rx); vectors
-            are turned, and orientations become the body's.
-        components: components of a vector that states them, with commas.
-        kinds: kinds of these components, with commas; linear without any.
-        rotation_axes: of estimates, the axes of the rotations that their covariance is of: the body's,
-            or those of the world, as in ROS.
-        states: numbers that the channel states, for parameters of models: noise densities, say.
+        fields: for each field of the message a source, or a list of sources for a vector; numbers are
+            constants, and an empty list is a vector without numbers.
+        factors: factors of sources, by field.
+        offsets: numbers added after the multiplication, by field.
+        units: units of the sources (with factors and offsets), by field; by default fuselog's units.
+        deviations: for a covariance the standard deviations, given as in `fields`.
+        cross_deviations: for a covariance the signed roots of the off-diagonal entries: those of 1 and
+            2, 1 and 3, 2 and 3.
+        inflated: conditions under which standard deviations are larger than stated.
+        where: for each source the values that a row must have to be imported.
+        missing: numbers that stand for a missing value.
+        each: makes one message for each of these entries from every row, with further fields.
+        mounting_deg: roll, pitch, yaw that rotate the sensor's axes into the body's (Rz Ry Rx); vectors
+            are rotated, and orientations become the body's.
+        components: components of a vector that states them, separated by commas.
+        kinds: kinds of these components, separated by commas; linear by default.
+        rotation_axes: axes of the rotations in the covariance of an estimate: those of the body, or of
+            the world, as in ROS.
+        states: numbers that the channel states for parameters of models, such as noise densities.
     """
 
     becomes: str
@@ -116,7 +117,7 @@ class StreamMapping(Parameters):
     states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
-        """Yield the names of all sources of numbers; some may come again."""
+        """Yield the names of all sources of numbers; names may repeat."""
         for fields in (self.fields, *self.each):
             for given in fields.values():
                 yield from (source for source in _listed(given) if isinstance(source, str))
@@ -124,14 +125,14 @@ class StreamMapping(Parameters):
             yield from (source for source in listed if isinstance(source, str))
 
     def conditions(self) -> Iterator[tuple[str, list[Source]]]:
-        """Yield the sources that are compared, and with what."""
+        """Yield the sources in conditions, each with the values that fulfil it."""
         for where in (self.where, *(each.where for each in self.inflated)):
             for source, values in where.items():
                 yield source, _listed(values)
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Return what the stream's channel states."""
+        """Return the metadata of the stream's channel."""
         stated = {name: repr(number) for name, number in self.states.items()}
         if not self.components:
             return stated
@@ -141,7 +142,7 @@ class StreamMapping(Parameters):
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:
-    """Return the message that a mapping gives; raises BadInput where it or a field is unknown."""
+    """Return the message that a mapping makes; raise BadInput if the message or a field is unknown."""
     known = {schema.name: schema for schema in schemas.SCHEMAS.values()}
     if mapping.becomes not in known:
         raise BadInput(
@@ -162,7 +163,7 @@ def schema_of(mapping: StreamMapping, where: str) -> Schema:
 
 
 class Mapped(NamedTuple):
-    """Holds messages (k,) that were made: columns, of which row (n,) each is, and which are left out."""
+    """Columns of k messages, the row of each message, and the messages that are left out, by reason."""
 
     columns: dict[str, NDArray]
     rows: NDArray[np.int64]
@@ -170,10 +171,10 @@ class Mapped(NamedTuple):
 
 
 def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: str) -> Mapped:
-    """Make messages of `size` rows.
+    """Make messages from `size` rows.
 
-    Raises BadInput that begins with `where` if units do not fit or a list has another length than it
-    must; what `read` and `holds` raise goes through.
+    Raises BadInput that begins with `where` if units do not fit, or a list has the wrong length.
+    Exceptions from `read` and `holds` are passed on.
     """
     schema = schema_of(mapping, where)
     maker = _Maker(mapping, schema, size, read, where)
@@ -199,7 +200,7 @@ def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: s
 
 
 class _Maker(NamedTuple):
-    """Makes columns of the sources."""
+    """Makes the columns of messages from the sources."""
 
     mapping: StreamMapping
     schema: Schema
@@ -208,7 +209,7 @@ class _Maker(NamedTuple):
     where: str
 
     def columns(self, fields: Mapping[str, OneOrMore[Source]], stretch: Floats) -> dict[str, NDArray]:
-        """Return a column for every field of the message but the sensor's clock."""
+        """Make a column for every field of the message except the sensor's clock."""
         made: dict[str, NDArray] = {}
         for entry in list(self.schema)[1:]:
             if entry.name in self.mapping.deviations:
@@ -225,8 +226,8 @@ class _Maker(NamedTuple):
         return made
 
     def _values(self, name: str, given: OneOrMore[Source]) -> NDArray:
-        """Compute a field's values (n, width), in fuselog's unit."""
-        if given == []:  # a vector that the messages do not have
+        """Compute the values (n, width) of a field, in fuselog's unit."""
+        if given == []:  # a vector that is absent
             return np.empty((self.size, 0))
         values = self._numbers(_listed(given))
         mapping, width = self.mapping, values.shape[1]
@@ -242,7 +243,7 @@ class _Maker(NamedTuple):
         return values
 
     def _covariance(self, name: str, stretch: Floats) -> Floats:
-        """Compute a covariance (n, width * width) of standard deviations."""
+        """Compute covariances (n, width * width) from standard deviations."""
         mapping = self.mapping
         deviations = self._numbers(mapping.deviations[name])
         width = deviations.shape[1]
@@ -253,8 +254,8 @@ class _Maker(NamedTuple):
         if name in mapping.cross_deviations:
             if width != 3:
                 raise BadInput(
-                    f"{self.where}: cross_deviations of {name} need 3 deviations beside them, found "
-                    f"{width}"
+                    f"{self.where}: cross_deviations of {name} need 3 standard deviations, "
+                    f"found {width} in `deviations`"
                 )
             crossed = self._numbers(mapping.cross_deviations[name])
             for column, (row, other) in enumerate(((0, 1), (0, 2), (1, 2))):
@@ -263,7 +264,7 @@ class _Maker(NamedTuple):
         return covariance.reshape(self.size, -1)
 
     def _numbers(self, sources: Sequence[Source]) -> NDArray:
-        """Read the numbers (n, width) of sources."""
+        """Read the numbers (n, width) of some sources."""
         parts = []
         for source in sources:
             if isinstance(source, str):
@@ -276,7 +277,7 @@ class _Maker(NamedTuple):
         return np.concatenate(parts, axis=1)
 
     def _conversions(self, name: str, width: int) -> Floats:
-        """Return by what each entry of a field is multiplied."""
+        """Return the factor for each entry of a field."""
         if name not in self.mapping.units:
             return np.ones(width)
         names = self.mapping.components.split(",")
@@ -292,10 +293,10 @@ class _Maker(NamedTuple):
             raise BadInput(f"{self.where}: {error}") from None
 
     def _spread(self, given: OneOrMore, width: int, what: str) -> NDArray:
-        """Repeat what is one for each entry of a vector."""
+        """Repeat a single value for each entry of a vector."""
         values = _listed(given)
         if len(values) not in (1, width):
-            raise BadInput(f"{self.where}: {what}: found {len(values)} values; give one, or {width}")
+            raise BadInput(f"{self.where}: {what}: found {len(values)} values; give 1 or {width}")
         return np.array(values * (width // len(values)))
 
 
@@ -313,8 +314,8 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
     for name in vectors:
         if columns[name].shape[1] != 3:
             raise BadInput(
-                f"{where}: field {name} has 2 columns, and mounting_deg turns vectors of 3; leave "
-                "mounting_deg out"
+                f"{where}: field {name} has 2 columns, but mounting_deg rotates vectors of 3; remove "
+                "mounting_deg"
             )
         columns[name] = columns[name] @ turn.as_matrix().T
     width = 3 * len(vectors)
@@ -329,30 +330,30 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
         columns["state"][:, which] = _turned_back(columns["state"][:, which], turn)
     elif not vectors:
         raise BadInput(
-            f"{where}: {schema.name} has no vector in the body's axes that could be turned; leave "
-            "mounting_deg out"
+            f"{where}: {schema.name} has no vector in the body's axes that could be rotated; remove "
+            "mounting_deg"
         )
 
 
 def _quaternion_of(kinds: str) -> list[int]:
-    """Find where a vector has the parts of a quaternion, if it has one."""
+    """Return the indices of a quaternion's parts in a vector, empty if there is no quaternion."""
     return [index for index, kind in enumerate(kinds.split(",")) if kind == "quaternion"]
 
 
 def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
-    """Turn orientations (n, 4) of the sensor to those of the body, each as long as it was."""
+    """Convert orientations (n, 4) of the sensor to those of the body, without normalising them."""
     return compose(quaternion, turn.inv().as_quat(scalar_first=True))
 
 
 def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Find the messages that lack a number that they must have, or have none at all.
+    """Find the messages that lack a required number, or have no numbers.
 
     Args:
-        schema: of the messages.
-        columns: by field, (n,) or (n, width) each; some fields may be missing.
+        schema: schema of the messages.
+        columns: columns by field, (n,) or (n, width) each; some fields may be missing.
 
     Returns:
-        (n,), whether a message is such.
+        (n,), True for these messages.
     """
     size = len(next(iter(columns.values())))
     lacks, finite = np.zeros(size, bool), []
@@ -361,7 +362,7 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
         if column is None or column.dtype.kind != "f":
             continue
         is_finite = np.isfinite(column).reshape(size, -1)
-        is_whole = is_finite.all()  # then its rows need no look, which would take longer
+        is_whole = is_finite.all()  # then the slower check of each row is not needed
         if is_finite.size and entry.kind != "identifier":
             finite.append(np.ones(size, bool) if is_whole else is_finite.any(axis=1))
         if not (is_whole or entry.may_be_nan or entry.may_be_partial):
@@ -370,7 +371,7 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
 
 
 class OffUnit(NamedTuple):
-    """Holds which messages (n,) are left out for their quaternions, and whose are scaled."""
+    """The messages (n,) that are left out because of their quaternions, and those that are scaled."""
 
     left_out: NDArray[np.bool_]
     scaled: NDArray[np.bool_]
@@ -386,13 +387,13 @@ def off_unit(
     """Find the messages whose quaternions are far from unit length.
 
     Args:
-        where: what a message begins with.
-        columns: of messages (n,), as `with_unit_quaternions` takes them.
-        kinds: of the components of a state or estimate, with commas.
-        taken: (n,), the messages that are looked at.
-        quaternions: what becomes of the messages. A quaternion of zeros cannot be scaled.
+        where: beginning of error messages.
+        columns: columns of messages (n,), as in `with_unit_quaternions`.
+        kinds: kinds of the components of a state or estimate, separated by commas.
+        taken: (n,), the messages to check.
+        quaternions: what to do with such messages. A quaternion of zeros cannot be scaled.
 
-    Raises BadInput if there are any, and they are neither scaled nor left out.
+    Raises BadInput if there are such messages, and they are neither scaled nor left out.
     """
     off, zero = np.zeros((2, len(taken)), bool)
     for name, which in _quaternions_in(columns, kinds):
@@ -402,8 +403,8 @@ def off_unit(
             count = int(is_off.sum())
             raise BadInput(
                 f"{where}: {count} of its quaternions {'is' if count == 1 else 'are'} not of unit "
-                f"length, the first of length {length[is_off.argmax()]:.9g}; check what they are, scale "
-                "them with --set quaternions=normalise, or leave them out with --set quaternions=skip"
+                f"length, the first of length {length[is_off.argmax()]:.9g}; check the columns, scale "
+                "the quaternions with --set quaternions=normalise, or use --set quaternions=skip"
             )
         off |= is_off
         zero |= is_off & (length == 0.0)
@@ -411,11 +412,11 @@ def off_unit(
 
 
 def with_unit_quaternions(columns: Mapping[str, NDArray], kinds: str) -> dict[str, NDArray]:
-    """Scale the quaternions among columns to unit length: of the field, or in a state or estimate.
+    """Scale quaternions to unit length: those of a field, or in a state or estimate.
 
     Args:
         columns: (n,) or (n, width), by field.
-        kinds: of the components of a state or estimate, with commas.
+        kinds: kinds of the components of a state or estimate, separated by commas.
     """
     made = dict(columns)
     for name, which in _quaternions_in(columns, kinds):
@@ -426,7 +427,7 @@ def with_unit_quaternions(columns: Mapping[str, NDArray], kinds: str) -> dict[st
 
 
 def _quaternions_in(columns: Mapping[str, NDArray], kinds: str) -> Iterator[tuple[str, list[int]]]:
-    """Yield the columns with quaternions, and where they have their parts."""
+    """Yield the names of columns with quaternions, and the indices of their parts."""
     for name in columns:
         which = (
             list(range(4)) if name == "quaternion" else _quaternion_of(kinds) if name in _STATED else []
@@ -436,17 +437,17 @@ def _quaternions_in(columns: Mapping[str, NDArray], kinds: str) -> Iterator[tupl
 
 
 def checked(where: str, field: str, column: NDArray) -> NDArray:
-    """Return a column's values; where one may be missing, infinite ones become NaN.
+    """Check a column's values, and replace infinite ones by NaN if the field may be missing.
 
     Args:
-        where: what a message begins with.
-        field: the schema's.
+        where: beginning of error messages.
+        field: name of the schema's field.
         column: (n,) or (n, width), in the field's unit.
 
     Returns:
-        The same shape.
+        The values, in the same shape.
 
-    Raises BadInput for values that nothing can mean.
+    Raises BadInput for impossible values.
     """
     limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
     if limit is not None and len(column) and np.abs(column).max() > limit:

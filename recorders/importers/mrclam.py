@@ -1,4 +1,4 @@
-"""Imports UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
+"""Importer of UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
 
 K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011. A
 folder holds Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and
@@ -23,12 +23,12 @@ from fuselog.recorders.recording import Importer, Recording
 
 
 class MrclamParameters(Parameters):
-    """States what the data do not: noise of odometry and sensor, and the uncertainty of the start.
+    """What the data do not state: the noise of odometry and sensor, and the uncertainty of the start.
 
-    They are the same for all sets and robots. The densities of the odometry are those of its errors
-    over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to 0.7
-    from one to the next), while a filter assumes them independent: so their standard deviations are a
-    few times the scatter.
+    The values are the same for all sets and robots. The densities of the odometry are those of its
+    errors over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to
+    0.7), but a filter assumes that they are independent, so the standard deviations are a few times the
+    scatter.
 
     Attributes:
         forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
@@ -48,9 +48,9 @@ class MrclamParameters(Parameters):
 
 
 def read(folder: Path, parameters: MrclamParameters) -> Recording:
-    """Read a set; unknown barcodes are dropped and counted in the notes.
+    """Read a data set; drop unknown barcodes, and count them in the notes.
 
-    Raises BadInput that names the file and line where one is missing or malformed.
+    Raises BadInput that names the file and line if a file is missing or malformed.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: not a folder; give the folder that holds Barcodes.dat")
@@ -144,7 +144,7 @@ def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArr
     _refuse(~np.isfinite(numbers), path, table, "expected a number")
     is_identifier = (numbers >= 0) & (numbers < 2**32) & (numbers == np.floor(numbers))
     is_identifier[:, [column not in identifiers for column in range(columns)]] = True
-    _refuse(~is_identifier, path, table, "expected a whole number from zero up")
+    _refuse(~is_identifier, path, table, "expected a whole number, zero or more")
     return numbers
 
 
@@ -161,7 +161,7 @@ def _timed(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
 
-    Stamps are printed to the millisecond, and are not exact as doubles: rounding makes them so again.
+    Stamps are printed to the millisecond and not exact as doubles; rounding restores them.
     """
     table = _table(path, columns, identifiers)
     bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)

@@ -1,4 +1,4 @@
-"""Makes stamps of the numbers that others log: exact to the nanosecond, or refused."""
+"""Conversion of logged numbers to stamps that are exact to the nanosecond."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from fuselog.recorders.errors import BadInput
 
 Stamps = NDArray[np.int64]
-# A stamp that is missing.
+# The value of a missing stamp.
 NOT_A_TIME = np.iinfo(np.int64).min
 # A double near 2^63 is exact to 1024.
 BEYOND = 2.0**63 - 2**12
@@ -23,16 +23,16 @@ def to_ns(
     """Compute stamps (n,) as `since_ns` plus values times a unit.
 
     Args:
-        values: (n,), whole numbers or floats; NOT_A_TIME or NaN if there is none.
-        unit_ns: how many nanoseconds one is.
-        since_ns: what they count from, NOT_A_TIME if that is unknown.
-        where: begins the sentence on values that cannot be: file and column or topic.
-        mend: ends it.
+        values: (n,), whole numbers or floats; NOT_A_TIME or NaN if a value is missing.
+        unit_ns: length of the unit in ns.
+        since_ns: the zero of the values, NOT_A_TIME if it is unknown.
+        where: beginning of error messages: file and column or topic.
+        mend: end of error messages: what to do.
 
     Returns:
-        The stamps, NOT_A_TIME if there is no value.
+        The stamps, NOT_A_TIME for missing values.
 
-    Raises BadInput if 64 bits cannot hold a stamp, as in the year 2262.
+    Raises BadInput if a stamp does not fit 64 bits, as after the year 2262.
     """
     given, since = np.asarray(values), np.asarray(since_ns)
     numbers, start = given.astype(float), since.astype(float)
@@ -50,7 +50,7 @@ def to_ns(
     filled = np.where(known, given, 0)
     if given.dtype.kind in "iu":
         product_ns = filled.astype(np.int64) * unit_ns
-    else:  # the whole part by itself, as a double of 1e9 s has no nanoseconds
+    else:  # the whole part separately, since a double near 1e9 s has no nanoseconds
         whole = np.floor(filled)
         product_ns = whole.astype(np.int64) * unit_ns
         product_ns += np.rint((filled - whole) * unit_ns).astype(np.int64)

@@ -142,7 +142,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     # parameters of all levels: names, types, bounds
     "record landmarks --set duration_s": ("--set duration_s", "key=value"),
     "record landmarks --set =1": ("--set =1", "key=value"),
-    "record landmarks --set robots=1 --set robots.x=1": ("--set robots.x=1", "a value of its own"),
+    "record landmarks --set robots=1 --set robots.x=1": ("--set robots.x=1", "already has a value"),
     "record landmarks --set duraton_s=1": ("no parameter 'duraton_s'", "did you mean 'duration_s'"),
     "record landmarks --set duration_s=soon": ("'duration_s' is 'soon'", "number"),
     "record landmarks --set duration_s=-1": ("'duration_s' is -1", "greater than 0"),

@@ -875,7 +875,7 @@ def test_parameters_that_a_log_states_are_shown_with_their_channel(
             "LLVM cannot compile for this ('bogus' is not a recognized processor",
         ),
         ("NUMBA_CPU_FEATURES", "+bogus", "LLVM cannot compile for this ("),
-        ("NUMBA_NUM_THREADS", "0", "expected a number of cores, from 1 on"),
+        ("NUMBA_NUM_THREADS", "0", "expected a number of cores, 1 or more"),
         ("SOURCE_DATE_EPOCH", "x", "expected whole seconds since 1970"),
         ("FUSELOG_UNCOMPILED", "yes", "expected 1"),
     ],

@@ -157,7 +157,7 @@ def test_the_smoother_that_ignores_a_delay_takes_back_that_of_the_recording(
 def test_several_recordings_and_none(tmp_path: Path):
     name, experiment = load_experiment("gnss-ins", {}, {})
     with pytest.raises(
-        BadInput, match=r"neither it nor a folder in it has the files that the mapping names \(\*\.pos"
+        BadInput, match=r"neither this folder nor one in it has all files of the mapping \(\*\.pos"
     ):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     for folder in ("one", "two"):

@@ -193,7 +193,7 @@ WRONG = {
     _FAILING.format("enough.mcap", "gone"): "estimator 'gone' (gone:GONE) raised ModuleNotFoundError",
     _FAILING.format("enough.mcap", "number"): "estimator 'number' (broken:NUMBER) is int",
     _FAILING.format("few.mcap", "choosy"): "fewer than 4 beacons",
-    "fuselog record twice": "/landmarks: is recorded as 2 streams",
+    "fuselog record twice": "/landmarks: has 2 streams",
     _FAILING.format(
         "few.mcap enough.mcap", "choosy"
     ): "few.mcap: choosy walker failed at 4.500 s: fewer than 4 beacons",

@@ -100,7 +100,7 @@ def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path,
     files = [str(drive / "gnss.csv"), str(drive / "imu.csv")]
     said = fuselog("import", "table", *files, "--mapping", str(mapping), "-o", str(out))
     assert said.code == 0
-    assert "gnss.csv: stamps repeat, and are kept: 1" in said.out
+    assert "gnss.csv: stamps repeat, but are kept: 1" in said.out
     assert "origin: 50, 8.1 deg, 100 m, the first fix" in said.out
     direct = fl.import_("table", drive, mapping=str(mapping))
     assert_allclose(direct["/gnss/fix"]["altitude_m"], fl.open(out)["/gnss/fix"]["altitude_m"])
@@ -116,7 +116,7 @@ def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path,
     words.write_text("name,colour\na,red\n")
     guess = fuselog("import", "table", str(words), "--guess", "-o", str(tmp_path / "words.toml"))
     assert (guess.code, guess.err.count("\n")) == (2, 1)
-    assert "write a mapping by hand, as docs/your-log.md says" in guess.err
+    assert "write a mapping yourself, as docs/your-log.md explains" in guess.err
     assert not (tmp_path / "words.toml").exists()
     two = fuselog("import", "ros", *files, "-o", str(out))
     assert (two.code, "ros data are one file or folder" in two.err) == (2, True)

@@ -204,5 +204,5 @@ def test_true_columns_of_a_table_become_the_truth_alone(tmp_path: Path) -> None:
         found = fl.import_("table", table, mapping=str(mapping))
         assert set(found.topics) == topics, name
     table.write_text("t,speed\n" + "\n".join(f"{1.7e9 + step},1" for step in range(30)))
-    with pytest.raises(BadInput, match="say that it is the truth, and it has no position or heading"):
+    with pytest.raises(BadInput, match="mark it as the truth, but it has no position or heading"):
         guess([table])

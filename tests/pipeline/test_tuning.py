@@ -233,7 +233,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
             "starts from 0; give a start above zero",
         ),
         ("sigma_range_m", {"by": "rmse"}, "gives no truth to judge its estimates by"),
-        ("sigma_range_m", {"by": "luck"}, "--by luck: there are: likelihood, nis"),
+        ("sigma_range_m", {"by": "luck"}, "--by luck: available: likelihood, nis"),
         (
             "sigma_range_m",
             {"bounds": {"sigma_bearing_rad": (0.1, 1)}},

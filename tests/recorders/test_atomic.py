@@ -191,7 +191,7 @@ def test_a_leftover_is_known_by_more_than_its_name(tmp_path, caplog):
         new.write_text("new")
     assert contents(tmp_path) == {**before, "f": "new"}
     assert len(caplog.messages) == 3
-    assert all("it is left as it is" in message for message in caplog.messages)
+    assert all("it is not removed" in message for message in caplog.messages)
 
 
 def test_errors_of_the_disk_say_where_and_others_go_through(tmp_path):

@@ -352,7 +352,7 @@ def test_another_robot_or_sensor_changes_no_other_stream():
     [
         ({"robots": 0}, "'robots' is 0"),
         ({"range": {"dropout_probability": 1.5}}, r"'range\.dropout_probability' is 1.5"),
-        ({"range": {"speed": 1}}, r"no parameter 'range\.speed'; there are: rate_hz"),
+        ({"range": {"speed": 1}}, r"no parameter 'range\.speed'; available: rate_hz"),
         ({"duration_s": float("nan")}, "'duration_s' is nan"),
         ({"forward_scale_error": -1.0}, "'forward_scale_error' is -1"),
     ],

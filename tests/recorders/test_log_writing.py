@@ -174,7 +174,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         ({"scan_id": [1, 2**32]}, "field scan_id holds 4294967296, which uint32 cannot hold"),
         ({"scan_id": [1]}, "field scan_id has 1 values for 2 messages"),
         ({"scan_id": [None, 2]}, "field scan_id is not numeric"),
-        ({"speed": [1, 2]}, "fuselog.Scan has no field speed; there are: scan_id, detections$"),
+        ({"speed": [1, 2]}, "fuselog.Scan has no field speed; available: scan_id, detections$"),
     ],
 )
 def test_a_stream_that_cannot_be_kept_exactly_is_refused(changes, sentence):

@@ -50,7 +50,7 @@ class Outer(Parameters):
         ({}, "x: parameter 'count' is missing"),
         ({"count": "many"}, "x: parameter 'count' is 'many'; it should be a valid integer"),
         ({"count": 1, "cuont": 2}, "x: no parameter 'cuont'; did you mean 'count'?"),
-        ({"count": 1, "zzz": 2}, "x: no parameter 'zzz'; there are: count, sigma_m, inner, others"),
+        ({"count": 1, "zzz": 2}, "x: no parameter 'zzz'; available: count, sigma_m, inner, others"),
         ({"count": 1, "others": [{"rate": 2}]}, "'others.0.rate'; did you mean 'rate_hz'?"),
         ({"count": 1, "inner": {"rate": 2}}, "x: no parameter 'inner.rate'; did you mean 'rate_hz'?"),
         ({"count": 1, "inner": {"rate_hz": 100}}, "'inner.rate_hz' is 100; it should be less than 100"),
@@ -177,8 +177,8 @@ def test_merging_is_settled_after_one_time(base: dict[str, object], over: dict[s
 def test_the_nearest_name_is_offered_else_all() -> None:
     assert choices("efk", ["ekf", "ukf"]) == "did you mean 'ekf'?"
     assert choices("gate", ["gate_probability", "kappa"]) == "did you mean 'gate_probability'?"
-    assert choices("zzz", ["ekf", "ukf"]) == "there are: ekf, ukf"
-    assert choices("zzz", []) == "there are: none"
+    assert choices("zzz", ["ekf", "ukf"]) == "available: ekf, ukf"
+    assert choices("zzz", []) == "available: none"
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_the_nearest_name_is_offered_else_all() -> None:
             "a=" + "1" * 5000,
             "--set a: the value cannot be used: it has a whole number of more than 4300",
         ),
-        (".".join("a" * 100_000) + "=1", "...: has more than 50 names with dots between"),
+        (".".join("a" * 100_000) + "=1", "...: has more than 50 levels of nested names"),
     ],
     ids=["brackets", "tables", "dotted key", "digits", "name"],
 )

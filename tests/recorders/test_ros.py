@@ -645,8 +645,8 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     streams, notes = imported(path)
     assert len(streams["/fix"]) == 5
     assert np.isnan(streams["/fix"]["altitude_m"]).all()
-    assert notes["/fix: stamps repeat, and are kept"] == "1"
-    assert notes["/fix: stamps go back, and are sorted"] == "1"
+    assert notes["/fix: stamps repeat, but are kept"] == "1"
+    assert notes["/fix: stamps go back in time, so they are sorted"] == "1"
     assert notes["/gps: fix dropped: NaN or infinite"] == "1"
     assert notes["/gps: fix dropped: without a fix"] == "1"
     assert notes["not taken, /scan"] == "3 sensor_msgs/msg/LaserScan"
@@ -861,7 +861,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     assert refusal(scan, topics="/pos") == "has no topic /pos; did you mean '/pose'?"
     level = "std_msgs/msg/Float64"
     many = bag("many", *((f"/{letter}", make(level)) for letter in "hgfedcba"))
-    assert refusal(many, topics="/zzz").endswith("there are: /a, /b, /c, /d, /e, /f, /g, /h")
+    assert refusal(many, topics="/zzz").endswith("available: /a, /b, /c, /d, /e, /f, /g, /h")
     mixed = bag("mixed", ("/pose", make(pose, 5_000_000_000)), ("/level", make("std_msgs/msg/Float64")))
     assert refusal(mixed) == (
         "mixed time bases: the stamps of /level (no header, the bag's) and of /pose are 1.7e+09 s "

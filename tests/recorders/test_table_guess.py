@@ -73,7 +73,7 @@ def test_no_rate_stands_for_times_that_cannot_be_read(tmp_path: Path) -> None:
     table = tmp_path / "own.csv"
     rows = [f"{row};14:03 and {row} s;{row}.5;0.1" for row in range(20)]
     table.write_text("\n".join(["number;when;speed;yaw_rate", *rows, ""]))
-    with pytest.raises(BadInput, match="column when holds times such as '14:03 and 0 s', whose format"):
+    with pytest.raises(BadInput, match="column when holds times such as '14:03 and 0 s' in an unknown format"):
         guess([table])
 
 
@@ -179,5 +179,5 @@ def test_without_any_one_column_the_others_are_taken_once_and_in_their_order(
 def test_a_cell_of_a_column_of_times_that_is_no_number_is_named(tmp_path: Path, cell: str) -> None:
     times = [str(1_700_000_000 + row) for row in range(30)]
     times[11] = cell
-    with pytest.raises(BadInput, match=f"but '{re.escape(cell)}' in row 12 is no number; correct it"):
+    with pytest.raises(BadInput, match=f"but '{re.escape(cell)}' in row 12 is not a number; correct it"):
         guessed(tmp_path, "\n".join(["t,x_m,y_m", *(f"{each},1.5,2.5" for each in times)]))

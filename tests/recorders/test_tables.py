@@ -98,7 +98,7 @@ def test_units_stamps_and_columns(imported: Callable[..., Any]) -> None:
     assert_allclose(inertial["turn_rate_radps"], np.radians([[10, 20, 30], [-5, 0, 5]]))
     assert inertial.publish_time_ns.tolist() == [1756402240_961000000, 1756402240_967000700]
     assert notes["table.csv"] == "2 rows as /inertial"
-    assert notes["table.csv: columns not taken"] == "note"
+    assert notes["table.csv: columns not imported"] == "note"
     by_number = INERTIAL.replace('["ax", "ay", "az"]', '["2", "3", "4"]')
     assert_array_equal(
         imported(ROWS, by_number)[0]["/inertial"]["specific_force_mps2"], inertial["specific_force_mps2"]
@@ -265,7 +265,7 @@ noise = { position_m = 0.5 }
     assert_allclose(streams["/fix"]["position_m"], places + noise, rtol=1e-15)
     assert notes["/fix: messages with simulated noise, position_m: 0.5"] == "4"
     assert (streams["/fix"]["position_m"] != imported(text, mapping)[0]["/fix"]["position_m"]).all()
-    with pytest.raises(BadInput, match="`noise` names position, which `fields` does not have"):
+    with pytest.raises(BadInput, match="`noise` names position, which are not in `fields`"):
         imported(text, mapping.replace("{ position_m = 0.5", "{ position = 0.5"))
 
 
@@ -296,7 +296,7 @@ def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
     assert recordings_in(mapping, tmp_path) == both
     assert recordings_in(mapping, both[1]) == both[1:]
     with pytest.raises(
-        BadInput, match=r"neither it nor a folder in it has the files .* \(GT.csv, IMU_{unit}.csv\)"
+        BadInput, match=r"neither this folder nor one in it has .* \(GT.csv, IMU_{unit}.csv\)"
     ):
         recordings_in(mapping, tmp_path / "part")
 
@@ -360,14 +360,14 @@ def test_cells_that_are_no_numbers_are_counted(imported: Callable[..., Any], tmp
     cells = ["0", "-inf", "infinity", "nan(0x7)", "1e+2147483648", "", "nan", "NaN"]
     text = "t,x,y\n" + "".join(f"{time},{cell},1\n" for time, cell in enumerate(cells))
     streams, notes = imported(text, POSITION)
-    assert notes["table.csv: x: cells that are no numbers, missing"] == "4"
+    assert notes["table.csv: x: cells that are not numbers, read as missing"] == "4"
     assert not [key for key in notes if key.startswith("table.csv: y")]
     missing = [np.nan] * 7
     assert_array_equal(streams["/position"]["position_m"][:, 0], [0.0, *missing])
     x = np.array([0.0, np.nan, np.inf])
     np.savez(tmp_path / "table.npz", t=np.arange(3.0), x=x, y=np.ones(3))
     streams, notes = imported(tmp_path / "table.npz", POSITION)
-    assert notes["table.npz: x: cells that are no numbers, missing"] == "1"
+    assert notes["table.npz: x: cells that are not numbers, read as missing"] == "1"
     assert_array_equal(streams["/position"]["position_m"][:, 0], [0.0, np.nan, np.nan])
 
 
@@ -492,20 +492,20 @@ def test_the_other_navigation_data(imported: Callable[..., Any], navigation: Pat
         0.591234406176474,
         -0.10000003381003134,
     ]
-    assert notes["IMU_2.csv: stamps repeat, and are kept"] == "3"
+    assert notes["IMU_2.csv: stamps repeat, but are kept"] == "3"
     assert len(streams["/fix"]) == 55
     assert streams["/prior"].publish_time_ns.tolist() == [streams["/truth"].publish_time_ns[0]]
 
     streams, notes = imported(navigation / "uwb_lias", "uwb-lias")
     ranges, truth = streams["/ranges"], streams["/truth"]
     assert notes["/ranges: messages left out: NaN or infinite"] == "7"
-    assert notes["motion_capture_dynamic_exp_mid.csv: stamps repeat, and are kept"] == "198"
+    assert notes["motion_capture_dynamic_exp_mid.csv: stamps repeat, but are kept"] == "198"
     residual = _residual(ranges, truth, streams["/anchors"], streams["/tags"])
     assert residual.std() == pytest.approx(0.096, abs=5e-4)
     assert residual.mean() == pytest.approx(0.179, abs=5e-4)
 
     streams, notes = imported(navigation / "uwb_outdoor/LOS/Trajectory_A/Case_1", "uwb-outdoor")
-    assert notes["ESKF.csv: stamps repeat, and are kept"] == "19"
+    assert notes["ESKF.csv: stamps repeat, but are kept"] == "19"
     truth, published = streams["/truth"], streams["/published/LS"]
     assert truth.publish_time_ns[0] == 1734501485_500326700
     inside = np.flatnonzero((truth["state"][:, 0] > 49.3) & (truth["state"][:, 1] > -5))
@@ -573,8 +573,8 @@ def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any],
     mapping = FIX.replace('time = { column = "t" }', 'time = { column = "t", zero = "2026-01-01" }')
     text = "t,lat,lon,h\n1,50,8,100\n3,50,8.001,100\n2,50.001,8,110\n3,,8,100\n3,,8,100\n4,50\n"
     _, notes = imported(text, mapping)
-    assert notes["table.csv: stamps go back, and are sorted"] == "1"
-    assert notes["table.csv: stamps repeat, and are kept"] == "1"
+    assert notes["table.csv: stamps go back in time, so they are sorted"] == "1"
+    assert notes["table.csv: stamps repeat, but are kept"] == "1"
     assert notes["/fix: messages left out: NaN or infinite"] == "2"
     assert notes["table.csv: rows left out, of another number of cells than 4"] == "1"
     import_log(
@@ -645,10 +645,10 @@ def test_a_million_rows_in_five_seconds(tmp_path: Path) -> None:
 
 
 BAD = [
-    (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; there are: time, ax"),
+    (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; available: time, ax"),
     (ROWS, INERTIAL, '"g"', '"m/s"', "the unit 'm/s' does not fit: specific_force_mps2 is in m/s^2"),
     (ROWS, INERTIAL, '"g"', '"0 g"', "the unit '0 g': its number must not be zero"),
-    (ROWS, INERTIAL, '"g"', '"gee"', "no unit 'gee'; there are: m, mm"),
+    (ROWS, INERTIAL, '"g"', '"gee"', "unknown unit 'gee'; available: m, mm"),
     (ROWS, INERTIAL, '"time"', '"note"', "column note has cells that are not numbers"),
     (ROWS, INERTIAL, '"ax"', '"note"', "table.csv: column note holds 'a'; expected numbers"),
     (ROWS, INERTIAL, "InertialSample", "Inertial", "did you mean 'InertialSample'?"),
@@ -656,7 +656,7 @@ BAD = [
     (ROWS, INERTIAL, ', "gz"]', "]", "field turn_rate_radps is given 2 columns; expected 3"),
     ("t,lat,lon,h\n1,90.5,8,0\n", FIX, "", "", "a latitude is 90.5 deg, beyond 90"),
     ("t,lat,lon,h\n1,x,8,0\n", FIX, "", "", "column lat holds 'x'; expected numbers"),
-    ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row has a time that can be read"),
+    ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row has a readable time"),
     ("t,lat,lon,h\n1,,8,0\n", FIX, "", "", "none of its rows could be imported"),
     ("t,lat,lon,h\n-1,1,8,0\n", FIX, "", "", "column t: a stamp is before 1970 or after"),
     ("t,lat,lon,h\n1767225600000,1,8,0\n", FIX, "", "", "or after 2262 (1767225600000"),
@@ -771,7 +771,7 @@ def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> 
     (folder / "imu_right.csv").write_text(ROWS.replace("1756402240", "12"))
     with pytest.raises(BadInput, match=r"mixed time bases: .*imu_right.csv begins 1.7564e"):
         imported(folder, mapping)
-    with pytest.raises(BadInput, match="say what its columns are with --mapping"):
+    with pytest.raises(BadInput, match="state the meaning of its columns with --mapping"):
         imported(folder, "")
     with pytest.raises(BadInput, match="no mapping 'wlak'; did you mean 'walk'"):
         imported(folder, "wlak")

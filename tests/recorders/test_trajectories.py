@@ -46,7 +46,7 @@ def test_poses_are_sorted_and_it_is_said(tmp_path: Path) -> None:
     assert found.position_m[:, 0].tolist() == [1, 1, 2, 3]
     how, mended = found.notes
     assert how.startswith(f"{path}: read as TUM (8 numbers: time in s")
-    assert mended == f"{path}: 1 stamps go back, 1 repeat; the poses were sorted"
+    assert mended == f"{path}: 1 stamps go back in time, 1 repeat; the poses were sorted"
 
 
 POSE = f"1 2 3 0 0 {HALF} {HALF}"  # as TUM a quarter turn about z, as EuRoC one of 180 deg about z and y
@@ -64,8 +64,8 @@ NANOSECONDS, UPTIME_NS = 1305031102160407123, 1200_000_000_000
         (UPTIME_NS, 50_000_000, ",", "euroc"),
         (0, 1, " ", "tum"),
         (0, 20_000, " ", "tum"),  # with spaces it is no EuRoC
-        (0, 100_000, ",", "may be s or ns: give --format tum or --format euroc"),
-        (NANOSECONDS, 50_000_000, " ", "in ns, with spaces"),
+        (0, 100_000, ",", "may be in s or ns; give --format tum or --format euroc"),
+        (NANOSECONDS, 50_000_000, " ", "in ns, and it has no commas"),
         (1305031102160, 50, ",", "in ms"),
         (1305031102160407, 1_000_000, ",", "in us"),
     ],
@@ -94,7 +94,7 @@ def test_a_first_column_that_numbers_the_poses_is_told(tmp_path: Path) -> None:
     for gap in (" ", ","):
         rows = [f"{row} {row * 0.1:.1f} {POSE}".replace(" ", gap) for row in range(1, 9)]
         path.write_text("\n".join(rows))
-        with pytest.raises(BadInput, match="its first column numbers the poses: leave it out"):
+        with pytest.raises(BadInput, match="its first column numbers the poses, so remove it"):
             read_trajectory(path)
 
 

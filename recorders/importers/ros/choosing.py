@@ -1,8 +1,8 @@
-"""Chooses what is taken of a bag: how each topic's messages are read, and what their streams are named.
+"""Choice of what is imported from a bag: how each topic is read, and the names of its streams.
 
-A stream is named by the namespace of its topic and by what it is: /odom gives /odometry, /robot1/imu
-gives /robot1/inertial. Where two topics would give the same name, both are named by the topic:
-/odom/odometry, /wheels/odometry. So are poses without a covariance, which may be goals: /goal_pose/pose.
+A stream is named by the namespace of its topic and by its kind: /odom gives /odometry, /robot1/imu gives
+/robot1/inertial. If two topics would give the same name, both include the topic: /odom/odometry,
+/wheels/odometry. So do poses without a covariance, which may be goals: /goal_pose/pose.
 """
 
 import re
@@ -21,7 +21,7 @@ from fuselog.recorders.importers.ros.parameters import RosParameters
 
 
 class Reader(NamedTuple):
-    """Describes how the messages of a connection are read; `taken` is None for transforms."""
+    """How the messages of a connection are read; `taken` is None for transforms."""
 
     type: MessageType
     taken: Taken | None
@@ -31,16 +31,16 @@ class Reader(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Describes how the messages of connections are read, and by topic why those of others are not."""
+    """How the messages of connections are read, and the reasons by topic why others are not."""
 
     readers: dict[Connection, Reader]
     not_taken: dict[str, str]
 
 
 def choose(bag: Bag, parameters: RosParameters) -> Choice:
-    """Choose what is taken of a bag.
+    """Choose what is imported from a bag.
 
-    Raises BadInput where what is asked for is not in the bag or cannot be read, or nothing is taken.
+    Raises BadInput if a requested topic is missing or cannot be read, or nothing can be imported.
     """
     connections = bag.connections
     mappings = _mappings(bag, parameters)
@@ -75,7 +75,7 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
 def stream_names(
     readers: Mapping[Connection, Reader], parameters: RosParameters
 ) -> dict[tuple[str, str], str]:
-    """Return the name of a stream by topic and kind."""
+    """Return the names of streams by topic and kind."""
 
     def below(topic: str, taken: Taken) -> str:
         own = topic if taken.is_doubtful else topic.rpartition("/")[0]
@@ -101,7 +101,7 @@ def stream_names(
 
 
 def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
-    """Return the mappings of messages of one's own, by type."""
+    """Return the mappings of user-defined messages, by type."""
     if parameters.mapping is None:
         return {}
     mappings = read_mapping(Path(parameters.mapping))
@@ -115,7 +115,7 @@ def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
 
 
 def _check_topics(bag: Bag, parameters: RosParameters) -> None:
-    """Raise BadInput where a topic that a parameter names is not there."""
+    """Raise BadInput if a topic that a parameter names is missing."""
     topics = sorted({each.topic for each in bag.connections})
     poses = [topic for _, topic in _poses_of(parameters)]
     for topic in [*parameters.topics, *parameters.names, *poses]:
@@ -130,7 +130,7 @@ def _poses_of(parameters: RosParameters) -> list[tuple[str, str]]:
 
 
 def _check_poses(bag: Bag, option: str, topic: str, readers: Mapping[Connection, Reader]) -> None:
-    """Raise BadInput where a topic whose poses are wanted has none."""
+    """Raise BadInput if a topic that should have poses has none."""
     reader = next((each for of, each in readers.items() if of.topic == topic), None)
     if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
         raise BadInput(f"{bag.path}: {option} = {topic}: this topic has no poses; name one that has")
@@ -139,7 +139,7 @@ def _check_poses(bag: Bag, option: str, topic: str, readers: Mapping[Connection,
 def _reader(
     connection: Connection, mapping: MessageMapping | None, parameters: RosParameters
 ) -> Reader | str:
-    """Choose how a connection is read, or say why it is not taken."""
+    """Choose how a connection is read; return the reason if it is not imported."""
     name = connection.type_name
     where = f"{parameters.mapping}: the mapping of {name}"
     is_transforms = name in TRANSFORM_TYPES

@@ -1,4 +1,4 @@
-"""Compares the clocks of a bag: the stamps of headers with those of the bag, by topic."""
+"""Comparison of the clocks of a bag: stamps of headers and of the bag, by topic."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from fuselog.recorders.importers.stamps import to_ns
 
 @dataclass
 class Clocks:
-    """Keeps by topic the span of the header's stamps, of the bag's, and of their difference, in ns."""
+    """The spans of the header's stamps, the bag's stamps and their difference, in ns, by topic."""
 
     header: dict[str, tuple[int, int]] = field(default_factory=dict)
     bag: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -23,8 +23,8 @@ class Clocks:
     def note(
         self, topic: str, stamp_ns: NDArray[np.int64] | None, log_time_ns: NDArray[np.int64]
     ) -> None:
-        """Take up the stamps of some messages (n,); without a header the bag's stand for both."""
-        if stamp_ns is not None:  # zero is none
+        """Add the stamps of some messages (n,); without a header, the bag's replace them."""
+        if stamp_ns is not None:  # zero means no stamp
             stamp_ns, log_time_ns = stamp_ns[stamp_ns != 0], log_time_ns[stamp_ns != 0]
         if not len(log_time_ns):
             return
@@ -35,7 +35,7 @@ class Clocks:
         _widen(self.offset, topic, behind)
 
     def check(self, path: Path, tolerance_s: float) -> None:
-        """Raise BadInput where topics are stamped by clocks that have nothing to do with one another."""
+        """Raise BadInput if topics have stamps of unrelated clocks."""
         early = min(self.offset, key=lambda topic: self.offset[topic][1], default="")
         late = max(self.offset, key=lambda topic: self.offset[topic][0], default="")
         apart_s = (self.offset[late][0] - self.offset[early][1]) * 1e-9 if self.offset else 0.0
@@ -50,7 +50,7 @@ class Clocks:
             )
 
     def notes(self) -> dict[str, str]:
-        """Return both clocks and their offset, in words."""
+        """Describe both clocks and their offset."""
         found = {}
         for name, spans in (("header", self.header), ("bag", self.bag)):
             if spans:
@@ -72,7 +72,7 @@ def _span(spans: Iterable[tuple[int, int]]) -> tuple[int, int]:
 
 
 def _date(stamp_ns: int) -> str:
-    """Write a stamp as a date, or in seconds where it is none of this century, as of a simulation."""
+    """Format a stamp as a date, or in seconds if it is before 2000, as in simulations."""
     if stamp_ns < 946_684_800_000_000_000:
         return f"{stamp_ns * 1e-9:.3f} s"
     return f"{datetime.fromtimestamp(stamp_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC"

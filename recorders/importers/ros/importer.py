@@ -1,4 +1,4 @@
-"""Imports ROS logs: topics become streams, and what is not taken is told."""
+"""Importer of ROS logs: topics become streams, and notes report what is not imported."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -24,14 +24,14 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.recording import Blocks, Importer
 
-# A block ends when it has so many messages, or bytes.
+# A block ends after this number of messages, or of bytes.
 _BLOCK_MESSAGES = 1 << 17
 _BLOCK_BYTES = 1 << 24
 
 
 @dataclass
 class _Pending:
-    """Holds messages of one size that wait to be read together: bytes (n, size), rows and stamps."""
+    """Messages of one size that wait to be read together: bytes (n, size), rows and stamps."""
 
     raw: list[NDArray[np.uint8]] = field(default_factory=list)
     rows: list[NDArray[np.int64]] = field(default_factory=list)
@@ -39,7 +39,7 @@ class _Pending:
 
 
 class _Import:
-    """Imports one bag: keeps what is chosen of it, what waits to be read, and what is to be told."""
+    """The import of one bag: the chosen topics, the messages that wait to be read, and the notes."""
 
     def __init__(self, bag: Bag, parameters: RosParameters) -> None:
         self.path, self._bag, self._parameters = bag.path, bag, parameters
@@ -54,19 +54,19 @@ class _Import:
         self._clocks, self._mountings = Clocks(), Mountings()
         self._chains = self._named_chains()
 
-    # What is read.
+    # Reading.
 
     def is_wanted(self, connection: Connection) -> bool:
-        """Tell whether the messages of a connection are read."""
+        """Test whether the messages of a connection are read."""
         return connection in self._readers
 
     @property
     def is_full(self) -> bool:
-        """Tell whether what waits is enough for a block."""
+        """Test whether enough messages wait for a block."""
         return self._waiting_messages >= _BLOCK_MESSAGES or self._waiting_bytes >= _BLOCK_BYTES
 
     def add(self, batch: Batch) -> None:
-        """Take up messages; they wait until there are enough for a block."""
+        """Add messages, which wait until there are enough for a block."""
         topic = batch.connection.topic
         for which, raw in by_size(batch.data, batch.begins, batch.lengths):
             pending = self._pending[batch.connection, raw.shape[1]]
@@ -78,7 +78,7 @@ class _Import:
         self._waiting_messages += len(batch.begins)
 
     def block(self, *, is_last: bool = False) -> list[Stream]:
-        """Return the streams of all that waits."""
+        """Make the streams of all waiting messages."""
         for (connection, _), pending in self._pending.items():
             rows, log_time_ns = np.concatenate(pending.rows), np.concatenate(pending.log_time_ns)
             for found in self._readers[connection].type.read(np.concatenate(pending.raw), rows):
@@ -134,7 +134,7 @@ class _Import:
         return transforms_of(messages, log_time_ns, where, quaternions, tell)
 
     def _named_chains(self) -> list[Chain]:
-        """Return the chains of the named pairs; all transforms of the bag are read once to find them."""
+        """Make the chains of the named pairs; this reads all transforms of the bag once."""
         pairs = []
         for text in self._parameters.transforms:
             parent, colon, child = text.partition(":")
@@ -152,7 +152,7 @@ class _Import:
             for which, raw in by_size(batch.data, batch.begins, batch.lengths):
                 for messages in reader.type.read(raw, which):
                     if isinstance(messages, Undecodable):
-                        continue  # told when it is read for the streams
+                        continue  # counted when it is read for the streams
                     logged_ns = batch.log_time_ns[messages.rows]
                     for pair, found in self._transforms(
                         batch.connection.topic, messages, logged_ns, lambda *_: None
@@ -190,15 +190,15 @@ class _Import:
         sent = Sent(topic, found.rows, found.stamp_ns, found.log_time_ns)
         self._streams.add(sent, part, [(frame, np.ones(len(found), bool))], name)
 
-    # What is told.
+    # Notes.
 
     @property
     def first_ns(self) -> int:
-        """Return the first publish time; zero where there is none."""
+        """Return the first publish time; zero if there is none."""
         return self._streams.first_ns or 0
 
     def check(self) -> None:
-        """Raise BadInput where the stamps are of several clocks, or nothing has come of the bag."""
+        """Raise BadInput if stamps are of several clocks, or nothing could be imported."""
         if self._parameters.clock == "header":
             self._clocks.check(self.path, self._parameters.clock_tolerance_s)
         if not self._streams.messages:
@@ -206,7 +206,7 @@ class _Import:
             raise BadInput(f"{self.path}: none of its topics could be imported: {facts}")
 
     def notes(self) -> dict[str, str]:
-        """Return what the bag had, by subject."""
+        """Write notes on the contents of the bag, by subject."""
         notes = self._clocks.notes()
         counts: Counter[str] = Counter()
         types = {}
@@ -243,7 +243,7 @@ class _Import:
 
 
 def _frames_of(messages: Messages, frame: str) -> Frames:
-    """Return the frames that messages (n,) name, the field `frame` and their child's."""
+    """Return the names of frames in messages (n,), from the field `frame` and the child's field."""
     stated = {
         name: messages.text(path)
         for name, path in (("frame_id", frame), ("child_frame_id", CHILD_FRAME))
@@ -264,10 +264,11 @@ def _frames_of(messages: Messages, frame: str) -> Frames:
 
 
 def read(path: Path, parameters: RosParameters) -> Blocks:
-    """Read a bag block by block; what is dropped, doubtful, lost or not taken is told in the notes.
+    """Read a bag block by block; notes report what is dropped, doubtful, lost or not imported.
 
-    The blocks raise BadInput where a bag cannot be read, what is asked for is not in it, or what it
-    holds cannot be: quaternions that are not unit, latitudes beyond 90 deg, stamps of several clocks.
+    Iterating the blocks raises BadInput if the bag cannot be read, a requested topic is missing, or the
+    data are impossible: quaternions not of unit length, latitudes beyond 90 deg, stamps of several
+    clocks.
     """
     found = Blocks(iter(()))
     found.blocks = _blocks(path, parameters, found)

@@ -1,8 +1,8 @@
-"""Decodes the bytes of ROS messages into columns, for any message type.
+"""Decoding of ROS messages into columns, for any message type.
 
-A message without strings and sequences has one byte layout. With them the layout depends on their
-lengths alone, and messages of one topic rarely differ in these: so the layout is found once, by walking
-one message along its definition, and all messages with the same lengths are read with it at once.
+A message without strings and sequences has one byte layout. Otherwise the layout depends only on their
+lengths, and messages of one topic rarely differ in these. So the layout is determined once, by walking
+along one message and its definition, and all messages with the same lengths are read with it together.
 Sources: wiki.ros.org/msg (ROS 1); OMG DDS-XTypes 1.3, section 7.4.1, plain CDR of version 1 (ROS 2).
 """
 
@@ -18,10 +18,10 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from fuselog.recorders.log.layout import windows
 
 Encoding = Literal["cdr", "ros1"]
-# What a definition says of each message type: its constants, and the names and types of its fields.
+# The constants of each message type, and the names and types of its fields.
 Definitions = Mapping[str, tuple[Any, Sequence[tuple[str, Any]]]]
 
-# Byte order and options of a serialised message, in front of it.
+# Byte order and options in front of a serialised message.
 _ENCAPSULATION_BYTES = 4
 _BYTE_ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 _NUMPY_TYPES = {
@@ -32,13 +32,13 @@ _IDL_BORDER = "=" * 80 + "\n"
 
 
 class Undecodable(ValueError):
-    """Says why a message, or a definition, cannot be decoded."""
+    """An error for a message or a definition that cannot be decoded; the text gives the reason."""
 
 
 def definitions_of(name: str, stated: MessageDefinition, distribution: str) -> Definitions:
-    """Return the type `name` and those within it, as the bag states them, else a distribution of ROS.
+    """Return the type `name` and the types in it, from the bag or else from a distribution of ROS.
 
-    Raises Undecodable where neither has the type.
+    Raises Undecodable if neither has the type.
     """
     try:
         if stated.format is MessageDefinitionFormat.MSG:
@@ -61,7 +61,7 @@ _BASE = get_typestore(Stores.EMPTY).fielddefs
 
 
 class _Number(NamedTuple):
-    """States where a number stands, or so many of them."""
+    """The position of a number, or of an array of `number` numbers."""
 
     offset: int
     dtype: np.dtype
@@ -69,7 +69,7 @@ class _Number(NamedTuple):
 
 
 class _Text(NamedTuple):
-    """States where a text stands, without the zero at its end."""
+    """The position of a text, without the zero at its end."""
 
     offset: int
     length: int
@@ -77,10 +77,10 @@ class _Text(NamedTuple):
 
 @dataclass
 class Layout:
-    """States where each field of a message is, for messages of equal lengths of texts and sequences.
+    """The position of each field of a message, valid for equal lengths of texts and sequences.
 
-    Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` are
-    the bytes, by their places, that all messages of the layout share: those of the lengths.
+    Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` has
+    the bytes, by position, that all messages of the layout share: those of the lengths.
     """
 
     numbers: dict[str, _Number] = field(default_factory=dict)
@@ -89,13 +89,13 @@ class Layout:
     fixed: dict[int, int] = field(default_factory=dict)
 
     def fits(self, raw: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return which of the messages (n, size) have this layout."""
+        """Test which of the messages (n, size) have this layout."""
         return (raw[:, list(self.fixed)] == np.array(list(self.fixed.values()), np.uint8)).all(axis=1)
 
 
 @dataclass(frozen=True)
 class Messages:
-    """Holds messages (n,) of one layout: the bytes (n, size) of each, and their rows in a topic."""
+    """Messages (n,) of one layout: their bytes (n, size), and their rows in the topic."""
 
     layout: Layout
     raw: NDArray[np.uint8]
@@ -105,7 +105,7 @@ class Messages:
         return len(self.rows)
 
     def numbers(self, path: str) -> NDArray:
-        """Read a field (n,), or (n, count) of an array; raises KeyError where there is none."""
+        """Read a field (n,), or an array (n, count); raise KeyError if there is none."""
         offset, dtype, count = self.layout.numbers[path]
         part = self.raw[:, offset : offset + dtype.itemsize * (1 if count is None else count)]
         if count == 0:
@@ -114,7 +114,7 @@ class Messages:
         return column[:, 0] if count is None else column
 
     def text(self, path: str) -> NDArray[np.bytes_]:
-        """Return a text (n,), as bytes; raises KeyError where there is none."""
+        """Read a text (n,) as bytes; raise KeyError if there is none."""
         offset, length = self.layout.texts[path]
         if not length:
             return np.zeros(len(self), "S1")
@@ -124,15 +124,15 @@ class Messages:
 def by_size(
     data: NDArray[np.uint8], begins: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Yield the bytes of messages, those of one size together.
+    """Yield the bytes of messages, grouped by size.
 
     Args:
-        data: holds all of them.
-        begins: (n,), at which byte of `data` each message begins.
-        lengths: (n,), how many bytes each has.
+        data: bytes of all messages.
+        begins: (n,), position in `data` where each message begins.
+        lengths: (n,), length of each message in bytes.
 
     Yields:
-        Which k of the n messages have a size (k,), and their bytes (k, size).
+        Indices (k,) of the messages with one size, and their bytes (k, size).
     """
     for size in np.unique(lengths).tolist():
         which = np.flatnonzero(lengths == size)
@@ -143,9 +143,9 @@ def by_size(
 
 
 class MessageType:
-    """Reads messages of one type and encoding; the layouts met so far are kept."""
+    """A reader of messages of one type and encoding, which keeps the layouts found so far."""
 
-    _MOST_LAYOUTS = 63  # of one size
+    _MOST_LAYOUTS = 63  # for each size
 
     def __init__(self, name: str, definitions: Definitions, encoding: Encoding) -> None:
         self.name = name
@@ -154,11 +154,11 @@ class MessageType:
         self._layouts: dict[int, list[Layout]] = {}
 
     def fields(self) -> dict[str, str]:
-        """Return the paths of all fields with one number each, or a fixed array, and their types."""
+        """Return the paths and types of all fields with a single number or a fixed array."""
         return dict(self._flat("", (Nodetype.NAME, self.name)))
 
     def read(self, raw: NDArray[np.uint8], rows: NDArray[np.int64]) -> Iterator[Messages | Undecodable]:
-        """Yield messages of one size (n, size) and their rows (n,), by layout; an error for others."""
+        """Yield messages of one size (n, size) with their rows (n,), by layout; errors for others."""
         while len(rows):
             try:
                 layout, same = self._next(raw)
@@ -173,7 +173,7 @@ class MessageType:
             raw, rows = raw[~same], rows[~same]
 
     def _next(self, raw: NDArray[np.uint8]) -> tuple[Layout, NDArray[np.bool_]]:
-        """Find the layout of the first of the messages (n, size), and which of all (n,) have it."""
+        """Find the layout of the first message (n, size), and test which messages (n,) have it."""
         known = self._layouts.setdefault(raw.shape[1], [])
         for layout in known:
             if layout.fits(raw[:1])[0]:
@@ -195,7 +195,7 @@ class MessageType:
 
 
 class _Walk:
-    """Walks along one message, field by field."""
+    """A walk along one message, field by field."""
 
     def __init__(self, definitions: Definitions, raw: bytes, encoding: Encoding) -> None:
         self._definitions, self._raw = definitions, raw
@@ -208,7 +208,7 @@ class _Walk:
         self._fix(0, 2 if self._is_cdr else 0)
 
     def layout(self, name: str) -> Layout:
-        """Return the layout; raises Undecodable where the message does not fit its definition."""
+        """Determine the layout; raise Undecodable if the message does not match its definition."""
         self._walk("", (Nodetype.NAME, name))
         behind = len(self._raw) - self._position
         if not 0 <= behind < (4 if self._is_cdr else 1):
@@ -251,7 +251,7 @@ class _Walk:
             self._step(dtype.itemsize * (1 if count is None else count))
 
     def _length(self) -> int:
-        """Read the length of a text or a sequence, which is a part of the layout."""
+        """Read the length of a text or sequence, which is a part of the layout."""
         self._align(4)
         place = self._position
         self._step(4)

@@ -1,4 +1,4 @@
-"""Maps messages of one's own: a TOML file says which of their fields become which stream.
+"""Mappings of user-defined messages: a TOML file states which of their fields become which stream.
 
 [messages."my_robot_msgs/msg/Wheels"]
 becomes = "VectorMeasurement"                 # one of fuselog's messages
@@ -23,11 +23,11 @@ from fuselog.recorders.parsing import read_toml
 
 
 class MessageMapping(StreamMapping):
-    """Holds what messages of one type become; sources are paths of their fields.
+    """What messages of one type become; sources are paths of their fields.
 
     Attributes:
         name: last part of the stream's name.
-        stamp: path of a time or a whole number of ns that says when it was measured.
+        stamp: path of a time, or of a whole number of ns, at which the message was measured.
         frame: path of the name of the frame.
     """
 
@@ -36,23 +36,22 @@ class MessageMapping(StreamMapping):
     frame: str = FRAME
 
     def paths(self) -> list[str]:
-        """Return the paths of all fields."""
+        """Return the paths of all fields that are used."""
         return [*self.sources(), *(source for source, _ in self.conditions())]
 
 
 class Mapping(Parameters):
-    """Holds the mappings of a file.
+    """The mappings in a file.
 
     Attributes:
-        messages: what becomes of messages, by the name of their type, such as
-            `my_robot_msgs/msg/Wheels`.
+        messages: mappings by the name of the type, such as `my_robot_msgs/msg/Wheels`.
     """
 
     messages: dict[str, MessageMapping] = Field(min_length=1)
 
 
 def read_mapping(path: Path) -> dict[str, MessageMapping]:
-    """Return a file of mappings; raises BadInput where it is none, or names what fuselog has not."""
+    """Read a file of mappings; raise BadInput if it is invalid, or names unknown messages or fields."""
     found = build(Mapping, read_toml(path), str(path)).messages
     for name, mapping in found.items():
         schema_of(mapping, f"{path}: the mapping of {name}")
@@ -60,7 +59,7 @@ def read_mapping(path: Path) -> dict[str, MessageMapping]:
 
 
 def taken(mapping: MessageMapping, where: str) -> Taken:
-    """Make what reads messages by a mapping; it raises BadInput where they lack a field."""
+    """Make the reader of messages for a mapping; it raises BadInput if they lack a field."""
     schema = schema_of(mapping, where)
 
     def parts(messages: Messages) -> Iterator[Part]:

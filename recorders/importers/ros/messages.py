@@ -1,7 +1,7 @@
-"""Maps each type of ROS messages to its streams, their columns, and what their channels state.
+"""The streams of each type of ROS message, their columns, and the metadata of their channels.
 
-The types are those of common_interfaces and vision_msgs; the conventions on what is unknown are those
-of sensor_msgs: a covariance of zeros, or whose first number is -1, is none.
+The types are those of common_interfaces and vision_msgs. As in sensor_msgs, a covariance is unknown if
+it is zero, or if its first number is -1.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -19,11 +19,11 @@ from fuselog.recorders.models.orientation import heading
 Floats = NDArray[np.float64]
 STAMP, FRAME, CHILD_FRAME = "header.stamp", "header.frame_id", "child_frame_id"
 _NO_FIX = -1  # sensor_msgs/NavSatStatus
-# A motion in the plane has less than this of the rest, in m/s and rad/s.
+# Motion counts as planar if its other components are below this, in m/s and rad/s.
 _PLANAR = 1e-6
 _DIAGONAL = [0, 4, 8]
-# Standard deviations that readings can have, by the noise density that is stated of them, and their
-# unit: drivers write variances such as 1e-9 and 1e6 where they know nothing.
+# Plausible standard deviations of readings and their unit, by the noise density stated for them: drivers
+# write variances such as 1e-9 and 1e6 if they do not know any.
 SIGMAS = {
     "forward_noise_density": (1e-4, 10.0, "m/s"),
     "turn_noise_density": (1e-5, 10.0, "rad/s"),
@@ -34,18 +34,18 @@ SIGMAS = {
 
 @dataclass(frozen=True)
 class Part:
-    """Holds what some messages (n,) say for one stream.
+    """What some messages (n,) contribute to one stream.
 
     Attributes:
-        kind: the last part of the stream's name.
-        columns: the fields (k,) or (k, width) of the stream's schema.
-        metadata: what the channel states.
-        constants: columns (k, width) of which the channel states the first value, by their names there.
-        noise: variances (k,) of readings, by the noise density that the channel states of them.
-        rows: of which message each is; None where there is one of each.
-        dropped: by reason, which (k,) are left out.
-        doubtful: by reason, which (k,) are kept all the same.
-        lacking: by field, which (k,) state that they have no such data; their columns are NaN there.
+        kind: last part of the stream's name.
+        columns: fields (k,) or (k, width) of the stream's schema.
+        metadata: metadata of the channel.
+        constants: columns (k, width) whose first value becomes metadata, by their names there.
+        noise: variances (k,) of readings, by the noise density that the channel states for them.
+        rows: message of each row; None if there is one row for each message.
+        dropped: rows (k,) to leave out, by reason.
+        doubtful: rows (k,) that are kept but counted, by reason.
+        lacking: rows (k,) that state that they have no such data, by field; their columns are NaN there.
     """
 
     kind: str
@@ -61,13 +61,13 @@ class Part:
 
 
 class Taken(NamedTuple):
-    """Describes how messages of a type are taken.
+    """How messages of a type are imported.
 
     Attributes:
-        kinds: of the streams that they give.
-        parts: what reads them.
-        is_doubtful: whether the type leaves open what they are, a measurement, a goal or the truth; then
-            their streams are named by the whole topic, and no model takes them unasked.
+        kinds: kinds of the streams made from them.
+        parts: function that reads the messages.
+        is_doubtful: whether the type does not say if they are a measurement, a goal or the truth; then
+            streams are named after the whole topic, and no model uses them by default.
     """
 
     kinds: tuple[str, ...]
@@ -76,7 +76,7 @@ class Taken(NamedTuple):
 
 
 def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray[np.int64] | None:
-    """Read stamps (n,) in ns of a field, a time or a whole number of ns; None where there is none."""
+    """Read stamps (n,) in ns from a field, a time or a whole number of ns; None if it is missing."""
     numbers = messages.layout.numbers
     if path in numbers:
         return to_ns(messages.numbers(path), 1, where=where + path)
@@ -87,17 +87,17 @@ def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray
 
 
 def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:
-    """Return the numbers (n, d) that a field such as a Vector3 has under `names`."""
+    """Read the numbers (n, d) that a field such as a Vector3 has under `names`."""
     return np.stack([messages.numbers(f"{path}.{name}") for name in names], axis=1).astype(float)
 
 
 def quaternion(messages: Messages, path: str) -> Floats:
-    """Return a quaternion (n, 4): w, x, y, z."""
+    """Read a quaternion (n, 4): w, x, y, z."""
     return vector(messages, path, "wxyz")
 
 
 def covariance(messages: Messages, path: str) -> Floats:
-    """Return a covariance (n, d * d), row-major; NaN where it is unknown."""
+    """Read a covariance (n, d * d), row-major; NaN if it is unknown."""
     found = messages.numbers(path).astype(float, copy=False)
     unknown = found[:, 0] == -1.0
     may_be_zeros = np.flatnonzero(found[:, 0] == 0.0)
@@ -106,12 +106,12 @@ def covariance(messages: Messages, path: str) -> Floats:
 
 
 def has_none(messages: Messages, path: str) -> NDArray[np.bool_]:
-    """Tell which messages (n,) state by a covariance that begins with -1 that they have no such data."""
+    """Test which messages (n,) state by a covariance that begins with -1 that they have no such data."""
     return np.asarray(messages.numbers(path)[:, 0] == -1.0)
 
 
 def _denied(messages: Messages, what: str, path: str) -> dict[str, NDArray[np.bool_]]:
-    """Return which messages to drop as their covariance says that there is no such data; see `Part`."""
+    """Return the messages to drop since their covariance says that there is no such data; see `Part`."""
     return {f"without {what}: {path}[0] is -1": has_none(messages, path)} if path else {}
 
 
@@ -195,7 +195,7 @@ def _magnetic(messages: Messages) -> Iterator[Part]:
 
 
 def _odometry(messages: Messages) -> Iterator[Part]:
-    """Yield the twist, as a body's in the plane and in full, and the pose that the robot made of it."""
+    """Yield the twist, for the plane and in full, and the pose that the robot integrated from it."""
     velocity, turn = vector(messages, "twist.twist.linear"), vector(messages, "twist.twist.angular")
     beside = np.abs(np.concatenate([velocity[:, 1:], turn[:, :2]], axis=1)).max(axis=1)
     spread = covariance(messages, "twist.covariance")
@@ -250,7 +250,7 @@ TRUTH: Mapping[str, str] = {
 
 
 def as_truth(part: Part) -> Part:
-    """Take poses as the reference that estimates are compared with, in the plane and in space."""
+    """Convert poses to the truth that estimates are compared with, in the plane and in space."""
     orientation = part.columns["quaternion"]
     state = np.column_stack([part.columns["position_m"], heading(orientation), orientation])
     metadata = {"components": ",".join(TRUTH), "kinds": ",".join(TRUTH.values())}
@@ -258,9 +258,9 @@ def as_truth(part: Part) -> Part:
 
 
 def as_estimate(part: Part, truth: str) -> Part:
-    """Take poses as the estimates of another filter, which are compared with the topic `truth`.
+    """Convert poses to the estimates of another filter, which are compared with the topic `truth`.
 
-    The covariance of a pose is of x, y, z and rotations about the fixed axes.
+    The covariance of a pose is that of x, y, z and rotations about the fixed axes.
     """
     components = {name: kind for name, kind in TRUTH.items() if kind != "angle"}
     metadata = {"components": ",".join(components), "kinds": ",".join(components.values())}
@@ -294,7 +294,7 @@ def _orientation(messages: Messages) -> Iterator[Part]:
 
 
 def _range(messages: Messages) -> Iterator[Part]:
-    """Take ranges as REP 117 has them: beyond the limits there is none."""
+    """Yield ranges as in REP 117: values beyond the limits are not measurements."""
     distance = messages.numbers("range").astype(float)
     least, most = messages.numbers("min_range"), messages.numbers("max_range")
     yield Part(
@@ -311,7 +311,7 @@ def _range(messages: Messages) -> Iterator[Part]:
 
 
 def _detections(names: str, unit: str) -> Taken:
-    """Take a scan for each message, and its detections: the centres of the boxes."""
+    """Read a scan from each message, and its detections: the centres of the boxes."""
 
     def parts(messages: Messages) -> Iterator[Part]:
         count, size = messages.layout.counts["detections"], len(messages)
@@ -344,7 +344,7 @@ def _detections(names: str, unit: str) -> Taken:
 
 
 def _measured(components: Mapping[str, str]) -> Taken:
-    """Take numbers without a meaning that the type tells: fields by the components' names."""
+    """Read numbers whose meaning the type does not define: fields by the names of components."""
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * len(components))}
 
     def parts(messages: Messages) -> Iterator[Part]:

@@ -1,4 +1,4 @@
-"""Reports how sensors are mounted by what a bag's transforms say, and the settings that use it."""
+"""Notes on the mounting of sensors from a bag's transforms, with the settings that use it."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,19 +10,19 @@ from fuselog.recorders.importers.ros.transforms import Chain, Floats, Pair, Tran
 from fuselog.recorders.log import schemas
 
 BASES = ("base_link", "base_footprint", "base")
-LEAST = 1e-4  # m and rad, of what is worth a setting
+LEAST = 1e-4  # m and rad; smaller values get no setting
 FIX, UNIT = schemas.GEODETIC_FIX.full_name, schemas.INERTIAL_SAMPLE.full_name
 
 
 class Mountings:
-    """Keeps the transforms that never change, sent once or again and again."""
+    """The transforms that never change, whether sent once or repeatedly."""
 
     def __init__(self) -> None:
         self._fixed: dict[Pair, Transforms] = {}
         self._moving: set[Pair] = set()
 
     def add(self, pair: Pair, found: Transforms) -> None:
-        """Take up transforms of a pair of frames."""
+        """Add transforms of a pair of frames."""
         if not len(found) or pair in self._moving:
             return
         first = self._fixed.setdefault(pair, found.take(slice(0, 1)))
@@ -32,10 +32,10 @@ class Mountings:
             del self._fixed[pair]
 
     def notes(self, streams: Mapping[str, tuple[str, Mapping[str, str]]]) -> Iterator[tuple[str, str]]:
-        """Yield notes on fixes and inertial samples whose frames are elsewhere on the body, by subject.
+        """Yield notes on fixes and inertial samples whose frames are not the body's, by subject.
 
         Args:
-            streams: their messages' names and metadata, by topic.
+            streams: names of messages and metadata, by topic.
         """
         odometry = schemas.ODOMETRY.full_name
         bodies = [each.get("child_frame_id") for name, each in streams.values() if name == odometry]
@@ -69,7 +69,7 @@ class Mountings:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 
     def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
-        """Say that a frame moves on the body; empty if none of the bases carries it."""
+        """Write that a frame moves on the body; empty if none of the bases carries it."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:
@@ -85,7 +85,7 @@ class Mountings:
         return ""
 
     def _pose(self, bases: list[str], stated: Mapping[str, str]) -> tuple[str, Floats, Rotation] | None:
-        """Find where a stream's frame is on the body, by the first of the bases that it is fixed to."""
+        """Find the position of a stream's frame on the body, from the first base that it is fixed to."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:

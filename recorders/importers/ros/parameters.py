@@ -1,4 +1,4 @@
-"""Defines the parameters of an import of ROS."""
+"""The parameters of an import from ROS."""
 
 from typing import Annotated, Literal
 
@@ -22,25 +22,25 @@ Names = Annotated[list[str], BeforeValidator(_as_list)]
 
 
 class RosParameters(Parameters):
-    """States which topics are imported, and by which clock.
+    """Which topics are imported, and by which clock.
 
     Attributes:
-        clock: what gives the publish time: the message's header, or the bag.
-        topics: the topics to import; without any, all that can be.
-        transforms: pairs of frames such as "map:base_link", whose poses are composed from TF; without
-            any, every transform is imported as it was sent.
+        clock: source of the publish time: the message's header, or the bag.
+        topics: topics to import; by default all that can be imported.
+        transforms: pairs of frames such as "map:base_link", whose poses are composed from TF; by default
+            every transform is imported as it was sent.
         names: replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic under
             /robot1.
         truth: topic whose poses become the stream `truth`, with which estimates are compared.
-        estimates: topics whose poses are those of another filter, such as /odometry/filtered: they
-            become estimates, which `fuselog evaluate` judges, and are no measurements.
+        estimates: topics with the poses of another filter, such as /odometry/filtered: they become
+            estimates, which `fuselog evaluate` judges, and not measurements.
         mapping: a TOML file for messages of your own.
-        distribution: which one's definitions hold for messages that the bag does not define.
-        clock_tolerance_s: headers that differ by more are refused as those of several clocks.
-        origin: latitude and longitude (deg) and perhaps height (m) of the origin of the plane that poses
-            and positions are in, whatever their frames are called; not that of transforms, nor of what
-            an odometry adds up to.
-        quaternions: what becomes of messages whose quaternions are not of unit length: "refuse" stops
+        distribution: distribution whose definitions are used for messages that the bag does not define.
+        clock_tolerance_s: headers that differ by more are rejected, as they have different clocks.
+        origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
+            plane of poses and positions, whatever their frames are called; it does not apply to
+            transforms, nor to poses that odometry integrates.
+        quaternions: what to do with messages whose quaternions are not of unit length: "refuse" stops
             the import, "normalise" scales them, "skip" leaves such messages out.
     """
 

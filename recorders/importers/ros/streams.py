@@ -1,4 +1,4 @@
-"""Makes the streams of a bag: keeps what waits for the end of a block, and counts."""
+"""Streams of a bag: messages are collected until the end of a block, and facts are counted."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -23,12 +23,12 @@ from fuselog.recorders.importers.ros.parameters import Clock
 from fuselog.recorders.log import Schema, Stream, make_stream
 from fuselog.recorders.log.planes import Origin, is_planar
 
-# Names of frames, and which messages (n,) name them.
+# Names of frames, and the messages (n,) that have them.
 Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
 
 
 class Sent(NamedTuple):
-    """Holds messages (n,) of a topic: their places in it, and their stamps; None without a header."""
+    """Messages (n,) of a topic: their rows in it, and their stamps; None without a header."""
 
     topic: str
     rows: NDArray[np.int64]
@@ -37,7 +37,7 @@ class Sent(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Holds some messages of a stream, which are one of its parts of a block."""
+    """Some messages of a stream within a block."""
 
     rows: NDArray[np.int64]
     publish_time_ns: NDArray[np.int64]
@@ -48,7 +48,7 @@ class _Piece(NamedTuple):
 
 @dataclass
 class _Written:
-    """Holds what a stream keeps from its first block to its last."""
+    """What is kept of a stream from its first block to its last."""
 
     schema: Schema
     metadata: dict[str, str]
@@ -61,13 +61,13 @@ class _Written:
 
 
 class StreamMaker:
-    """Makes streams block by block, and counts what is dropped or doubtful.
+    """A maker of streams, block by block, that counts dropped and doubtful messages.
 
     Attributes:
-        counts: how many, by subject and fact.
-        came_of: what has come of a topic, in the order in which it came.
-        first_ns: the first publish time of all.
-        noise: what is stated of the noise of a topic, or why nothing is.
+        counts: counts by subject and fact.
+        came_of: what was made from a topic, in the order in which it came.
+        first_ns: first publish time of all streams.
+        noise: the noise stated for a topic, or the reason why none is.
     """
 
     def __init__(
@@ -89,12 +89,12 @@ class StreamMaker:
 
     @property
     def messages(self) -> int:
-        """Count the messages that have come of the bag."""
+        """Count the messages made from the bag so far."""
         return sum(written.messages for written in self._written.values())
 
     @property
     def described(self) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """Return the messages' names and the metadata of all streams, by topic."""
+        """Return the names of messages and the metadata of all streams, by topic."""
         return {topic: (each.schema.full_name, each.metadata) for topic, each in self._written.items()}
 
     def tell(self, subject: str, fact: str, count: int) -> None:
@@ -103,7 +103,7 @@ class StreamMaker:
             self.counts[subject, fact] += count
 
     def add(self, sent: Sent, part: Part, frames: Frames, name: str = "") -> None:
-        """Take up a part of messages (n,), for the stream `name` or that of their topic and frames."""
+        """Add a part of messages (n,) to the stream `name`, or to that of their topic and frames."""
         keep = self._kept(sent, part)
         for frame, which in frames:
             rows = np.flatnonzero(keep & (which if part.rows is None else which[part.rows]))
@@ -111,13 +111,13 @@ class StreamMaker:
                 self._put(name or self._name(sent.topic, part.kind, frame), sent, part, rows, frame)
 
     def block(self) -> list[Stream]:
-        """Return the streams of all that waits."""
+        """Make the streams of all collected messages."""
         return [
             self._stream(topic, written) for topic, written in self._written.items() if written.pieces
         ]
 
     def _kept(self, sent: Sent, part: Part) -> NDArray[np.bool_]:
-        """Return which (k,) of a part are kept; the others are counted by reason."""
+        """Test which messages (k,) of a part are kept; count the others by reason."""
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
@@ -141,7 +141,7 @@ class StreamMaker:
         return keep
 
     def _name(self, topic: str, kind: str, frame: Mapping[str, str]) -> str:
-        """Name the stream of a topic, kind and frames; a second frame of the topic has its own."""
+        """Name the stream of a topic, kind and frames; further frames get their own streams."""
         key = (topic, kind, *frame.values())
         if key not in self._streams:
             name = self._names[topic, kind]
@@ -150,7 +150,7 @@ class StreamMaker:
         return self._streams[key]
 
     def _plane_of(self, topic: str, part: Part, metadata: Mapping[str, str]) -> dict[str, str]:
-        """Return the origin a stream states: none of transforms, nor of what an odometry adds up to."""
+        """Return the origin for a stream's channel; empty for transforms and poses from odometry."""
         is_own = part.kind == "odometry_pose" or (topic, part.kind) not in self._names
         if self._origin is None or is_own or not is_planar(part.schema.full_name, metadata):
             return {}
@@ -164,7 +164,7 @@ class StreamMaker:
         rows: NDArray[np.int64],
         frame: Mapping[str, str],
     ) -> None:
-        """Take up the rows (k,) of a part for a stream."""
+        """Add rows (k,) of a part to a stream."""
         size = len(next(iter(part.columns.values())))
         which = slice(None) if len(rows) == size else rows
         where = f"{self._path}: topic {sent.topic}"
@@ -197,7 +197,7 @@ class StreamMaker:
         self.came_of[sent.topic][name] = None
 
     def _state_noise(self, topic: str, written: _Written, steps_ns: NDArray[np.int64]) -> None:
-        """State the noise densities of a stream by the first of its variances that is known."""
+        """State the noise densities of a stream from the first of its variances that is known."""
         step_s = 1e-9 * float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else 0.0
         for name, variances in written.noise.items():
             known = variances[variances > 0.0]  # not zero, NaN or negative
@@ -213,7 +213,7 @@ class StreamMaker:
             self.noise[f"{topic}: {name}"] = statement
 
     def _stream(self, topic: str, written: _Written) -> Stream:
-        """Return what waits for a stream, in the order in which the bag has it."""
+        """Make a stream of the collected messages, in the order of the bag."""
         parts = written.pieces
         log_time_ns = np.concatenate([part.log_time_ns for part in parts])
         rows = np.concatenate([part.rows for part in parts])
@@ -223,8 +223,8 @@ class StreamMaker:
         steps_ns = np.diff(
             published, prepend=published[0] - 1 if written.last_ns < 0 else written.last_ns
         )
-        self.tell(topic, "stamps repeat, and are kept", int((steps_ns == 0).sum()))
-        self.tell(topic, "stamps go back, and are sorted", int((steps_ns < 0).sum()))
+        self.tell(topic, "stamps repeat, but are kept", int((steps_ns == 0).sum()))
+        self.tell(topic, "stamps go back in time, so they are sorted", int((steps_ns < 0).sum()))
         if not written.messages:
             self._state_noise(topic, written, np.diff(np.sort(published)))
         written.last_ns = int(published[-1])
@@ -248,5 +248,5 @@ class StreamMaker:
 
 
 def in_words(values: NDArray) -> str:
-    """Write numbers (n,) with commas between them."""
+    """Format numbers (n,) separated by commas."""
     return ",".join(f"{value:.9g}" for value in values.tolist())

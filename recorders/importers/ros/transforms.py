@@ -1,9 +1,9 @@
-"""Reads transforms between frames (TF): those sent, as poses, and named pairs composed of them.
+"""Transforms between frames (TF): those sent, as poses, and named pairs that are composed from them.
 
 A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
-that part of its chain which is sent most often; the others are interpolated between the two nearest,
-linearly and along the shortest rotation, as tf2 does it, and never beyond their ends. What is held is
-what no such time has passed, so that memory stays bounded.
+the part of its chain that is sent most often. The others are interpolated between the two nearest
+transforms, linearly and along the shortest rotation, as in tf2, and never extrapolated. Transforms are
+kept only until they are no longer needed, so that memory stays bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,9 +30,9 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class Transforms:
-    """Holds poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
+    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
 
-    `rows` says of which message of its topic each is.
+    `rows` has the message of the topic from which each comes.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -45,7 +45,7 @@ class Transforms:
         return len(self.stamp_ns)
 
     def take(self, rows: NDArray | slice) -> "Transforms":
-        """Return some of them."""
+        """Select some of the transforms."""
         return Transforms(
             self.stamp_ns[rows],
             self.log_time_ns[rows],
@@ -65,13 +65,13 @@ def transforms_of(
     """Yield the transforms in messages, by parent and child.
 
     Args:
-        messages: n of them.
-        log_time_ns: (n,), the stamps of the recorder.
-        where: what a message to the user begins with.
-        quaternions: what becomes of those that are not of unit length.
-        tell: is told a fact about transforms, and of how many it holds.
+        messages: n messages.
+        log_time_ns: (n,), stamps of the recorder, in ns.
+        where: beginning of error messages.
+        quaternions: what to do with quaternions that are not of unit length.
+        tell: function called with a fact about transforms, and their number.
 
-    Raises BadInput if a quaternion is not of unit length, and neither scaled nor left out.
+    Raises BadInput if a quaternion is not of unit length, and is neither scaled nor left out.
     """
     for number in range(messages.layout.counts["transforms"]):
         path = f"transforms.{number}"
@@ -108,7 +108,7 @@ def _frame(name: bytes) -> str:
 
 
 def join(parts: Sequence[Transforms]) -> Transforms:
-    """Join parts in the order of their stamps."""
+    """Join transforms in the order of their stamps."""
     joined = Transforms(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.log_time_ns for part in parts]),
@@ -120,15 +120,15 @@ def join(parts: Sequence[Transforms]) -> Transforms:
 
 
 class Chain:
-    """Holds a pair of frames, and the transforms that lead from one to the other.
+    """A pair of frames, and the transforms that lead from one to the other.
 
     Args:
         pair: parent and child.
-        sent: how often each transform is sent.
-        static: those that hold for good.
+        sent: number of messages of each transform.
+        static: transforms that never change.
 
-    `left_out` counts the stamps at which not every part of the chain is known, or which come too late.
-    Raises BadInput where no transforms lead from one to the other.
+    `left_out` counts the stamps at which a part of the chain is unknown, or that come too late. Raises
+    BadInput if no transforms lead from one frame to the other.
     """
 
     def __init__(self, pair: Pair, sent: Mapping[Pair, int], static: Mapping[Pair, Transforms]) -> None:
@@ -142,13 +142,13 @@ class Chain:
         self.left_out = 0
 
     def add(self, pair: Pair, found: Transforms) -> None:
-        """Take up transforms, where they are of the chain."""
+        """Add transforms, if they belong to the chain."""
         if pair in self._held and len(found):
             self._held[pair].append(found)
             self.left_out += int((found.stamp_ns <= self._done_ns).sum()) if pair == self._leader else 0
 
     def composed(self, *, is_last: bool = False) -> Transforms | None:
-        """Return the pair's poses since the last call, up to where every part of the chain is known."""
+        """Compose the pair's poses since the last call, up to where the whole chain is known."""
         if self._leader is None or not all(self._held.values()):
             return None
         held = {link: join(parts) for link, parts in self._held.items()}
@@ -159,7 +159,7 @@ class Chain:
         wanted = leader.take((leader.stamp_ns > self._done_ns) & (leader.stamp_ns <= known_ns))
         self._done_ns = max(self._done_ns, int(known_ns))
         for link, part in held.items():
-            # the last one before stays, for what is interpolated from it
+            # keep the last earlier one for interpolation
             first = max(int(np.searchsorted(part.stamp_ns, known_ns, side="right")) - 1, 0)
             self._held[link] = [part.take(slice(first, None))]
         inside = np.ones(len(wanted), bool)
@@ -175,14 +175,14 @@ class Chain:
 
     @property
     def static(self) -> Transforms | None:
-        """Return the pair's pose, where it never changes."""
+        """Return the pair's pose if it never changes, else None."""
         if self._held:
             return None
         zero = np.zeros(1, np.int64)
         return self._product({}, Transforms(zero, zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
 
     def _product(self, moving: Mapping[Pair, Transforms], wanted: Transforms) -> Transforms:
-        """Compose the chain's transforms one after another, at the wanted stamps."""
+        """Compose the chain's transforms in turn, at the wanted stamps."""
         position = np.zeros((len(wanted), 3))
         orientation = np.tile([1.0, 0.0, 0.0, 0.0], (len(wanted), 1))
         for link, is_forward in self._links:
@@ -202,10 +202,10 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
     Args:
         given: transforms in the order of their stamps.
-        stamp_ns: (n,), within those of the given ones.
+        stamp_ns: (n,), stamps within those of `given`.
 
     Returns:
-        n transforms; their other stamps and their rows have no meaning.
+        n transforms; their other stamps and rows are meaningless.
     """
     last = len(given) - 1
     after = np.clip(np.searchsorted(given.stamp_ns, stamp_ns), 0, last)
@@ -224,7 +224,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
 
 def path_between(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
-    """Find the links from one frame to the other, and whether each is taken in its direction."""
+    """Find the links from one frame to the other, and whether each is followed in its direction."""
     above = {child: parent for parent, child in links}
     parent, child = pair
     for frame in pair:

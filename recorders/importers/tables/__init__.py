@@ -1,4 +1,4 @@
-"""Imports tables of others, such as CSV files: a mapping says what their columns are.
+"""Importer of tables, such as CSV files: a mapping defines the meaning of their columns.
 
-Begin with `rows`, which makes streams of the rows of one file; `importer` takes all files together.
+Begin with `rows`, which makes streams from the rows of one file; `importer` combines all files.
 """

@@ -1,4 +1,4 @@
-"""Reads texts in blocks of whole lines, none of which is too long: memory holds one block."""
+"""Readers of texts in blocks of whole lines with a limited length, so that memory holds one block."""
 
 import io
 from collections import Counter
@@ -13,9 +13,10 @@ COMMENTS = (b"%", b"#")
 
 
 def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
-    """Yield whole lines, as many as a block takes; raises ValueError where a line is longer.
+    """Yield blocks of as many whole lines as fit; raise ValueError if a line is too long.
 
-    Of the last line, which may have no end, there is no block by itself; that is added to `doubts`.
+    The last line, which may lack its end, never is a block of its own; if it lacks its end, `doubts`
+    says so.
     """
     lines = rest = b""
     while block := file.read(BLOCK_BYTES):
@@ -34,7 +35,7 @@ def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
 
 
 def lines_of(file: BinaryIO) -> Iterator[bytes]:
-    """Yield the lines one by one; raises ValueError where one is longer than a block."""
+    """Yield the lines one by one; raise ValueError if one is longer than a block."""
     while line := file.readline(BLOCK_BYTES + 1):
         if len(line) > BLOCK_BYTES:
             raise ValueError(f"it has a line of more than {BLOCK_BYTES >> 20} MB")
@@ -42,17 +43,17 @@ def lines_of(file: BinaryIO) -> Iterator[bytes]:
 
 
 class Chunks(io.RawIOBase):
-    """Gives chunks of bytes, one after the other, as a file."""
+    """A file made from an iterator of chunks of bytes."""
 
     def __init__(self, chunks: Iterator[bytes]) -> None:
         self._chunks, self._rest = chunks, b""
 
     def readable(self) -> bool:
-        """Tell whether files can be read, as they are asked."""
+        """Return True, which makes this a readable file."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Fill the buffer as far as the chunk in hand goes; 0 at the end."""
+        """Fill the buffer from the current chunk; return the number of bytes, 0 at the end."""
         while not self._rest:
             chunk = next(self._chunks, None)
             if chunk is None:
@@ -65,13 +66,13 @@ class Chunks(io.RawIOBase):
 
 
 def utf8(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield blocks with what is not UTF-8 replaced: Arrow's handler of rows takes no other bytes."""
+    """Replace invalid UTF-8 in blocks, since Arrow's handler of invalid rows accepts no other bytes."""
     for block in blocks:
         yield block.decode("utf-8", "replace").encode()
 
 
 def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield lines whose cells stand between white space, with commas; comments are passed over."""
+    """Yield lines with commas in place of the white space between cells, without comments."""
     for block in blocks:
         yield b"".join(
             b",".join(line.split()) + b"\n"
@@ -81,7 +82,7 @@ def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
 
 
 def without(blocks: Iterator[bytes], heads: Sequence[bytes], left_out: Counter[str]) -> Iterator[bytes]:
-    """Yield blocks without the lines that repeat the header; these are counted."""
+    """Yield blocks without lines that repeat the header, which are counted."""
     for block in blocks:
         if any(head in block for head in heads):
             lines = block.splitlines(keepends=True)
@@ -93,7 +94,7 @@ def without(blocks: Iterator[bytes], heads: Sequence[bytes], left_out: Counter[s
 
 
 def joined(opened: Callable[[Path], BinaryIO], paths: Sequence[Path]) -> Iterator[bytes]:
-    """Yield the bytes of files one after the other, each ended by a newline; one is open at a time."""
+    """Yield the bytes of files in turn, each ended by a newline; one file is open at a time."""
     for path in paths:
         last = b"\n"
         with opened(path) as file:

@@ -1,4 +1,4 @@
-"""Reads cells of Arrow as stamps, texts to the last digit."""
+"""Conversion of Arrow cells to stamps, without loss of digits in texts."""
 
 from functools import reduce
 from typing import Any
@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.stamps import BEYOND, NOT_A_TIME, Stamps, to_ns
 
-# Numbers that a decimal of 38 digits holds if they are short; a large exponent crashes Arrow.
+# Texts that a decimal of 38 digits can hold if they are short; a large exponent crashes Arrow.
 _PARTS = r"^[-+]?[0-9]*\.?(?P<part>[0-9]*)(?P<power>(?:[eE][-+]?[0-9]{1,2})?)$"
 _SHORT, _LARGEST_POWER, _MORE_DIGITS = 30, 18, 11
 _SIDED = r"^\s*(?P<before>[NSEWnsew]?)\s*(?P<number>\d+(?:\.\d*)?)\s*°?\s*(?P<after>[NSEWnsew]?)\s*$"
@@ -20,20 +20,20 @@ _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 def read_ns(
     cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, mend: str
 ) -> Stamps:
-    """Read cells (n,) as stamps; texts to the last digit, where a double of today has 200 ns.
+    """Convert cells (n,) to stamps; texts keep all digits, while a double of today has steps of 200 ns.
 
     Args:
-        cells: whole numbers, floats, texts that are numbers, or timestamps or durations, which have
-            their own unit.
-        digits: how many digits after the point of the unit are nanoseconds: 9 if it is a second.
-        since_ns: what they count from.
-        where: begins the sentence on values that cannot be.
-        mend: ends it.
+        cells: whole numbers, floats, texts of numbers, or timestamps or durations, which have their own
+            unit.
+        digits: number of digits after the point that are nanoseconds: 9 if the unit is a second.
+        since_ns: the zero of the values.
+        where: beginning of error messages.
+        mend: end of error messages.
 
     Returns:
         The stamps, NOT_A_TIME for a cell that is empty or NaN.
 
-    Raises BadInput if a cell is no number, or 64 bits cannot hold its stamp.
+    Raises BadInput if a cell is not a number, or its stamp does not fit 64 bits.
     """
     if pa.types.is_dictionary(cells.type):
         cells = cells.dictionary_decode()
@@ -63,7 +63,7 @@ def read_ns(
 
 
 def sided(cells: pa.Array) -> tuple[pa.Array, pa.Array]:
-    """Split texts such as 48.1N or W 11.5° into numbers and letters of hemispheres; null for others."""
+    """Split texts such as 48.1N or W 11.5° into numbers and hemispheres; null for other texts."""
     parts = pc.extract_regex(cells.cast(pa.string()), _SIDED)
     letters = [pc.struct_field(parts, name) for name in ("before", "after")]
     return pc.struct_field(parts, "number").cast(pa.float64()), pc.utf8_upper(
@@ -72,9 +72,9 @@ def sided(cells: pa.Array) -> tuple[pa.Array, pa.Array]:
 
 
 def _plain(texts: pa.Array, digits: int) -> Stamps | None:
-    """Return texts (n,) as nanoseconds if all are digits with a point and none is finer; else None.
+    """Convert texts (n,) to nanoseconds if all are plain decimals of at most `digits` digits; else None.
 
-    That is quick, and all that most files need.
+    This is fast, and sufficient for most files.
     """
     if any(pc.any(pc.match_substring(texts, mark)).as_py() for mark in "eE+"):
         return None
@@ -91,7 +91,7 @@ def _plain(texts: pa.Array, digits: int) -> Stamps | None:
 
 
 def _to_the_last_digit(texts: pa.Array, digits: int, rough: Stamps) -> Stamps:
-    """Return texts (n,) as nanoseconds, which fit 64 bits; rough ones where they are written oddly."""
+    """Convert texts (n,) to nanoseconds, which fit 64 bits; odd notations keep the `rough` values."""
     parts = pc.extract_regex(texts, _PARTS)
     powers = pc.replace_substring_regex(pc.struct_field(parts, "power"), r"[eE+]", "")
     power = pc.if_else(pc.equal(powers, ""), "0", powers).cast(pa.int32())
@@ -103,7 +103,7 @@ def _to_the_last_digit(texts: pa.Array, digits: int, rough: Stamps) -> Stamps:
     )
     is_exact = pc.fill_null(reduce(pc.and_, conditions), False)
     decimals = pc.if_else(is_exact, texts, None).cast(pa.decimal128(38, digits + _MORE_DIGITS))
-    # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
+    # Arrow stores a decimal as a count of units of its last digit: nanoseconds
     scaled = pc.round(decimals, digits).cast(pa.decimal128(38, digits))
     low: Any = np.frombuffer(scaled.buffers()[1], "<i8").reshape(-1, 2)[:, 0]
     exact = low[scaled.offset : scaled.offset + len(scaled)]

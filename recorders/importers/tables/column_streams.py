@@ -1,4 +1,4 @@
-"""Guesses which streams the columns of a table are: inertial, fix, pose, odometry and others."""
+"""Guesses of the streams in the columns of a table: inertial, fix, pose, odometry and others."""
 
 import json
 import re
@@ -37,7 +37,7 @@ from fuselog.recorders.importers.tables.guessed_places import (
 from fuselog.recorders.models.geodesy import local_metres
 from fuselog.recorders.units import unit
 
-# What vectors are called.
+# Names of vectors.
 _ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
 _GYROSCOPES = ("gyr", "gyro", "gyroscope", "angular_velocity", "rate", "omega", "w", "g")
 _MAGNETOMETERS = ("mag", "magnetometer", "magnetic_field", "m")
@@ -60,7 +60,7 @@ _HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
 _ACCURACY = r"(?!.*(bearing|head|course|yaw|speed|vel|vert|time|angle))(.*_)?(accuracy|eph|h_?acc)"
 _AT = "((x|y|z|p|pos|position)_|p)?"
 _EAST, _NORTH = f"{_AT}(east(ing)?|e)", f"{_AT}(north(ing)?|n)"
-# Not where an origin, a home or a goal is.
+# Excludes the position of an origin, a home or a goal.
 _HERE = r"(?!(.*_)?(ref|home|origin|base|datum|target|goal|waypoint|wp|setpoint|sp)_)(.*_)?"
 _GEODETIC = rf"{_HERE}lat(itude)?", rf"{_HERE}(lon|lng|long)(gitude)?"
 _ENU = "along east, north and up; order of fields, factors"
@@ -69,7 +69,7 @@ _TARGET = (
 )
 
 
-# No vehicle goes round a bend faster, and no turn rate of one is larger in rad/s.
+# Limits of vehicles: lateral acceleration in a bend, and turn rate in rad/s.
 _LARGEST_ACCELERATION_MPS2 = 20.0
 _LARGEST_RATE_RADPS = 10.0
 
@@ -84,7 +84,7 @@ def _inertial(table: GuessedTable) -> Iterator[str]:
         return
     force_unit, why = unit_by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)})
     rate_unit, rate_why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
-    # a magnetometer of the same table is one of a nine-axis unit, which orientation filters read
+    # with a magnetometer in the same table, this is a nine-axis unit, as orientation filters need it
     field = take_axes(list(columns), *_MAGNETOMETERS, usual="uT")
     is_ned = force[0].frame == "ned"
     axes = "forward, right, down" if is_ned else "forward, left, up"
@@ -115,7 +115,7 @@ def _magnetic(table: GuessedTable) -> Iterator[str]:
 
 
 def _field_lines(field: Sequence[GuessedColumn]) -> list[str]:
-    """Write the field and unit of a magnetometer's columns; none without any."""
+    """Write the field and unit of a magnetometer's columns; an empty list without columns."""
     if not field:
         return []
     sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
@@ -174,13 +174,13 @@ def _fix(table: GuessedTable) -> Iterator[str]:
 
 
 def _target(table: GuessedTable) -> Iterator[str]:
-    """Write ranges and bearings; one alone needs a target's number, as its name says too little."""
+    """Write ranges and bearings; a single one needs a column of target numbers to be recognised."""
     columns = table.columns
     whole = list(columns)
     number = take(columns, _TARGET)
     distance = take(columns, r"(.*_)?(range|distance|dist)|r", usual="m")
     direction = take(columns, r"(.*_)?(bearing|azimuth)|angle|phi", usual="rad")
-    is_travelled = bool(table.places) and not number  # along a path, and where it leads
+    is_travelled = bool(table.places) and not number  # distance along a path, and its direction
     if is_travelled or not ((distance and direction) or (number and (distance or direction))):
         columns[:] = whole
         return
@@ -254,10 +254,10 @@ def _odometry(table: GuessedTable) -> Iterator[str]:
 
 
 def _pose(table: GuessedTable) -> Iterator[str]:
-    """Write positions with and without orientation, and orientations alone."""
+    """Write positions with or without orientation, and orientations."""
     columns = table.columns
     place, factors, said = _position(columns, table.places)
-    turn = [] if -1 in factors else _quaternion(columns)  # of a body in another frame than ours
+    turn = [] if -1 in factors else _quaternion(columns)  # ours needs a position in east, north and up
     heading = take(columns, _HEADING, usual="rad") if place and not (turn or table.has_truth) else []
     if not (place or turn):
         return
@@ -295,7 +295,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
 def _position(
     columns: list[GuessedColumn], places: Sequence[GuessedColumn]
 ) -> tuple[list[GuessedColumn], list[int], list[str]]:
-    """Find the columns of a position, what makes them of east, north and up, and what was assumed."""
+    """Find the columns of a position, the factors to east, north and up, and the assumptions made."""
     for up, sign in (("up", 1), ("down", -1)):
         if found := take(columns, _EAST, _NORTH, f"{_AT}({up}|{up[0]})", usual="m"):
             return found, [1, 1, sign], []
@@ -310,12 +310,12 @@ def _position(
 def _along_axes(
     found: list[GuessedColumn], steps: Sequence[NDArray], places: Sequence[GuessedColumn]
 ) -> tuple[list[GuessedColumn], list[int], list[str]]:
-    """Return x, y and z as east, north and up: by their frame, by how places move, or assumed.
+    """Order x, y and z as east, north and up: by their frame, by the motion of positions, or assumed.
 
     Args:
         found: the columns.
-        steps: how far along x and y each row (rows,) is from the one before.
-        places: east and north of the rows, if these are known.
+        steps: displacement along x and y from the previous row, (rows,) each.
+        places: east and north of the rows, if known.
     """
     frame = (found[0].frame or frame_of(steps, places)) if found else "enu"
     if frame == "ned":
@@ -325,7 +325,7 @@ def _along_axes(
 
 
 def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
-    """Say what a quaternion is assumed to turn."""
+    """Write the assumption on the frames of a quaternion."""
     if not turn:
         return []
     names = ", ".join(each.name for each in turn)
@@ -336,7 +336,7 @@ def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
 
 
 def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
-    """Find the columns w, x, y, z of a quaternion, or of its parts 0 to 3, if its length is one."""
+    """Find the columns w, x, y, z (or 0 to 3) of a quaternion of unit length."""
     whole = list(columns)
     found = next(
         filter(
@@ -352,7 +352,7 @@ def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
 
 
 def _length(place: list[GuessedColumn]) -> str:
-    """Return the unit that a position's names state, else m."""
+    """Return the unit that a position's names state, or m."""
     return stated_unit(place[0], "m") or "m" if place else "m"
 
 
@@ -360,11 +360,11 @@ _TRUE = r"(^|_)(ground_?truth|truth|gt|mocap|vicon|optitrack)(_|$)"
 
 
 def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[GuessedColumn]:
-    """Take the columns whose names say that they are the truth out of the list, without that word.
+    """Remove the columns that are named as truth from the list; return them without that word.
 
     Args:
-        columns: of a table.
-        is_reference: whether the file's name says that all are.
+        columns: columns of a table.
+        is_reference: whether the name of the file marks all columns as truth.
     """
     found = [each for each in columns if is_reference or re.search(_TRUE, each.plain)]
     columns[:] = [each for each in columns if each not in found]
@@ -372,7 +372,7 @@ def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[Gu
 
 
 def truth_lines(table: GuessedTable) -> Iterator[str]:
-    """Write the stream of a table's true columns, of which nothing is made that a filter could read."""
+    """Write the stream of a table's true columns; nothing that filters could read is made."""
     columns = table.columns
     place, factors, said = _position(columns, table.places)
     if not place and (geodetic := take(columns, *_GEODETIC, usual="deg")):
@@ -404,7 +404,7 @@ def truth_lines(table: GuessedTable) -> Iterator[str]:
         yield from stream_lines(f"{table.prefix}/truth", "TruthState", why, *lines)
     if columns:
         rest = ", ".join(each.name for each in columns)
-        yield f"# True columns, not taken, so that no filter reads them: {rest}"
+        yield f"# True columns that are not imported, so that no filter reads them: {rest}"
 
 
 def _truth(
@@ -413,7 +413,7 @@ def _truth(
     turn: list[GuessedColumn],
     heading: list[GuessedColumn],
 ) -> list[str]:
-    """Write the lines of a TruthState of these columns."""
+    """Write the lines of a TruthState made from these columns."""
     names = [f"{axis}_m" for axis, _ in zip("xyz", place, strict=False)]
     names += [f"orientation_{part}" for part, _ in zip("wxyz", turn, strict=False)]
     kinds = ["linear"] * len(place) + ["quaternion"] * len(turn)
@@ -445,7 +445,7 @@ def _truth(
 
 
 def _heading(table: GuessedTable) -> Iterator[str]:
-    """Write headings beside fixes; a course alone is none, as it has no direction at rest."""
+    """Write headings next to fixes; a course is not used, as it is undefined at rest."""
     if not table.places or not (found := take(table.columns, _HEADING_ALONE, usual="rad")):
         return
     is_compass = is_ais(table) or bool(re.search("compass|course|heading|hdg", found[0].plain))

@@ -1,4 +1,4 @@
-"""Takes the columns of a table by their names, axes, units and sizes."""
+"""Selection of table columns by their names, axes, units and sizes."""
 
 import json
 import re
@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.units import unit
 
-# What stands for a unit in names of columns with times of the day, hhmmss.
+# The unit in names of columns with times of day as hhmmss.
 TIME_OF_DAY = "hhmmss"
-# How a line of a guessed mapping begins that says what was assumed.
+# The beginning of lines in a guessed mapping that state an assumption.
 ASSUMED = "# Assumed: "
 
 
 class GuessedColumn(NamedTuple):
-    """Holds a column of numbers.
+    """A column of numbers.
 
     Attributes:
-        name: as the file has it.
-        plain: the name in lower case, without its unit and frame.
-        unit: that its name or a row of units states; empty without one.
-        values: its numbers (rows,).
-        unknown: what the name or a row of units states in place of a unit, and is none that is known.
-        frame: "ned" for axes of north, east, down, "enu" for east, north, up; empty if nothing says it.
+        name: name in the file.
+        plain: name in lower case, without unit and frame.
+        unit: unit that the name or a row of units states; empty if there is none.
+        values: numbers (rows,).
+        unknown: text in place of a unit that is not a known unit.
+        frame: "ned" for axes north, east, down, "enu" for east, north, up; empty if unknown.
     """
 
     name: str
@@ -39,19 +39,19 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """Holds what is known of a table while its streams are guessed.
+    """What is known of a table while its streams are guessed.
 
     Attributes:
         path: the file.
-        columns: those without a stream yet.
-        texts: the cells (rows,) of the columns of texts, by name.
-        prefix: how topics begin.
+        columns: columns that are not in a stream yet.
+        texts: cells (rows,) of text columns, by name.
+        prefix: beginning of topics.
         has_truth: whether other columns are the truth.
-        time_s: the rows' times (rows,), NaN where there is none; None without times.
+        time_s: times of the rows (rows,), NaN if missing; None without times.
         whole: all columns.
-        places: east and north of the rows, by which courses are told, as soon as they are known.
-        made: lines of the table itself.
-        prepared: tables of the mapping's columns, such as `missing`, by name.
+        places: east and north of the rows, from which courses are computed, as soon as they are known.
+        made: lines of the table's mapping outside its streams.
+        prepared: entries of the mapping that prepare columns, such as `missing`, by name.
     """
 
     path: Path
@@ -67,9 +67,10 @@ class GuessedTable(NamedTuple):
 
 
 def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
-    """Take the columns whose names fit the patterns, one each, out of the list; none unless all do.
+    """Remove the columns that match the patterns, one each, from the list; return [] unless all match.
 
-    A column whose unit is of another kind than the usual one, such as a speed in rpm, does not fit.
+    A column whose unit measures another quantity than the usual unit, such as a speed in rpm, is
+    skipped.
     """
     found = []
     for pattern in patterns:
@@ -92,7 +93,7 @@ def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[
 def take_axes(
     columns: list[GuessedColumn], *stems: str, axes: str = "xyz", usual: str = ""
 ) -> list[GuessedColumn]:
-    """Return the columns of the axes of a vector whose name is one of some."""
+    """Take the columns of a vector's axes, trying several names of the vector."""
     for stem in stems:
         before = f"(.*_)?{stem}_?" if stem else ""
         if found := take(columns, *(before + axis for axis in axes), usual=usual):
@@ -101,15 +102,15 @@ def take_axes(
 
 
 def known_of(column: GuessedColumn) -> NDArray:
-    """Return the numbers of a column that are known."""
+    """Return the finite numbers of a column."""
     values = column.values
     return values[np.isfinite(values)]
 
 
 def stated_unit(column: GuessedColumn, usual: str) -> str:
-    """Return the unit that a column's name states, if it is one of the usual one's kind.
+    """Return the unit that a column's name states, if it measures the same quantity as the usual unit.
 
-    A turn rate in deg is one in deg/s, and a latitude in minutes one in minutes of arc.
+    A turn rate in deg is in deg/s, and a latitude in minutes is in minutes of arc.
     """
     meant = {"rad/s": f"{column.unit}/s", "deg": "arcmin" if column.unit == "min" else ""}
     for stated in (column.unit, meant.get(usual, "")):
@@ -121,7 +122,7 @@ def stated_unit(column: GuessedColumn, usual: str) -> str:
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """Return the unit in which a vector's length is as it must be, else the first; and the reason."""
+    """Choose the unit that gives a vector its expected length, else the first; return it and why."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
@@ -133,14 +134,14 @@ def unit_by_size(
 
 
 def length_of(columns: Sequence[GuessedColumn]) -> float:
-    """Return the median length of the vectors of some columns."""
+    """Return the median length of the vectors in some columns."""
     return float(np.nanmedian(np.linalg.norm([column.values for column in columns], axis=0)))
 
 
 def unit_by_largest(
     columns: Sequence[GuessedColumn], usual: str, other: str, limit: float
 ) -> tuple[str, str]:
-    """Return the unit of columns: the other one if their numbers go beyond a limit; and the reason."""
+    """Choose the other unit if numbers exceed a limit, else the usual unit; return the reason too."""
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
     largest = largest_of(columns)
@@ -152,7 +153,7 @@ def largest_of(columns: Sequence[GuessedColumn]) -> float:
     return float(np.nanmax(np.abs([column.values for column in columns])))
 
 
-# Words of other languages in names, by what they are called here.
+# Words of other languages in names, with the English words.
 _WORDS = {
     "geschwindigkeit": "speed", "gierrate": "yaw_rate", "drehrate": "turn_rate", "breite": "latitude",
     "breitengrad": "latitude", "laenge": "longitude", "laengengrad": "longitude", "hoehe": "altitude",
@@ -160,7 +161,7 @@ _WORDS = {
     "zeit": "time", "uhrzeit": "time", "zeitstempel": "time", "datum": "date",
 }  # fmt: skip
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
-# Units at the end of a name, as they are written there.
+# Units at the end of names.
 _ENDINGS = {
     "mps": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "km_h": "km/h", "mph": "mi/h",
     "fps": "ft/s", "ft_s": "ft/s", "kn": "kn", "kts": "kn", "knots": "kn",
@@ -175,7 +176,7 @@ _ENDINGS = {
     "nsec": "ns", "sec": "s", "secs": "s", "seconds": "s", "nanoseconds": "ns", "microseconds": "us",
     "milliseconds": "ms", "degrees": "deg", "meters": "m", "metres": "m", "km": "km",
 }  # fmt: skip
-# Units in brackets that others write otherwise than we do.
+# Units in brackets that are written differently from ours.
 _WRITTEN = {
     "degrees": "deg", "degree": "deg", "grad": "deg", "°": "deg", "meters": "m", "feet": "ft",
     "fuss": "ft", "knots": "kn", "kts": "kn", "kt": "kn", "kmh": "km/h", "kph": "km/h", "mph": "mi/h",
@@ -192,7 +193,7 @@ _WRITTEN = {
 
 
 def parted(name: str) -> tuple[str, str]:
-    """Split a name, in lower case with underlines, from its unit, in brackets or at its end.
+    """Split a name into its lower-case form with underscores and its unit, in brackets or at the end.
 
     >>> parted("Höhe [ft]"), parted("speed_kmh"), parted("TimeUS")
     (('altitude', 'ft'), ('speed', 'km/h'), ('time', 'us'))
@@ -205,13 +206,13 @@ def parted(name: str) -> tuple[str, str]:
 
 
 def bracketed(name: str) -> re.Match[str] | None:
-    """Find what stands in brackets in a name, unless it is an index or an axis, as in q[0]."""
+    """Find text in brackets in a name, unless it is an index or an axis, as in q[0]."""
     match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
     return None if match and re.fullmatch(r"(?i)\d+|[wxyz]", match[1]) else match
 
 
 def unit_in(text: str) -> str:
-    """Return the unit that a text such as °/s, knots or m/(s^2) means; empty if it means none."""
+    """Return the unit that a text such as °/s, knots or m/(s^2) means, or an empty string."""
     bare = (
         text.strip()
         .strip("()[]")
@@ -231,7 +232,7 @@ def unit_in(text: str) -> str:
 
 
 def _words(name: str) -> str:
-    """Set apart the words of a name such as TimeUS or yawRate."""
+    """Separate the words of a name such as TimeUS or yawRate."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
 
 
@@ -243,21 +244,21 @@ def _is_unit(text: str) -> bool:
 
 
 def underlined(name: str) -> str:
-    """Return a name in lower case, its English words with underlines between them."""
+    """Return a name in lower case, in English, with underscores between words."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower().translate(_UMLAUTS)).strip("_")
     return "_".join(_WORDS.get(word, word) for word in plain.split("_"))
 
 
-# By how much of the path one direction has to be more like the course than another.
+# How much better one direction must agree with the course than another, as a share of the path.
 _CLEAR = 0.4
-# Of a direction that is the course, and of one that is not.
+# Agreement of a direction that equals the course, and of one that does not.
 _CLOSE, _APART = 0.995, 0.98
-# How far from the course directions are, at most, that are along it.
+# The largest angle from the course of directions that follow it.
 _ALIKE_RAD = 0.1
 
 
 class Direction(NamedTuple):
-    """States what a heading is in, whether it is clockwise from north, and why."""
+    """The unit and convention of a heading, and the reason for the choice."""
 
     unit: str
     is_compass: bool
@@ -268,10 +269,10 @@ class Direction(NamedTuple):
 def direction_of(
     heading: GuessedColumn, places: Sequence[GuessedColumn], *, usual: bool | None = None
 ) -> Direction:
-    """Find a heading's unit and convention, by the course of places, else by its numbers.
+    """Determine a heading's unit and convention from the course of positions, or from its numbers.
 
-    A heading may be unwrapped, so that its largest value says little. `usual` is whether such a heading
-    mostly is a compass's, which decides if the course does not tell clearly.
+    A heading may be unwrapped, so its largest value says little. `usual` is whether such a heading
+    usually is a compass heading; it decides if the course is not clear.
     """
     stated = stated_unit(heading, "rad")
     units = [stated] if stated else _angle_units(largest_of([heading]))
@@ -295,20 +296,20 @@ def direction_of(
             if likeness[best] > 0.5 * whole:
                 other = likeness[best[0], not best[1]]
                 is_sure = usual is None or bool(likeness[best] - other > _CLEAR * whole)
-                return Direction(*best, "so it goes with the course", is_sure=is_sure)
+                return Direction(*best, "which agrees with the course", is_sure=is_sure)
     why = "as its name says" if stated else f"the largest is {largest_of([heading]):.4g}"
     return Direction(units[0], bool(re.search("compass|course|heading|hdg|cog", heading.plain)), why)
 
 
 def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
-    """Tell whether steps along two axes are east and north or north and east, by how places move.
+    """Determine by the motion of positions whether two axes are east and north or north and east.
 
     Args:
-        steps: along the first and the second axis (rows,), NaN if there is none.
-        places: east and north of the rows; none if these are not known.
+        steps: displacement along the first and the second axis (rows,), NaN if unknown.
+        places: east and north of the rows; empty if unknown.
 
     Returns:
-        "enu", "ned", or nothing if the steps do not tell clearly.
+        "enu", "ned", or an empty string if the steps are not clear.
     """
     if not places:
         return ""
@@ -326,12 +327,12 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
 
 
 def _angle_units(largest: float) -> list[str]:
-    """Return what angles up to a largest one may be in, the likeliest first."""
+    """Return the possible units of angles up to a largest one, the likeliest first."""
     if largest <= 720.0:
         return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
     scales = ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")
     fitting = [each for each in scales if largest <= 370.0 * _per_deg(each)]
-    return [*fitting, "deg", "rad"]  # unwrapped ones may be large
+    return [*fitting, "deg", "rad"]  # unwrapped angles may be large
 
 
 def _per_deg(name: str) -> float:
@@ -339,7 +340,7 @@ def _per_deg(name: str) -> float:
 
 
 def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
-    """Estimate the sigma of a heading's white noise by second differences, at least .5 deg."""
+    """Estimate a heading's white noise (sigma in rad, at least 0.5 deg) from second differences."""
     angle = unit(in_unit).size * heading.values[np.isfinite(heading.values)]
     bend = np.angle(np.exp(1j * np.diff(angle, n=2)))
     sigma = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0) if len(bend) else 0.0
@@ -347,7 +348,7 @@ def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
 
 
 def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray] | None:
-    """Find rows from which places move, in which direction (rad) and how far; None where none do."""
+    """Find rows, directions (rad) and lengths of the steps between positions; None for fewer than 3."""
     east, north = (each.values for each in places[:2])
     rows = np.flatnonzero(np.isfinite(east) & np.isfinite(north))
     if len(rows) < 3:
@@ -357,16 +358,16 @@ def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray]
 
 
 def stream_lines(topic: str, becomes: str, why: str, *lines: str) -> list[str]:
-    """Write one stream of a mapping: its topic, what it becomes and why, and further lines."""
+    """Write one stream of a mapping: its topic, its message with the reason, and further lines."""
     head = ["", f"# {becomes}: {why}.", "[[tables.streams]]"]
     return [*head, f'topic = "{topic}"', f'becomes = "{becomes}"', *lines]
 
 
 def names_of(columns: Sequence[GuessedColumn]) -> str:
-    """Write the names of columns as a list of TOML."""
+    """Write the names of columns as a TOML list."""
     return json.dumps([column.name for column in columns], ensure_ascii=False)
 
 
 def name_of(column: GuessedColumn) -> str:
-    """Write the name of a column as TOML."""
+    """Write the name of a column as a TOML string."""
     return json.dumps(column.name, ensure_ascii=False)

@@ -1,25 +1,26 @@
-"""Knows the units and axes of devices that their files do not state, by the names of their columns."""
+"""Units and axes that files of some devices do not state, recognised by the names of columns."""
 
 import numpy as np
 
 from fuselog.recorders.importers.tables.columns import GuessedColumn, known_of
 from fuselog.recorders.importers.tables.files import VBOX_UNITS
 
-# The counter of Xsens, and at how many samples a second it is in us, as of a DOT, else in 0.1 ms.
+# The counter of Xsens, and the sample rates at which it is in us, as in a DOT; otherwise it is in 0.1
+# ms.
 _XSENS, _DOT_RATES_HZ = "SampleTimeFine", np.array([1, 4, 10, 12, 15, 20, 30, 60, 120])
-# What a VBOX calls its columns in tables.
+# Names of columns in tables of a VBOX.
 _VBOX = (
     {"sats", "time", "lat", "long", "velocity", "heading", "height"},
     {"satellites", "time", "latitude", "longitude", "velocity", "heading", "height"},
 )
-# An inertial unit of ArduPilot, whose axes are forward, right, down.
+# An inertial unit of ArduPilot, with axes forward, right, down.
 _ARDUPILOT = ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
 # The largest latitude in deg, and in minutes.
 _LARGEST_LATITUDE = (90.0, 5400.0)
 
 
 def of_device(columns: list[GuessedColumn]) -> list[GuessedColumn]:
-    """Return the columns with the units and axes that those of a device have."""
+    """Add the units and axes of known devices to columns."""
     units = {}
     by_name = {column.name: column for column in columns}
     if by_name.keys() >= {*_ARDUPILOT} and np.nanmedian(by_name[_ARDUPILOT[-1]].values) < 0:

@@ -1,4 +1,4 @@
-"""Recognises tables of `fuselog export` by their columns, and writes the mapping that reads them."""
+"""Recognition of tables written by `fuselog export`, and the mapping that reads them."""
 
 import json
 import re
@@ -15,7 +15,7 @@ _NAMED_VECTORS = ("value", "state", "mean")
 
 
 def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str]:
-    """Return the lines of an exported table's mapping below its `files`; none for another table."""
+    """Write the lines of an exported table's mapping after `files`; empty for other tables."""
     if tuple(columns[:3]) != _CLOCKS:
         return []
     fitting = [
@@ -44,7 +44,7 @@ def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str
 
 
 def _fields(schema: Schema, columns: Sequence[str]) -> dict[str, str | list[str]] | None:
-    """Return the columns of each field of a message; None if one is missing, or of no field."""
+    """Assign columns to the fields of a message; None if a field or a column is left over."""
     found: dict[str, str | list[str]] = {}
     left = list(columns)
     for entry in sorted(list(schema)[1:], key=lambda each: -len(each.name)):

@@ -1,8 +1,8 @@
-"""Opens files that hold tables, one like another: the names of columns, and batches of rows.
+"""Uniform access to files that hold tables: names of columns, and batches of rows.
 
-CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), logs of a VBOX (.vbo),
-of a FlySight and of NovAtel (ASCII), and the trajectories of benchmarks. A batch has an Arrow array for
-each column that is asked for; memory holds one at a time.
+Formats are CSV and similar texts, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), logs of
+a VBOX (.vbo), of a FlySight and of NovAtel (ASCII), and trajectories of benchmarks. A batch has an Arrow
+array for each requested column; memory holds one batch at a time.
 """
 
 import bz2
@@ -48,7 +48,7 @@ from fuselog.recorders.trajectories import NO_END, read_trajectory
 
 Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory", "tum", "kitti", "euroc", "vbo"]
 Batch = dict[str, pa.Array]
-# Gives the batches with these columns, and which of them are wanted as text.
+# Yields batches of these columns; the flag of each says whether it is wanted as text.
 Read = Callable[[Mapping[str, bool]], Iterator[Batch]]
 
 _SUFFIXES: dict[str, Format] = {
@@ -57,33 +57,33 @@ _SUFFIXES: dict[str, Format] = {
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 _BLOCK_ROWS = 1 << 17
-# How much of a text is looked at to tell how its lines end.
+# How much of a text is read to find out how its lines end.
 _HEAD_BYTES = 1 << 16
-# How many lines there are at most before the data of a .vbo file, and what columns of a VBOX are in.
+# The most lines before the data of a .vbo file, and the units of a VBOX's columns.
 _HEADER_LINES = 10_000
 VBOX_UNITS = {
     "time": "hhmmss", "lat": "arcmin", "latitude": "arcmin", "long": "-1 arcmin",
     "longitude": "-1 arcmin", "velocity": "km/h", "heading": "deg",
 }  # fmt: skip
-# Arrow takes 10 kB for a column, however few rows there are.
+# Arrow needs 10 kB for a column, even for few rows.
 MOST_COLUMNS = 10_000
-# Of JSON, such as a quotation mark that ends no string.
+# Escapes in JSON, such as a quotation mark that does not end a string.
 _ESCAPED = re.compile(rb"\\.", re.DOTALL)
 DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
 
 
 @dataclass
 class Table:
-    """Reads a file's table.
+    """The table in a file.
 
     Attributes:
         path: the file.
-        columns: their names.
-        left_out: why how many rows were left out.
-        mended: what was mended.
-        units: what a row of units says, by column.
-        doubts: what is doubtful about its rows.
-        is_text: whether its cells are texts, of which those that say NaN are null.
+        columns: names of the columns.
+        left_out: number of rows that were left out, by reason.
+        mended: what was corrected.
+        units: units from a row of units, by column.
+        doubts: doubtful facts about the rows.
+        is_text: whether cells are texts; cells that say NaN are null.
     """
 
     path: Path
@@ -99,7 +99,7 @@ class Table:
         _check_width(self.path, len(self.columns))
 
     def column(self, name: str) -> str:
-        """Find a column by its name, or its number from 1 on; raises BadInput where there is none."""
+        """Find a column by its name, or its number from 1; raise BadInput if there is none."""
         if name in self.columns:
             return name
         if name.isdecimal() and len(name) < 9 and 0 < int(name) <= len(self.columns):
@@ -107,9 +107,10 @@ class Table:
         raise BadInput(f"{self.path}: has no column '{name}'; {choices(name, self.columns)}")
 
     def batches(self, numbers: Collection[str], texts: Collection[str] = ()) -> Iterator[Batch]:
-        """Yield the rows with these columns, block by block.
+        """Yield batches of rows with these columns.
 
-        Empty cells are null. Raises BadInput where the file is damaged, or a cell of `numbers` is none.
+        Empty cells are null. Raises BadInput if the file is damaged, or a cell of `numbers` is not a
+        number.
         """
         try:
             yield from self.read(dict.fromkeys(numbers, False) | dict.fromkeys(texts, True))
@@ -120,14 +121,14 @@ class Table:
 
 
 class TextOptions(NamedTuple):
-    """States what a text table does not tell itself.
+    """What a text table does not say itself.
 
     Attributes:
-        names: of the columns, if the file does not name them.
-        has_header: whether the first line names the columns; by default the lines tell.
-        delimiter: between cells; " " is for any white space. By default the lines tell.
-        decimal: the mark before fractions.
-        skip: how many lines at the start of the file are not part of the table.
+        names: names of the columns, if the file does not name them.
+        has_header: whether the first line names the columns; by default this is recognised.
+        delimiter: delimiter of cells; " " is any white space. By default it is recognised.
+        decimal: the decimal mark.
+        skip: number of lines at the start of the file that are not part of the table.
     """
 
     names: Sequence[str] = ()
@@ -149,12 +150,12 @@ def open_table(
 
     Args:
         path: the file; .gz, .bz2 and .xz are decompressed.
-        format: what it holds; by default its suffix tells, and CSV is what has no other.
-        options: what a text does not tell itself.
+        format: format of the file; by default it follows from the suffix, and is CSV for unknown ones.
+        options: what a text does not say itself.
         more: text files whose lines follow those of the first.
-        split: columns whose cells hold several numbers each, and the names of these.
+        split: columns whose cells hold several numbers, with the names of these numbers.
 
-    Raises BadInput if the file cannot be read, or holds no rows.
+    Raises BadInput if the file cannot be read, or has no rows.
     """
     suffix = path.suffixes[-2:][0] if path.suffix in _OPENERS and len(path.suffixes) > 1 else path.suffix
     format = format or _SUFFIXES.get(suffix.lower(), "csv")  # noqa: A001
@@ -176,13 +177,15 @@ def open_table(
 
 
 def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
-    """Return a table in which the parts of some columns' cells are columns of their own."""
+    """Split the cells of some columns into columns of their own."""
     parts = {table.column(source): names for source, names in split.items()}
     source_of = {name: source for source, names in parts.items() for name in names}
     twice = [name for name in source_of if name in table.columns]
     if twice or len(source_of) < sum(map(len, parts.values())):
         names = ", ".join(twice or source_of)
-        raise BadInput(f"{table.path}: `split` gives a name twice, or one of a column: {names}")
+        raise BadInput(
+            f"{table.path}: `split` gives a name twice, or the name of another column: {names}"
+        )
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         sources = {source_of[name]: True for name in wanted if name in source_of}
@@ -213,7 +216,7 @@ def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
 
 
 def _parts_of(names: Sequence[str]) -> str:
-    """Return the expression of a cell that holds as many numbers as there are names."""
+    """Return the expression for a cell with one number for each name."""
     return r"[\s,;]+".join(rf"(?P<p{index}>[-+]?[\d.]+(?:[eE][-+]?\d+)?)" for index in range(len(names)))
 
 
@@ -222,22 +225,22 @@ def _first_line(error: Exception) -> str:
 
 
 def _reason(error: Exception, table: Table) -> str:
-    """Say what Arrow says of a cell, with the column's name and the mend."""
+    """Translate Arrow's error on a cell into a sentence with the column's name and a remedy."""
     found = re.search(r"In CSV column #(\d+):.*invalid value '(.*)'", str(error))
     if not found:
         return f"is damaged ({_first_line(error)})"
     name = table.columns[int(found[1])]
-    return f"column {name} holds '{found[2]}'; expected numbers: mend the cell, or empty it"
+    return f"column {name} holds '{found[2]}'; expected numbers: correct or empty the cell"
 
 
 def open_decompressed(path: Path) -> BinaryIO:
-    """Open the bytes of a file; .gz, .bz2 and .xz are decompressed."""
+    """Open a file as bytes; .gz, .bz2 and .xz are decompressed."""
     opener = _OPENERS.get(path.suffix)
     return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open the bytes of a text, decompressed; if its lines end with CR only, these become newlines."""
+    """Open a text as decompressed bytes; lines that end with CR only get newlines."""
     file = open_decompressed(path)
     head = file.read(_HEAD_BYTES).strip()
     file.seek(0)
@@ -254,7 +257,7 @@ def _with_newlines(file: BinaryIO) -> Iterator[bytes]:
 
 @contextmanager
 def _open_joined(paths: Sequence[Path]) -> Iterator[BinaryIO]:
-    """Open one file, or the lines of several as one."""
+    """Open one file, or several files as one text."""
     if len(paths) == 1:
         with open_text(paths[0]) as file:
             yield file
@@ -264,7 +267,7 @@ def _open_joined(paths: Sequence[Path]) -> Iterator[BinaryIO]:
 
 def _check_width(path: Path, width: int) -> None:
     if width > MOST_COLUMNS:
-        raise BadInput(f"{path}: has {width} columns, of which at most {MOST_COLUMNS} can be read")
+        raise BadInput(f"{path}: has {width} columns; at most {MOST_COLUMNS} can be read")
 
 
 # Text.
@@ -319,10 +322,10 @@ def _open_tagged(path: Path, found: Tagged) -> Table:
 
 
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
-    """Name columns; such as are empty, come again or are lacking are numbers from 1 on."""
+    """Name the columns; numbers from 1 replace empty, repeated and missing names."""
     if len(names) > width:
         raise BadInput(
-            f"{path}: `columns` names {len(names)} columns, and the rows have {width}; name each once"
+            f"{path}: `columns` names {len(names)} columns, but the rows have {width}; name each once"
         )
     counts = Counter(names)
     padded = [*names, *[""] * (width - len(names))]
@@ -359,7 +362,9 @@ def _text_batches(
         ),
     )
     for batch in map(_by_name, batches):
-        if decimal != ".":  # Arrow minds it in numbers alone; of texts only those are mended, and 48,1N
+        if (
+            decimal != "."
+        ):  # Arrow uses it only for numbers; texts are changed if they are numbers, or like 48,1N
             begin, end = r"[NSEWnsew]?\s*[-+]?\d*", r"\d+(?:[eE][-+]?\d+)?\s*°?\s*[NSEWnsew]?"
             number = rf"^\s*({begin}){re.escape(decimal)}({end})\s*$"
             for name in wanted:
@@ -372,7 +377,7 @@ def _text_batches(
 
 
 def _open_rtklib(path: Path) -> Table:
-    """Open a solution of RTKLIB: its header names two columns, date and time, by one word."""
+    """Open a solution of RTKLIB; its header has one name for two columns, date and time."""
     named: list[str] = []
     with open_text(path) as file:
         for line in lines_of(file):
@@ -390,7 +395,7 @@ def _open_rtklib(path: Path) -> Table:
 
 
 def _open_vbo(path: Path) -> Table:
-    """Open a log of Racelogic's VBOX, whose places are in minutes, positive to the north and west."""
+    """Open a log of Racelogic's VBOX, with positions in minutes, positive to the north and west."""
     sections: dict[str, list[str]] = {}
     section: list[str] = []
     count = 0
@@ -438,7 +443,7 @@ def _open_parquet(path: Path) -> Table:
 
 
 def _root(name: str, columns: Sequence[str]) -> str:
-    """Return the column of a file that a column is, or a part of: names may have dots themselves."""
+    """Return the file's column that contains a column; names may contain dots themselves."""
     return next(
         (each for each in columns if name == each or name.startswith(f"{each}.")), name.partition(".")[0]
     )
@@ -462,7 +467,7 @@ def _open_json(path: Path) -> Table:
 
 
 def _check_depth(block: bytes) -> None:
-    """Raise ValueError where JSON is nested so deeply that Arrow, which recurses, dies of it."""
+    """Raise ValueError if JSON is nested so deeply that Arrow, which recurses, would crash."""
     text = np.frombuffer(_ESCAPED.sub(b"__", block), np.uint8)
     outside = np.cumsum(text == ord('"'), dtype=np.uint8) % 2 == 0
     step = np.isin(text, list(b"{[")).astype(np.int32) - np.isin(text, list(b"}]"))
@@ -481,7 +486,7 @@ def _open_npz(path: Path) -> Table:
 
 
 def _open_trajectory(path: Path, format: str | None) -> Table:  # noqa: A002
-    """Open TUM, KITTI or EuRoC: time_ns (not of KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
+    """Open TUM, KITTI or EuRoC: time_ns (except KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
     found = read_trajectory(path, format)
     columns = dict(zip("xyz", found.position_m.T, strict=True))
     if found.rotation is not None:
@@ -505,7 +510,7 @@ def _by_name(batch: pa.RecordBatch) -> Batch:
 
 
 def _flat_batches(table: pa.Table) -> Iterator[Batch]:
-    """Take structures and lists of a table apart: NAME.PART, NAME.0, NAME.1, ..."""
+    """Split the structures and lists of a table into columns NAME.PART, NAME.0, NAME.1, ..."""
     while any(pa.types.is_struct(kind) for kind in table.schema.types):
         table = table.flatten()
     for batch in table.combine_chunks().to_batches():
@@ -523,7 +528,7 @@ def _flat_batches(table: pa.Table) -> Iterator[Batch]:
 
 
 def _plain(column: pa.Array) -> pa.Array:
-    """Return a column in one of the few types that are read: numbers, texts, dates with a time."""
+    """Convert a column to one of the few types that are read: numbers, texts, dates with a time."""
     kind = column.type
     if pa.types.is_dictionary(kind):
         return _plain(column.dictionary_decode())
@@ -544,9 +549,9 @@ _PLAIN: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (
 
 
 def floats(cells: pa.Array) -> NDArray[np.float64]:
-    """Return numbers (n,), NaN for empty cells; whole ones beyond 2^53 are rounded.
+    """Convert cells (n,) to floats, NaN for empty cells; whole numbers beyond 2^53 are rounded.
 
-    Raises pa.ArrowException if a cell holds something else.
+    Raises pa.ArrowException if a cell holds anything else.
     """
     if pa.types.is_string(cells.type):
         cells = pc.utf8_trim_whitespace(cells)

@@ -1,4 +1,4 @@
-"""Finds tables in folders: single files, and files of one row each with a file of their times."""
+"""Search for tables in folders: single files, and sets of one-row files with a file of their times."""
 
 import re
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
 from fuselog.recorders.importers.tables.files import open_text
 
-# How many files of one row are one table at least.
+# The fewest one-row files that are taken as one table.
 _FEWEST = 3
 _TEXTS = {".txt", ".csv", ".tsv", ".dat"}
 
 
 class Source(NamedTuple):
-    """Describes the files of one table.
+    """The files of one table.
 
     Attributes:
         path: the first file.
-        name: the pattern of the names of all.
+        name: pattern of the names of all files.
         more: the files whose rows follow.
-        stamps: the file with the times of the rows, and its name from the folder on.
-        columns: names of the columns that a file beside says.
+        stamps: the file with the times of the rows, and its name relative to the folder.
+        columns: names of the columns from another file.
     """
 
     path: Path
@@ -34,7 +34,7 @@ class Source(NamedTuple):
 
 
 def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
-    """Return the tables of files with their names; those of one row in a folder are one table."""
+    """Group files with their names into tables; the one-row files of a folder are one table."""
     groups: dict[tuple[Path, str], list[tuple[Path, str]]] = {}
     for path, name in files:
         if path.suffix.lower() in _TEXTS and re.fullmatch(r"\D*\d+", path.stem):
@@ -56,14 +56,14 @@ def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
 
 
 def stamps_in(path: Path) -> list[str]:
-    """Return the lines of a file with times that are not blank."""
+    """Read the lines of a file with times that are not blank."""
     with open_text(path) as file:
         lines = [line.decode("utf-8", "replace").strip() for line in lines_of(file)]
     return [line for line in lines if line]
 
 
 def _count(path: Path, most: int) -> int:
-    """Count the rows of a text, up to a number."""
+    """Count the rows of a text, up to `most`; 0 if it cannot be read."""
     try:
         with open_text(path) as file:
             rows = (line for line in lines_of(file) if line.strip() and not line.startswith(COMMENTS))
@@ -73,7 +73,7 @@ def _count(path: Path, most: int) -> int:
 
 
 def _columns(first: Path, others: Sequence[Path]) -> tuple[tuple[str, ...], set[Path]]:
-    """Return the names that a file beside gives, line by line as `name: meaning`, and that file."""
+    """Find a file with the names of columns, line by line as `name: meaning`; return both."""
     width = len(stamps_in(first)[0].replace(",", " ").split())
     for path in others:
         try:

@@ -1,6 +1,6 @@
-"""Guesses what latitudes, longitudes, altitudes and speeds are in, and codes of missing ones.
+"""Guesses of the units of latitudes, longitudes, altitudes and speeds, and of codes for missing ones.
 
-By names, sizes, and how far places move for the speed of the rows; what is not certain is refused.
+They use names, sizes, and the speed of the rows; if the unit is ambiguous, the table is rejected.
 """
 
 import json
@@ -23,14 +23,14 @@ from fuselog.recorders.importers.tables.columns import (
 from fuselog.recorders.models.geodesy import local_metres
 from fuselog.recorders.units import MISTAKEN, unit
 
-# Codes of AIS (ITU-R M.1371) for what is not available, by what a column is called.
+# Codes of AIS (ITU-R M.1371) for unavailable values, by the name of the column.
 _AIS = {
     r"(.*_)?(heading|hdg|true_heading)": (511.0,),
     r"(.*_)?(sog|speed(_over_ground)?|velocity)": (102.3, 1023.0),
     r"(.*_)?(cog|course(_over_ground)?)": (360.0, 3600.0),
 }
-# By what a column is called, its codes for no fix, and those for one: of NavSatFix, u-blox, PX4 and
-# MAVLink, GGA, and gpsd.
+# By the name of the column, its codes for no fix and for a fix, in NavSatFix, u-blox, PX4 and MAVLink,
+# GGA, and gpsd.
 _FIX_CODES: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...] = (
     (r"(.*_)?status_status", (-1,), (0, 1, 2)),
     (r"^(.*[._])?fixType$", (0, 5), (1, 2, 3, 4)),
@@ -43,7 +43,7 @@ _FIX_CODES: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...] = (
         (1,),
     ),
 )
-# What columns of words on fixes are called, and words for none.
+# Names of text columns on fixes, and words for no fix.
 _FIX_WORDS = r"(.*_)?(fix(_?(type|status|mode))?|status|valid(ity)?)"
 _NO_FIX = {"v", "void", "invalid", "none", "no", "no fix", "no_fix", "nofix", "no gps", "false"}
 _NOT_A_PLACE = (91.0, 181.0)
@@ -51,19 +51,19 @@ _NO_ALTITUDE, _LOWEST_M = (-999.0, -9999.0, -32768.0), -450.0
 ALTITUDE = (
     r"(.*_)?(alt|altitude|(ellipsoidal_)?height|ele|elevation)(_?(m?sl|amsl|ellipsoid|wgs84))?|h|h_?msl"
 )
-# What latitudes may be in, and the largest latitude so.
+# Possible units of latitudes.
 _SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
 _MINUTES = "ddmm.mmmm"
 _SPEEDS = {name: unit(name).size for name in ("m/s", *MISTAKEN["m/s"], "cm/s", "mm/s")}
-_NEAR = 0.03  # of a ratio of the path to the speed
-_HIGHEST_M = 12_000.0  # that anything with a receiver mostly is
-# What columns of hemispheres are called, if they have a name.
+_NEAR = 0.03  # tolerance for the ratio of the path to the speed
+_HIGHEST_M = 12_000.0  # usual limit for anything with a receiver
+# Names of columns with hemispheres, if they have a name.
 _SIDE = r"(^|_)(lat|lon|lng|ns|ew|n_s|e_w|hemi|dir|ref|side|north|south|east|west|ind|sign)|^\d+$"
 _SOUTH_WEST = {"N", "S", "E", "W", "NORTH", "SOUTH", "EAST", "WEST"}
 
 
 class Places(NamedTuple):
-    """Holds what latitudes and longitudes are in, lines that say so, and degrees (rows,) of them."""
+    """The unit of latitudes and longitudes, the lines that state it, and degrees (rows,) of both."""
 
     unit: str
     lines: list[str]
@@ -72,7 +72,7 @@ class Places(NamedTuple):
 
 
 def without_codes(table: GuessedTable) -> GuessedTable:
-    """Return a table whose columns have no codes of what is missing; these are stated in `prepared`."""
+    """Replace codes of missing values in a table by NaN; `prepared` lists them for the mapping."""
     plain = {column.plain for column in table.whole}
     is_ais = any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
     codes: dict[str, list[float]] = {}
@@ -84,7 +84,7 @@ def without_codes(table: GuessedTable) -> GuessedTable:
             known = tuple(code for code in _NOT_A_PLACE if _is_code(column.values, code, 90.0))
         elif re.fullmatch(r"(.*_)?(lon|lng|long)(gitude)?", column.plain):
             known = (181.0,) if _is_code(column.values, 181.0, 180.0) else ()
-        elif column.plain == "yaw" and "nsats" in plain:  # of ArduPilot, whose north is 360
+        elif column.plain == "yaw" and "nsats" in plain:  # ArduPilot, where north is 360
             known = (0.0,)
         elif re.fullmatch(ALTITUDE, column.plain) and np.nanmedian(column.values) > _LOWEST_M:
             known = _NO_ALTITUDE
@@ -119,20 +119,20 @@ def _rows(count: int) -> str:
 
 
 def _is_code(values: NDArray, code: float, largest: float) -> bool:
-    """Tell whether a value is a code: beyond the range of degrees that most others keep to."""
+    """Test whether a value is a code: beyond the range of degrees, unlike most others."""
     others = values[np.isfinite(values) & ~np.isin(values, _NOT_A_PLACE)]
     return bool(np.any(values == code)) and (not len(others) or float(np.abs(others).max()) <= largest)
 
 
 def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
-    """Return the lines that choose rows with a fix by a receiver's code, and which (rows,) have one."""
+    """Write the lines that select rows with a fix; return them, and which rows (rows,) have one."""
     rows = len(table.whole[0].values)
     found: list[tuple[str, NDArray[np.bool_], Sequence[float | str]]] = []
     is_of_satellites = any(column.plain == "nsats" for column in table.whole)
     for column in table.whole:
         plain = column.plain
         if (plain == "status" and is_of_satellites) or (plain == "mode" and "class" in table.texts):
-            plain = f"gps_{plain}"  # of ArduPilot, and of gpsd
+            plain = f"gps_{plain}"  # in logs of ArduPilot, and of gpsd
         for name, none, valid in _FIX_CODES:
             known = known_of(column)
             if re.fullmatch(name, column.name if name[0] == "^" else plain) and len(known):
@@ -159,7 +159,7 @@ def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
 
 
 def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
-    """Find what latitudes and longitudes are in; raises BadInput if that is not certain."""
+    """Determine the unit of latitudes and longitudes; raise BadInput if it is ambiguous."""
     latitude, longitude = place
     signed = [
         _signed(table, column, letters) for column, letters in zip(place, ("NS", "EW"), strict=True)
@@ -178,7 +178,7 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
         _refuse(
             table,
             place,
-            "longitudes seem to count from 0 to 360 deg, so subtract 360 from those beyond 180"
+            "longitudes seem to be from 0 to 360 deg; subtract 360 from those above 180"
             if whole_turn
             else "no unit fits",
         )
@@ -187,13 +187,13 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     if stated and stated in fitting and not (stated == "deg" and _MINUTES in fitting):
         chosen, why = stated, "as its name says"
     elif len(by_speed) == 1 < len(fitting):
-        chosen, why = by_speed[0], "by which places move as fast as the speed says"
+        chosen, why = by_speed[0], "in which positions agree with the speed"
     elif by_speed == [] and len(fitting) > 1 and "deg" not in fitting:
-        _refuse(table, place, f"as {' or '.join(fitting)} they do not move as fast as the speed says")
+        _refuse(table, place, f"as {' or '.join(fitting)} they do not agree with the speed")
     else:
         chosen, why = _by_name(table, place, [each for each in fitting if each in by_speed] or fitting)
         if not chosen:
-            _refuse(table, place, f"they may be {', '.join(fitting)}")
+            _refuse(table, place, f"they may be in {', '.join(fitting)}")
     if chosen not in ("deg", stated):
         comment = f"{ASSUMED}{names}: in {chosen}, {why}"
     units = (chosen, own if chosen == stated else chosen)
@@ -230,16 +230,15 @@ def _how(chosen: str) -> str:
 def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> None:
     largest = [float(np.nanmax(np.abs(column.values))) for column in place]
     raise BadInput(
-        f"{table.path}: it is not certain what {place[0].name} and {place[1].name}, up to "
-        f"{largest[0]:.9g} and {largest[1]:.9g}, are in: {why}; write a mapping by hand with `units` "
-        "of latitude_deg and "
-        'longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` for '
-        "ddmm.mmmm, or `missing` for codes of missing values"
+        f"{table.path}: the unit of {place[0].name} and {place[1].name}, up to {largest[0]:.9g} and "
+        f"{largest[1]:.9g}, is ambiguous: {why}; write a mapping yourself with `units` of latitude_deg "
+        'and longitude_deg, such as "deg", "1e-7 deg", "1e-6 deg" or "semicircle", `degrees_minutes` '
+        "for ddmm.mmmm, or `missing` for codes of missing values"
     )
 
 
 def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray:
-    """Return a column with the signs of a column of hemispheres, if there is one."""
+    """Apply the signs from a column of hemispheres to a column, if there is one."""
     if column.name in table.prepared.get("hemispheres", {}):
         return column.values
     sides = [
@@ -261,12 +260,12 @@ def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray
 
 
 def _fits(name: str, latitude: NDArray, longitude: NDArray) -> bool:
-    """Tell whether latitudes and longitudes may be in a unit."""
+    """Test whether latitudes and longitudes may be in a unit."""
     sizes = [np.abs(values[np.isfinite(values)]) for values in (latitude, longitude)]
     if not (len(sizes[0]) and len(sizes[1])):
         return name == "deg"
     if name == _MINUTES:
-        # longitudes may count to 360 deg, and stand where latitudes are named
+        # longitudes may go up to 360 deg, and may be in the column named latitude
         is_beyond = max(sizes[0].max(), sizes[1].max()) > 360.0
         in_minutes = all(np.all(np.fmod(size, 100.0) < 60.0) for size in sizes)
         return bool(is_beyond and in_minutes and sizes[0].max() <= 9000.0 and sizes[1].max() <= 18000.0)
@@ -278,7 +277,7 @@ def _fits(name: str, latitude: NDArray, longitude: NDArray) -> bool:
     if name == "deg":
         return True
     is_whole = all(np.all(size == np.rint(size)) for size in sizes)
-    # a degree or less from 0, 0 there is mostly sea
+    # within a degree of 0, 0 there is mostly sea
     return bool(
         is_whole
         and max(sizes[0].max(), sizes[1].max()) * factor > 0.5
@@ -294,7 +293,7 @@ def _degrees(name: str, values: NDArray) -> NDArray:
 
 
 def _by_speed(table: GuessedTable, pair: tuple[NDArray, NDArray], fitting: Sequence[str]) -> list[str]:
-    """Return the units by which places move as fast as a column of speeds says; all without one."""
+    """Return the units in which positions agree with a column of speeds; all units without one."""
     speed = _column(table.whole, r"(.*_)?(sog|speed(_over_ground)?|ground_?speed|g_?spd|velocity|gs)")
     if speed is None or len(fitting) == 1:
         return list(fitting)
@@ -315,7 +314,7 @@ def _speed_sizes(table: GuessedTable) -> list[float]:
 
 
 def is_ais(table: GuessedTable) -> bool:
-    """Tell whether a table holds AIS reports, by the names of its columns."""
+    """Test by the names of columns whether a table holds AIS reports."""
     plain = {column.plain for column in table.whole}
     return any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
 
@@ -323,12 +322,12 @@ def is_ais(table: GuessedTable) -> bool:
 def path_ratio(
     table: GuessedTable, latitude_deg: NDArray, longitude_deg: NDArray, speed: NDArray
 ) -> float | None:
-    """Return how many m/s of the path one of a speed's unit is; None if places or speeds do not tell.
+    """Compute the m/s of the path per unit of a speed; None if positions or speeds do not suffice.
 
     Args:
-        table: has the times of the rows.
-        latitude_deg: (rows,), NaN if there is none.
-        longitude_deg: (rows,), NaN if there is none.
+        table: the table with the times of the rows.
+        latitude_deg: (rows,), NaN if unknown.
+        longitude_deg: (rows,), NaN if unknown.
         speed: (rows,), in the unknown unit.
     """
     east, north = local_metres(latitude_deg, longitude_deg).T
@@ -336,10 +335,10 @@ def path_ratio(
 
 
 def plane_ratio(table: GuessedTable, east: NDArray, north: NDArray, speed: NDArray) -> float | None:
-    """Return what `path_ratio` does, for places in a plane.
+    """Compute the same ratio as `path_ratio` for positions in the local tangent plane.
 
     Args:
-        table: has the times of the rows.
+        table: the table with the times of the rows.
         east: (rows,), in m.
         north: (rows,), in m.
         speed: (rows,), in the unknown unit.
@@ -349,7 +348,7 @@ def plane_ratio(table: GuessedTable, east: NDArray, north: NDArray, speed: NDArr
     known = np.isfinite(east) & np.isfinite(north) & np.isfinite(table.time_s)
     if known.sum() < 5:
         return None
-    # over several rows, so that rounding and noise of places count less
+    # over several rows, which reduces the effect of rounding and noise
     stride = max(1, int(known.sum()) // 12)
     moved = np.hypot(*(each[stride:] - each[:-stride] for each in (east[known], north[known])))
     span = np.abs(table.time_s[known][stride:] - table.time_s[known][:-stride])
@@ -369,7 +368,7 @@ def plane_ratio(table: GuessedTable, east: NDArray, north: NDArray, speed: NDArr
 def _by_name(
     table: GuessedTable, place: Sequence[GuessedColumn], fitting: Sequence[str]
 ) -> tuple[str, str]:
-    """Return the unit that names and sizes tell, with why; empty if they do not."""
+    """Choose a unit by names and sizes; return it with the reason, or empty strings."""
     if "deg" in fitting and "rad" not in fitting:
         return "deg", "by their size"
     if fitting == ["deg", "rad"] or set(fitting) == {"deg", "rad"}:
@@ -400,7 +399,7 @@ def _by_name(
 
 
 def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) -> list[str]:
-    """Write the unit of an altitude; raises BadInput if its numbers are too large for m."""
+    """Write the unit of an altitude; raise BadInput if its numbers are too large for m."""
     if length := stated_unit(height, "m"):
         return [f'units.altitude_m = "{length}"   # as its name says'] if length != "m" else []
     known = known_of(height)
@@ -415,14 +414,13 @@ def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) 
         said = f"{ASSUMED}{height.name}: in mm, as {largest:.6g} m is above any receiver; units"
         return [said, 'units.altitude_m = "mm"']
     raise BadInput(
-        f"{table.path}: it is not certain what {height.name}, up to {largest:.6g}, is in; write a "
-        "mapping by "
-        'hand with units.altitude_m, such as "ft" or "mm"'
+        f"{table.path}: the unit of {height.name}, up to {largest:.6g}, is ambiguous; write a mapping "
+        'yourself with units.altitude_m, such as "ft" or "mm"'
     )
 
 
 def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str) -> list[str]:
-    """Write the unit of a standard deviation of positions; raises BadInput if it is not certain."""
+    """Write the unit of a standard deviation of positions; raise BadInput if it is ambiguous."""
     if length := stated_unit(accuracy, "m"):
         return [f'units.covariance_m2 = "{length}"   # as its name says'] if length != "m" else []
     known = known_of(accuracy)
@@ -430,8 +428,8 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
         return [f"{ASSUMED}{accuracy.name}: in m, as no unit is stated; units"]
     if not re.search("acc", accuracy.plain):
         raise BadInput(
-            f"{table.path}: it is not certain what {accuracy.name}, up to {known.max():.6g}, is "
-            "in: whole numbers may be m, mm, or a dilution times 100; write a mapping by hand with "
+            f"{table.path}: the unit of {accuracy.name}, up to {known.max():.6g}, is ambiguous: whole "
+            "numbers may be m, mm, or a dilution times 100; write a mapping yourself with "
             "`deviations` and `factors` of covariance_m2"
         )
     said = f"{ASSUMED}{accuracy.name}: in mm, as receivers with positions of 1e-7 deg have it; units"
@@ -439,9 +437,9 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
 
 
 def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tuple[str, str]:
-    """Return the unit of a speed, or of a velocity of east, north and up, and why.
+    """Determine the unit of a speed, or of a velocity of east, north and up, and the reason.
 
-    By its name, or by how far places move; else m/s.
+    It follows from the name, or from how fast positions change; otherwise it is m/s.
     """
     speed = velocity[0]
     if stated := stated_unit(speed, "m/s"):
@@ -454,7 +452,7 @@ def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tup
         if ratio is not None:
             nearest = min(_SPEEDS, key=lambda each: abs(np.log(_SPEEDS[each] / ratio)))
             if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
-                return nearest, "so places move as fast"
+                return nearest, "which agrees with the positions"
     return "m/s", f"a guess: the largest is {np.nanmax(length):.4g}"
 
 

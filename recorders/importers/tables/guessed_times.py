@@ -1,6 +1,6 @@
-"""Guesses which columns of a table are its times, and in which form; what is not certain is refused.
+"""Guesses of the columns with a table's times, and of their format; ambiguous tables are rejected.
 
-No rate is made up for a table with a column that could be a time.
+If a column could be the time, no rate is assumed.
 """
 
 import json
@@ -42,15 +42,15 @@ from fuselog.recorders.importers.tables.times import (
 from fuselog.recorders.models.geodesy import local_metres
 
 UNKNOWN_ZERO = "2026-01-01"
-# What times of FIT files count from in s, and where numbers are more likely of 1970.
+# The zero of times in FIT files, and the number of seconds above which times rather count from 1970.
 _FIT_ZERO, _FIT_END = "1989-12-31", 1.3e9
 _SIZES = {unit: 10.0 ** (digits - 9) for unit, digits in DIGITS.items()}
 _LIKELY = ("s", "ms", "us", "ns")
-# Unix time, in s, of 2000 and of 2050: what numbers that count from 1970 are between.
+# Unix time, in s, of 2000 and of 2050: the range of numbers that count from 1970.
 _DATES_S = (946_684_800.0, 2_524_608_000.0)
-# Unix time, in s, of the date and of a year later at which receivers begin whose clock was never set.
+# Unix time, in s, at which the clocks of receivers begin if they were never set, and a year later.
 _UNSET_S = (315_964_800.0, 347_500_800.0)
-# Nothing that is not a date counts longer, in s: a year.
+# The longest time, in s, that is not a date: a year.
 _LONGEST_S = 31_557_600.0
 _UNIT_WORDS = {
     "ms": r"ms|millis(ec(ond)?s?)?|msecs?",
@@ -66,17 +66,18 @@ _COUNTERS = re.compile(
     r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
     r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
 )
-# How many cells are looked at together for one that is not empty.
+# How many cells are searched at a time for one that is not empty.
 _CELLS = 1000
-# Names of columns that count days, as Excel and MATLAB do.
+# Names of columns that count days, as in Excel and MATLAB.
 _DAYS = r"(^|_)(excel|serial|date_?num|matlab|mjd|julian)(_|$)"
-# What the column of a message's own stamp is called, and columns without a name of their own.
+# The column of a message's own stamp, and columns without a proper name.
 _OF_HEADER = r"(^|_)header_?(time_?)?stamp"
 _NAMELESS = r"(value|field|column|col|var|data|unnamed)?_?\d*"
 _PLACE = r"(.*_)?(lat(itude)?|lon|lng|long(itude)?|x|y|z|east(ing)?|north(ing)?|alt(itude)?|height)"
 _OFFSETS = r"(.*_)?((utc|gmt)_?of+se?t|utcofst|tz_?offset|time_?zone_?offset)|tz"
 _LIKE_A_TIME = r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d[ ./-][A-Z][a-z]{2,8}[ ./-]\d{2}"
-# From and below how many seconds steps are, by what a table holds: three decades, so that one unit fits.
+# The least usual step in s, by what a table holds; usual steps span three decades, so that one unit
+# fits.
 _STEPS_S = {"inertial": 5e-4, "fix": 0.02, "other": 2e-3}
 _VEHICLES = re.compile(
     r"(.*_)?(mmsi|imei|imo|icao(24)?|callsign|call_sign|(vehicle|veh|robot|drone|uav|aircraft|flight|device|"
@@ -94,17 +95,17 @@ _RANGES = {
     "%S": (0, 60),
 }  # fmt: skip
 _DAYS_IN_PARTS = (["%Y", "%j"], ["%Y", "%m", "%d"])
-# Numbers of pictures, whose rate is stated elsewhere.
+# Frame numbers, whose rate is not in the table.
 _FRAMES = r"(.*_)?(frame|image|img)(_?(id|no|nr|num|number|idx|index|count|counter))?"
 # The clock of all messages of ArduPilot, and that of the computer that received them.
 _ARDUPILOT, _RECEIVED = "TimeUS", "timestamp"
 
 
 class GuessedTime(NamedTuple):
-    """Holds a table's time: as TOML, the columns it is of, and what was seen and assumed.
+    """A table's time: TOML, the columns that it uses, and comments on what was seen and assumed.
 
-    `stamps` (n,) are those of the rows, or None if no column has them, and `vehicle` is the column that
-    says whose row it is.
+    `stamps` (n,) are the stamps of the rows, or None if no column has them; `vehicle` is the column that
+    identifies the vehicle of each row.
     """
 
     text: str
@@ -115,10 +116,10 @@ class GuessedTime(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """Holds the first rows of a table, its columns of numbers and of texts, and whose row it is (n,).
+    """The first rows of a table, its columns of numbers and texts, and the vehicle of each row (n,).
 
-    `has_others` is whether there are other tables, with which it has to share a clock; `stamps` are
-    those that were read, by their mapping.
+    `has_others` is whether other tables have to share a clock with this one; `stamps` caches the stamps
+    by mapping.
     """
 
     path: Path
@@ -142,7 +143,7 @@ def guess_time(
 ) -> GuessedTime:
     """Guess the time of a table's rows; `has_others` is whether other tables are guessed with it.
 
-    Raises BadInput if columns could be times, and it is not certain which they are.
+    Raises BadInput if columns could be times, but the choice is ambiguous.
     """
     plain = {column.plain for column in columns}
     vehicle = _vehicle(batch, columns, texts)
@@ -177,11 +178,11 @@ def _kind_of(plain: set[str]) -> str:
     return "fix" if is_fix else "other"
 
 
-# Whose rows they are.
+# Vehicles.
 
 
 def _vehicle(batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]) -> str:
-    """Return the column that says whose row it is, of several; empty without one."""
+    """Return the column that identifies the vehicle of each row, or an empty string."""
     plain = {column.name: column.plain for column in columns} | {name: parted(name)[0] for name in texts}
     is_placed = any(
         re.fullmatch(r"(.*_)?(lat(itude)?|x(_center)?|east(ing)?)", each) for each in plain.values()
@@ -199,7 +200,7 @@ def _vehicle(batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str
 
 
 def _separates(cells: pa.Array) -> bool:
-    """Tell whether cells are of a few values, each of which comes several times."""
+    """Test whether cells have few values, each of which occurs several times."""
     if pa.types.is_floating(cells.type) and not _are_whole(cells.to_numpy(zero_copy_only=False)):
         return False
     counts = pc.value_counts(cells.drop_null()).field("counts")
@@ -223,16 +224,16 @@ def _codes(batch: Batch, vehicle: str) -> NDArray[np.int64]:
 
 
 def _parts(stamps: Stamps, codes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the rows with a time, vehicle by vehicle."""
+    """Split the rows with a time by vehicle."""
     known = stamps != NOT_A_TIME
     return [np.flatnonzero(known & (codes == code)) for code in np.unique(codes) if code >= 0]
 
 
-# Which columns, in which form.
+# Columns, and formats of times.
 
 
 def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield what the time may be, the likeliest first; raises BadInput for what could be several."""
+    """Yield candidates for the time, the likeliest first; raise BadInput if several are possible."""
     dated: set[str] = set()
     yield from _of_ardupilot(table)
     yield from _dates(table, dated)
@@ -260,14 +261,14 @@ def _candidates(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         if re.fullmatch(_NAMELESS, column.plain) and _is_steady(column.values):
             raise BadInput(
                 f"{table.path}: column {column.name} rises steadily, and could be the time; write a "
-                f'mapping by hand, with time = {{ column = "{column.name}", unit = ... }}, or with '
+                f'mapping yourself, with time = {{ column = "{column.name}", unit = ... }}, or with '
                 "`rate_hz` in `time`"
             )
     _check_frames(table)
 
 
 def _of_ardupilot(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield the clock that all messages of ArduPilot have, so that several tables have one."""
+    """Yield the clock that all messages of ArduPilot share, so that tables have the same clock."""
     by_name = {column.name: column for column in table.columns}
     if _ARDUPILOT in by_name and (table.has_others or _RECEIVED in by_name):
         received = by_name.get(_RECEIVED)
@@ -276,34 +277,34 @@ def _of_ardupilot(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 
 def _check_frames(table: _Table) -> None:
-    """Raise BadInput for rows that are of several vehicles or counted as frames, and have no time."""
+    """Raise BadInput for rows of several vehicles, or with frame numbers, that have no time."""
     frames = next((each.name for each in table.columns if re.fullmatch(_FRAMES, each.plain)), "")
     of_several = f"several vehicles, by column {table.vehicle}" if table.vehicle else ""
     if not (frames or of_several):
         return
     whose = f', and in the table vehicle = "{table.vehicle}"' if table.vehicle else ""
-    of_frames = f"column {frames} counts frames, whose rate is not in the file" if frames else ""
+    of_frames = f"column {frames} counts frames, but the frame rate is not in the file" if frames else ""
     column = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
     raise BadInput(
         f"{table.path}: {of_frames or 'no column could be the time of rows of ' + of_several}; write a "
-        f"mapping by hand with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
+        f"mapping yourself with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
     )
 
 
 def _rises(values: NDArray) -> bool:
-    """Tell whether numbers rise nearly always, and to another one than the first."""
+    """Test whether numbers nearly always rise, and end above the first."""
     known = values[np.isfinite(values)]
     return len(known) > 1 and float(np.mean(np.diff(known) >= 0)) >= 0.9 and bool(known[-1] > known[0])
 
 
 def _is_steady(values: NDArray) -> bool:
-    """Tell whether numbers go in steps of nearly one size, other than those of a count of rows."""
+    """Test whether numbers have nearly equal steps, other than the steps of a row count."""
     steps = np.diff(values[np.isfinite(values)])
     return len(steps) > 1 and 0 < steps.max() <= 1.5 * steps.min() and not np.all(steps == 1)
 
 
 def _passed_over(table: _Table, used: set[str]) -> list[str]:
-    """Say which columns with other dates were not taken for the time."""
+    """Write which columns with other dates were not chosen as the time."""
     others = [
         column.name
         for column in table.columns
@@ -319,7 +320,7 @@ def _passed_over(table: _Table, used: set[str]) -> list[str]:
 def _tried(
     table: _Table, mapping: TimeMapping, comments: list[str], refusals: list[BadInput]
 ) -> GuessedTime | None:
-    """Return the time by one candidate; None if it is none, with a refusal if it may be one."""
+    """Try one candidate; return None if it is not the time, and add a refusal if it might be."""
     columns = mapping.columns
     try:
         stamps = _stamps(table, mapping)
@@ -334,8 +335,8 @@ def _tried(
         if len(known) > 1:
             refusals.append(
                 BadInput(
-                    f"{label} could be the time, and is the same in all rows; write a mapping by hand "
-                    "with the `time` of the rows, as docs/your-log.md says"
+                    f"{label} could be the time, but is the same in all rows; write a mapping yourself "
+                    "with the `time` of the rows, as docs/your-log.md explains"
                 )
             )
         return None
@@ -348,7 +349,7 @@ def _tried(
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
             comments = [
                 *comments,
-                f"{ASSUMED}{columns[0]}: begins again at {rollover}, and is continued; rollover",
+                f"{ASSUMED}{columns[0]}: rolls over at {rollover}, and is unwrapped; rollover",
             ]
             stamps = _stamps(table, mapping)
         elif back == 1 and not vehicle:
@@ -356,7 +357,10 @@ def _tried(
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
     if back == -1:
-        comments = [*comments, f"{ASSUMED}rows: newest first, as their times fall, so reversed; order"]
+        comments = [
+            *comments,
+            f"{ASSUMED}rows: newest first, as their times decrease, so reversed; order",
+        ]
     try:
         for part in parts:
             order = Order(label, mapping)
@@ -384,7 +388,7 @@ def _stamps(table: _Table, mapping: TimeMapping) -> Stamps:
 
 
 def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.int64]], back: int) -> int:
-    """Return at which number a counter begins again, of each vehicle the same; 0 if it does not."""
+    """Return the number at which the counters of all vehicles roll over; 0 if there is none."""
     column = next(each for each in table.columns if each.name == mapping.columns[0])
     found = set()
     for part in parts if len(mapping.columns) == 1 else ():
@@ -398,7 +402,7 @@ def _rollover(table: _Table, mapping: TimeMapping, parts: Sequence[NDArray[np.in
 
 
 def _separating(table: _Table, stamps: Stamps, used: Sequence[str]) -> str:
-    """Return the column whose values separate rows so that the times of each rise."""
+    """Return the column that splits rows into groups with increasing times, or an empty string."""
     others = [*table.texts, *(column.name for column in table.columns)]
     for name in others:
         if name in used or not _separates(table.batch[name]):
@@ -453,7 +457,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
                 cell = first_cell(table.batch[days[0]])
                 raise Undecided(
                     f"{table.path}: column {names[0]} has times of the day, and {days[0]} dates such as "
-                    f"'{cell}', whose format is not known; write a mapping by hand, with time = "
+                    f"'{cell}' in an unknown format; write a mapping yourself, with time = "
                     f'{{ column = ["{days[0]}", "{names[0]}"], unit = "date", format = ... }}'
                 )
             dated |= {*names}
@@ -461,7 +465,7 @@ def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[s
 
 
 def _offsets(table: _Table) -> dict[str, str]:
-    """Return the columns that are called offsets from UTC, with their first cells."""
+    """Return the columns named as offsets from UTC, with their first cells."""
     found = {
         name: first_cell(table.batch[name])
         for name in table.batch
@@ -471,7 +475,7 @@ def _offsets(table: _Table) -> dict[str, str]:
 
 
 def _check_texts(table: _Table, dated: set[str]) -> None:
-    """Raise BadInput for a column of times in no known format."""
+    """Raise BadInput for a column of times in an unknown format."""
     for name in table.texts:
         cell = first_cell(table.batch[name])
         is_named = _NAMED.search(parted(name)[0]) and re.search(r"\d.*\d", cell)
@@ -481,13 +485,12 @@ def _check_texts(table: _Table, dated: set[str]) -> None:
             if odd and _is_number(cell):
                 raise BadInput(
                     f"{table.path}: column {name} holds times such as '{cell}', but '{odd[0]}' in row "
-                    f"{texts.index(odd[0]) + 1} is no number; correct it, or leave the row out"
+                    f"{texts.index(odd[0]) + 1} is not a number; correct it, or remove the row"
                 )
             raise BadInput(
-                f"{table.path}: column {name} holds times such as '{cell}', whose format is not known; "
-                "write "
-                f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
-                "as docs/your-log.md says"
+                f"{table.path}: column {name} holds times such as '{cell}' in an unknown format; write "
+                f'a mapping yourself, with time = {{ column = "{name}", unit = "date", format = ... }}, '
+                "as docs/your-log.md explains"
             )
 
 
@@ -496,7 +499,7 @@ def _is_number(cell: str) -> bool:
 
 
 def first_cell(cells: pa.Array, *, is_part: bool = False) -> str:
-    """Return the first cell that is not empty, as text; an empty one without any."""
+    """Return the text of the first cell that is not empty, or an empty string."""
     for begin in range(0, len(cells), _CELLS):
         texts = texts_of(cells[begin : begin + _CELLS], is_part=is_part).to_pylist()
         if found := next(filter(None, texts), ""):
@@ -509,7 +512,7 @@ def _first_cells(table: _Table, names: Sequence[str]) -> str:
 
 
 def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
-    """Return the time of columns of texts; None if they hold none."""
+    """Find the format of times in text columns; return None if they hold no times."""
     cell = _first_cells(table, names)
     if not re.search(r"\d", cell):
         return None
@@ -528,7 +531,7 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
             raise Undecided(
                 f"{table.path}: column {name} states offsets from UTC such as "
                 f"'{first_cell(table.batch[name])}', which are not used with {' and '.join(names)}; "
-                "write a mapping by hand, with `utc_offset_h` or `zone` in `time`"
+                "write a mapping yourself, with `utc_offset_h` or `zone` in `time`"
             )
         comments = [
             f"{ASSUMED}{' and '.join(names)}: in UTC, as no zone is stated; zone or utc_offset_h"
@@ -557,14 +560,14 @@ def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]]
     others = [each for each in fitting if not np.array_equal(fitting[each], fitting[pattern])]
     if others:
         comments.append(
-            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as rows leap with "
+            f"{ASSUMED}{' and '.join(names)}: {_first_part(pattern)} first, as times jump with "
             f"{_first_part(others[0])} first; format"
         )
     return TimeMapping.model_validate({**given, "format": pattern}), comments
 
 
 def _first_part(pattern: str) -> str:
-    """Name what a format begins with."""
+    """Name the first part of a format."""
     return {"%d": "the day", "%m": "the month"}.get(pattern[:2], "the year")
 
 
@@ -573,9 +576,9 @@ def _has_zone(kind: pa.DataType) -> bool:
 
 
 def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Stamps]) -> str:
-    """Return the format by which rows follow one another, without leaps of months or years.
+    """Choose the format in which rows follow one another without jumps of months or years.
 
-    Raises BadInput if several do so alike: what the day is cannot be told.
+    Raises BadInput if several formats do so equally well: the day is ambiguous.
     """
     spans = {}
     for pattern, stamps in stamps_by.items():
@@ -594,14 +597,14 @@ def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Sta
         first, second = (pd.Timestamp(int(stamps_by[each][row])) for each in (best, alike[0]))
         raise BadInput(
             f"{table.path}: column {' and '.join(names)} holds dates such as '{cell}', which may be "
-            f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping by hand with `format` in `time`, "
+            f"{first:%-d %B %Y} or {second:%-d %B %Y}; write a mapping with `format` in `time`, "
             f'"{best}" or "{alike[0]}"'
         )
     return best
 
 
 def _zone(names: Sequence[str]) -> str:
-    """Return the zone that a column's name states in brackets."""
+    """Return the zone in brackets in a column's name."""
     for text in re.findall(r"[\[(]\s*([^\])]+?)\s*[\])]", " ".join(names)):
         try:
             offset_of(text)
@@ -611,11 +614,11 @@ def _zone(names: Sequence[str]) -> str:
     return ""
 
 
-# Numbers of calendars and clocks.
+# Numbers of dates and times of day.
 
 
 def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield year, month and day, or day of the year, and the time of day in columns of their own."""
+    """Yield dates in separate columns (year, month and day, or day of the year) with the time of day."""
     parts = _parts_of_date(table)
     day = [letters for letters in ("%Y", "%j", "%m", "%d") if letters in parts]
     if day not in _DAYS_IN_PARTS:
@@ -641,7 +644,7 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 
 def _parts_of_date(table: _Table) -> dict[str, str]:
-    """Return the columns with a year and other parts of a time, by letters; none without a year."""
+    """Return the columns with parts of a date and time, by their letters; empty without a year."""
     found: dict[str, str] = {}
     for pattern, letters in _PARTS:
         for column in table.columns:
@@ -656,7 +659,7 @@ def _parts_of_date(table: _Table) -> dict[str, str]:
 
 
 def _nameless_parts(table: _Table) -> dict[str, str]:
-    """Return what `_parts_of_date` does by the numbers of columns without names; none if unclear."""
+    """Find the parts of a date by the numbers in columns without names; empty if ambiguous."""
     fitting = []
     for day in _DAYS_IN_PARTS:
         own = {
@@ -671,18 +674,18 @@ def _nameless_parts(table: _Table) -> dict[str, str]:
 
 
 def _check_calendars(table: _Table) -> None:
-    """Raise BadInput for dates in several columns whose time of day is in no form that is known."""
+    """Raise BadInput for dates in several columns whose time of day has an unknown format."""
     parts = _parts_of_date(table)
     if [letters for letters in ("%Y", "%j", "%m", "%d") if letters in parts] in _DAYS_IN_PARTS:
         raise BadInput(
-            f"{table.path}: columns {', '.join(parts.values())} hold the date in parts, and the time of "
-            "day is in no form that is known; add a column of times such as 2026-05-03T10:00:00Z, or "
-            'state in `time` of a mapping the columns and their format, such as "%Y %j %H %M %S"'
+            f"{table.path}: columns {', '.join(parts.values())} hold the date in parts, but the time of "
+            "day has an unknown format; add a column of times such as 2026-05-03T10:00:00Z, or write a "
+            'mapping with the columns and their `format` in `time`, such as "%Y %j %H %M %S"'
         )
 
 
 def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield times as hhmmss, as NMEA has them, with or without a date as ddmmyy or yyyymmdd."""
+    """Yield times as hhmmss, as in NMEA, with or without a date as ddmmyy or yyyymmdd."""
     for column in table.columns:
         cell = first_cell(table.batch[column.name])
         if not (
@@ -719,7 +722,7 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 
 def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield GPS weeks with seconds of the week, and seconds with parts of them in another column."""
+    """Yield GPS weeks with seconds of the week, and seconds with their fractions in another column."""
     by_plain = {column.plain: column for column in table.columns}
     week = next(
         (
@@ -781,12 +784,12 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 
 def _full(column: GuessedColumn) -> str:
-    """Return a column's name in lower case with underlines, its unit at the end."""
+    """Return a column's name in lower case with underscores, followed by its unit."""
     return f"{column.plain}_{column.unit}" if column.unit in _SIZES else column.plain
 
 
 def _stated_unit(column: GuessedColumn) -> str:
-    """Return the unit of a column of times that its name states; empty without one."""
+    """Return the unit that the name of a column of times states, or an empty string."""
     if column.unit in _SIZES:
         return column.unit
     last = column.plain.rpartition("_")[2]
@@ -794,7 +797,7 @@ def _stated_unit(column: GuessedColumn) -> str:
 
 
 def _epoch_unit(column: GuessedColumn) -> str:
-    """Return the unit in which a column's numbers are dates from 2000 to 2100; empty without one."""
+    """Return the unit in which a column's numbers are dates from 2000 to 2050, or an empty string."""
     known = known_of(column)
     if not len(known):
         return ""
@@ -804,7 +807,7 @@ def _epoch_unit(column: GuessedColumn) -> str:
 
 
 def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield a column of numbers as times; raises BadInput if its unit is not to be told."""
+    """Yield a column of numbers as times; raise BadInput if its unit is ambiguous."""
     known = known_of(column)
     steps = np.abs(np.diff(known))
     steps = steps[steps > 0]
@@ -834,9 +837,9 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
             unit, why = _relative_unit(table, column, step)
         if largest * _SIZES[unit] > _LONGEST_S:
             raise BadInput(
-                f"{table.path}: column {column.name} could be the time, and reaches {largest:.6g}, "
-                f"which in {unit} is neither a date since 1970 nor less than a year; write a mapping by "
-                'hand with the `unit` and `zero` of `time`, such as zero = "1904-01-01"'
+                f"{table.path}: column {column.name} could be the time, but reaches {largest:.6g}, "
+                f"which in {unit} is neither a date since 1970 nor less than a year; write a mapping "
+                'yourself with the `unit` and `zero` of `time`, such as zero = "1904-01-01"'
             )
         comments = [
             f"# Stamps begin at {known[0]:g}.",
@@ -854,26 +857,26 @@ def _is_fit(table: _Table) -> bool:
 
 
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:
-    """Return the unit of a counter of unknown zero, and why: by its steps, if speeds do not tell."""
+    """Choose the unit of a counter with unknown zero, by speeds or else by its steps."""
     if (ratio := _seconds_a_count(table, column)) is not None:
         nearest = min(_LIKELY, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
         if abs(np.log10(_SIZES[nearest] / ratio)) < 1.0:
-            return nearest, ", by which places move as fast as the speed says,"
+            return nearest, ", in which positions agree with the speed,"
     least_s = _STEPS_S[table.kind]
     fitting = [unit for unit in _LIKELY if least_s <= step * _SIZES[unit] < 1000 * least_s]
     unit = fitting[0] if fitting else "s" if step >= 1 else "ns"
     rate_hz = 1.0 / (step * _SIZES[unit])
     if not 1e-5 < rate_hz < 2e4:
         raise BadInput(
-            f"{table.path}: column {column.name} could be the time, and goes in steps of {step:.3g}, "
-            "which are those of no unit; write a mapping by hand with the `unit` and `zero` of `time`; "
-            "convert days, as Excel and MATLAB count them, to seconds or dates first"
+            f"{table.path}: column {column.name} could be the time, but its steps of {step:.3g} fit no "
+            "unit; write a mapping yourself with the `unit` and `zero` of `time`; convert days, as in "
+            "Excel and MATLAB, to seconds or dates first"
         )
     return unit, f", {rate_hz:.4g} rows a second,"
 
 
 def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
-    """Return how many seconds one count of a column is, by the distance and the speed of rows."""
+    """Estimate the seconds per count of a column from the distances and speeds of rows."""
     named: dict[str, NDArray] = {}
     for key, pattern in (
         ("lat", r"(.*_)?lat(itude)?"), ("lon", r"(.*_)?(lon|lng|long)(gitude)?"),
@@ -903,11 +906,11 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
     return float(moved.sum() / counts.sum() / speed)
 
 
-# What was seen.
+# Comments on what was seen.
 
 
 def _seen(parts: Sequence[Stamps]) -> list[str]:
-    """Say the rate, gaps and repetitions of stamps, those of each vehicle by themselves."""
+    """Write the rate, gaps and repetitions of stamps, with each vehicle on its own."""
     steps_s = np.concatenate([np.diff(part) for part in parts]) * 1e-9
     if is_reversed(parts):
         steps_s = -steps_s

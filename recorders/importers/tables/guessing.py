@@ -1,7 +1,7 @@
-"""Guesses a mapping to start from: which messages columns are, by their names and numbers.
+"""Guesses of a mapping to start from: the messages that columns hold, by their names and numbers.
 
-Every guess stands in the mapping with its reason as a comment beside it; columns that fit no message
-become a vector of plain numbers. A person reads and mends it: the text is the product, not the import.
+The mapping gives the reason for each guess in a comment; columns that fit no message become a vector of
+plain numbers. A person reads and corrects the mapping: the text is the result, not the import.
 """
 
 import json
@@ -39,38 +39,38 @@ from fuselog.recorders.importers.tables.guessed_times import GuessedTime, first_
 
 # How many rows are read.
 _ROWS = 100_000
-# A file without times that has fewer is a summary or a text.
+# A file without times and with fewer rows is a summary or a text.
 _FEWEST = 10
 # Names of files with the truth.
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
-# What the axes x, y and z of a file that is named so are of.
+# Sensors whose axes are the columns x, y and z of a file with such a name.
 _SENSORS = {
     "acc": r"(?i)acc(el\w*)?(?![a-z])|acceleration", "gyr": r"(?i)gyro\w*|gyr(?![a-z])",
     "mag": r"(?i)mag(netometer|netic\w*)?(?![a-z])", "gravity": "(?i)gravity",
 }  # fmt: skip
-# Columns of numbers whose name says nothing, and columns that say in each row what these are of.
+# Value columns with a general name, and columns that name the quantity of each row.
 _KINDS = {
     r"_?(value|val|reading)(_1)?": r"_?(field|name|signal|variable|parameter|metric|key|topic)(_1)?"
     r"|(.*_)?(sensor|channel|measurement)(_?(name|type))?",
     "x": r"(.*_)?sensor(_?(name|type))?",
 }
-# Names of files whose axes are north, east, down, as PX4 and MAVLink have them, and of frames in names.
+# Names of files with axes north, east, down, as in PX4 and MAVLink, and frames in names.
 _NED = r"(?i)vehicle_(local_position|odometry|trajectory)|local_position_ned|(^|[^a-z])ned([^a-z]|$)"
 _FRAME = r"(^|_)(ned|enu)(?=_|$)"
 # Names of columns with latitudes or longitudes.
 _PLACE = r"(^|_)(lat(itude)?|lon|lng|long(itude)?)$"
-# What in place of a unit is none, and needs no word.
+# Texts in place of a unit that need no comment.
 _NO_UNITS = {"", "-", "1", "none", "n/a"}
-# The column of times that have a file of their own.
+# The column name for times in a file of their own.
 _STAMP = "timestamp"
-# How the line of a file begins that is left out.
+# The beginning of the line on a file that is left out.
 _NOT_TAKEN = "# not taken: "
-# Reasons of a guess that are none of a doubt.
-_SURE = ("as its name says", "so places move as fast")
+# Reasons of a guess that leave no doubt.
+_SURE = ("as its name says", "which agrees with the positions")
 
 
 def guess(paths: Sequence[Path]) -> str:
-    """Return a mapping of tables, in TOML; raises BadInput where a file is no table."""
+    """Write a mapping of tables in TOML; raise BadInput if no file is a table."""
     files = []
     for path in paths:
         if not path.exists():
@@ -94,7 +94,7 @@ def guess(paths: Sequence[Path]) -> str:
             else f"{paths[0]}: has no table among its files; give a folder or files of tables"
         )
     head = [
-        "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
+        "# Guessed by fuselog; correct it where needed: docs/your-log.md explains how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
         *(f"{_NOT_TAKEN}{note}" for note in notes),
         *_warnings("\n".join(tables)),
@@ -103,7 +103,7 @@ def guess(paths: Sequence[Path]) -> str:
 
 
 def assumptions(text: str) -> list[str]:
-    """Return what a guessed mapping assumes that changes numbers, and which files it leaves out."""
+    """List the assumptions of a guessed mapping that change numbers, and the files it leaves out."""
     found = []
     for line in text.splitlines():
         setting, _, why = line.partition("   # ")
@@ -117,16 +117,16 @@ def assumptions(text: str) -> list[str]:
 
 
 def _warnings(text: str) -> Iterator[str]:
-    """Say what a person must still say of streams that belong together: vehicle and origin."""
+    """Write what the user still has to state for streams that belong together: vehicle and origin."""
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
-        yield f"# The topics lie in {len(namespaces)} namespaces, {', '.join(namespaces)}."
-        yield "# They are taken for one vehicle's while none of a kind is there twice; better give all"
-        yield "# of one vehicle the same, such as /car/odometry, /car/fix and /car/truth."
+        yield f"# The topics are in {len(namespaces)} namespaces, {', '.join(namespaces)}."
+        yield "# They are taken as one vehicle's unless a kind of topic occurs twice; better give all"
+        yield "# topics of a vehicle one namespace, such as /car/odometry, /car/fix and /car/truth."
     becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
     if {"GeodeticFix", "TruthState"} <= {*becomes}:
-        yield "# The truth is in a plane, fixes are latitudes and longitudes. Without where the plane"
-        yield "# touches, here or as --origin LATITUDE,LONGITUDE,HEIGHT, the truth judges nothing:"
+        yield "# The truth is in a local tangent plane, but fixes are latitudes and longitudes."
+        yield "# The truth is not used unless the plane's origin is given, here or with --origin:"
         yield "# [origin]"
         yield "# latitude_deg = "
         yield "# longitude_deg = "
@@ -158,7 +158,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
     used = time.used if time else set()
     is_timed = bool(used or exported or source.stamps)
     unread = [
-        f"column {text} holds places such as '{found}', which are no numbers; convert them to degrees"
+        f"column {text} holds places such as '{found}', which are not numbers; convert them to degrees"
         for text in texts
         if re.search(_PLACE, parted(text)[0])
         and (
@@ -170,7 +170,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
     if not columns or (not is_timed and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
-            "mapping by hand, as docs/your-log.md says"
+            "mapping yourself, as docs/your-log.md explains"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}"]
     if exported:
@@ -221,23 +221,23 @@ def _table(source: Source, *, is_alone: bool) -> str:
     streams += [*_rest(rest), *truth_lines(true)]
     rest.made.extend(_unknown_units([each for each in every.whole if each.name not in plain_numbers]))
     if not streams:
-        nothing = "has no column of numbers beside its time; write a mapping by hand"
+        nothing = "has no column of numbers except its time; write a mapping yourself"
         raise BadInput(f"{path}: {unread[0] if unread else nothing}")
     if not any(line.startswith("topic =") for line in streams) and rest.has_truth:
         raise BadInput(
-            f"{path}: its name or columns say that it is the truth, and it has no position or heading; "
-            "if it was measured, write a mapping by hand"
+            f"{path}: its name or columns mark it as the truth, but it has no position or heading; if "
+            "it was measured, write a mapping yourself"
         )
     lines += [f"{_NOT_TAKEN}{path}: {each}" for each in unread]
     prepared = list(prepared_lines(rest))
     sides = rest.prepared.get("hemispheres", {}).values()
     if not_taken := [text for text in texts if text not in used and text not in sides]:
-        lines.append(f"# Columns with texts, not taken: {', '.join(not_taken)}")
+        lines.append(f"# Columns with texts that are not imported: {', '.join(not_taken)}")
     return "\n".join([*lines, *prepared, *rest.made, *true.made, *streams]) + "\n"
 
 
 def _check_kinds(path: Path, columns: Sequence[str], batch: Batch) -> None:
-    """Raise BadInput for a table whose rows are of several kinds, with the kind in a column of texts."""
+    """Raise BadInput for a table with several kinds of rows, named in a column of texts."""
     plain = {name: parted(name)[0] for name in columns}
     for of_value, of_kind in _KINDS.items():
         value = next((name for name in columns if re.fullmatch(of_value, plain[name])), "")
@@ -254,17 +254,17 @@ def _check_kinds(path: Path, columns: Sequence[str], batch: Batch) -> None:
 
 
 def _unknown_units(columns: Sequence[GuessedColumn]) -> Iterator[str]:
-    """Say which columns state a unit that is not known."""
+    """Write which columns state an unknown unit."""
     unknown: dict[str, list[str]] = {}
     for column in columns:
         if column.unknown.lower() not in _NO_UNITS:
             unknown.setdefault(column.unknown, []).append(column.name)
     for text, names in unknown.items():
-        yield f"{ASSUMED}{', '.join(names)}: '{text}' is no known unit, so ignored; units"
+        yield f"{ASSUMED}{', '.join(names)}: '{text}' is not a known unit, so it is ignored; units"
 
 
 def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
-    """Return columns whose axes x, y, z have the name of the sensor that the file's name says."""
+    """Prefix the columns x, y, z with the sensor that the file's name states."""
     sensor = next((name for name, known in _SENSORS.items() if re.search(known, path.stem)), "")
     if not sensor or not {"x", "y", "z"} <= {column.plain for column in columns}:
         return columns
@@ -275,7 +275,7 @@ def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
 
 
 def _in_frame(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
-    """Return columns with the frames that their names, or that of the file, state."""
+    """Set the frames that the names of columns, or that of the file, state."""
     of_file = "ned" if re.search(_NED, path.stem) else ""
     found = []
     for column in columns:
@@ -286,7 +286,7 @@ def _in_frame(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
 
 
 def _without_denied(columns: list[GuessedColumn]) -> list[GuessedColumn]:
-    """Leave out what a covariance says that there is none of: -1 at its front, as ROS has it."""
+    """Remove columns whose covariance is marked as unknown, by -1 in its first entry, as in ROS."""
     stems = [
         stem[1]
         for column in columns
@@ -320,7 +320,7 @@ def _time(
 
 
 def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
-    """Return the rows by their times, of several vehicles those of the one that has the most."""
+    """Sort the rows by time; with several vehicles, keep those of the one with the most rows."""
     rows = np.arange(len(next(iter(batch.values()))))
     if vehicle:
         names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
@@ -347,7 +347,7 @@ def _seconds(stamps: Stamps) -> NDArray:
 
 
 def _first_rows(source: Source) -> tuple[Table, Batch, str, dict[str, list[str]]]:
-    """Open a table; return it, its first rows as texts, the mark before fractions, and what is split."""
+    """Open a table; return it, its first rows as texts, the decimal mark, and the columns to split."""
     decimal = "."
     table, batch = _opened(source, decimal, {})
     if any(_has_commas(cells) for cells in batch.values()):
@@ -369,7 +369,7 @@ def _opened(source: Source, decimal: str, split: dict[str, list[str]]) -> tuple[
 
 
 def _has_commas(cells: pa.Array) -> bool:
-    """Tell whether all cells are numbers, and some have a fraction after a comma."""
+    """Test whether all cells are numbers, and some have a decimal comma."""
     if not pa.types.is_string(cells.type) or not pc.any(pc.match_substring(cells, ",")).as_py():
         return False
     known = pc.utf8_trim_whitespace(cells).drop_null()
@@ -379,7 +379,7 @@ def _has_commas(cells: pa.Array) -> bool:
 
 
 def _split(name: str, cells: pa.Array) -> list[str]:
-    """Return the names of the numbers that each cell of a column holds; none for a column of others."""
+    """Return names for the numbers in each cell of a column; empty unless all cells hold several."""
     if not pa.types.is_string(cells.type) or not re.search(r"\d[\s,;]+[-+.\d]", first_cell(cells)):
         return []
     is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()
@@ -404,7 +404,7 @@ def _split(name: str, cells: pa.Array) -> list[str]:
 
 
 def _numbers(cells: pa.Array) -> NDArray | None:
-    """Read a column's numbers, NaN for empty cells; None where it holds something else, or nothing."""
+    """Read a column's numbers, NaN for empty cells; None if it holds anything else, or is empty."""
     if pa.types.is_timestamp(cells.type):
         return None
     try:
@@ -415,7 +415,7 @@ def _numbers(cells: pa.Array) -> NDArray | None:
 
 
 def _sided(name: str, cells: pa.Array) -> NDArray | None:
-    """Read a column of places such as 48.1N, with signs; None if it holds others."""
+    """Read a column of positions such as 48.1N as signed numbers; None if it holds anything else."""
     if not (re.search(_PLACE, parted(name)[0]) and pa.types.is_string(cells.type)):
         return None
     numbers, letters = sided(cells)
@@ -426,11 +426,11 @@ def _sided(name: str, cells: pa.Array) -> NDArray | None:
     return floats(pc.if_else(is_south, pc.negate(numbers), numbers))
 
 
-# What columns are together.
+# Columns that belong together.
 
 
 def _rest(table: GuessedTable) -> list[str]:
-    """Say which columns fit no message."""
+    """Write a stream of the columns that fit no message."""
     if not table.columns:
         return []
     plain = [

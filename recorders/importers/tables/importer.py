@@ -1,4 +1,4 @@
-"""Imports tables: rows become messages by a mapping, and what is left out is told."""
+"""Importer of tables: a mapping turns rows into messages, and notes report what is left out."""
 
 import heapq
 from collections import Counter
@@ -38,18 +38,18 @@ from fuselog.recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """States the mapping, and what differs between recordings.
+    """The mapping, and what differs between recordings.
 
     Attributes:
         mapping: the mapping, by its name (walk) or file (own.toml).
         more: further files and folders.
-        mounting_deg: roll, pitch, yaw in place of those that the mapping states.
-        delays_s: how long before its stamp a topic's message was measured, in s, in place of what the
-            mapping states; by topic.
+        mounting_deg: roll, pitch, yaw that replace those of the mapping.
+        delays_s: by topic, how long before its stamp a message was measured, in s; replaces the delays
+            of the mapping.
         seed: seed of the noise that a mapping adds.
-        origin: latitude and longitude (deg) and perhaps height (m) of the plane's origin, in place of
-            that which the mapping states.
-        quaternions: what becomes of messages whose quaternions are not of unit length: "refuse" stops
+        origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
+            plane; replaces that of the mapping.
+        quaternions: what to do with messages whose quaternions are not of unit length: "refuse" stops
             the import, "normalise" scales them, "skip" leaves such messages out.
     """
 
@@ -63,15 +63,15 @@ class TableParameters(Parameters):
 
 
 def read(path: Path, parameters: TableParameters) -> Blocks:
-    """Read tables block by block; what is left out, doubtful or not taken is told in the notes.
+    """Read tables block by block; notes report what is left out, doubtful or not imported.
 
-    The blocks raise BadInput where a file or the mapping cannot be used, or a value cannot be: latitudes
-    beyond 90 deg, quaternions that are not unit, tables of several clocks.
+    Iterating the blocks raises BadInput if a file, the mapping or a value cannot be used: latitudes
+    beyond 90 deg, quaternions that are not of unit length, tables of different clocks.
     """
     if not parameters.mapping:
         raise BadInput(
-            f"{path}: say what its columns are with --mapping, a file or one of {', '.join(shipped())}; "
-            "--guess -o FILE.toml writes a mapping to start from"
+            f"{path}: state the meaning of its columns with --mapping, a file or one of "
+            f"{', '.join(shipped())}; --guess -o FILE.toml writes a mapping to start from"
         )
     paths = [path, *map(Path, parameters.more)]
     for each in paths:
@@ -100,8 +100,8 @@ def _blocks(
     }
     if not firsts:
         raise BadInput(
-            f"{paths[0]}: no row has a time that can be read, so that nothing can be imported; check "
-            "`time` in the mapping"
+            f"{paths[0]}: no row has a readable time, so nothing can be imported; check `time` in the "
+            "mapping"
         )
     result.epoch_ns = min(firsts.values())
     _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)
@@ -109,7 +109,7 @@ def _blocks(
     is_stated = mapping.origin is not None
     plane = None if origin is None else Plane(origin, mapping.projection, is_stated)
     yield [_constant(each, result.epoch_ns) for each in mapping.constants]
-    # the file that is furthest behind comes next, so that the log is nearly in the order of time
+    # the file that is furthest behind comes next, so that the log is nearly sorted by time
     queue = [(first, number) for number, first in firsts.items()]
     heapq.heapify(queue)
     while queue:
@@ -128,7 +128,7 @@ def _blocks(
 
 
 def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:
-    """Raise BadInput where files begin so far apart that their clocks have nothing in common."""
+    """Raise BadInput if files begin so far apart that their clocks must differ."""
     early, late = min(firsts, key=lambda each: firsts[each]), max(firsts, key=lambda each: firsts[each])
     apart_s = (firsts[late] - firsts[early]) * 1e-9
     if apart_s > mapping.clock_tolerance_s:
@@ -139,7 +139,7 @@ def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:
 
 
 def _constant(own: ConstantStream, time_ns: int) -> Stream:
-    """Make the messages that stand in a mapping."""
+    """Make the messages that are stated in a mapping."""
 
     def read_none(source: str, *_: object) -> NDArray:
         raise BadInput(
@@ -156,7 +156,7 @@ def _constant(own: ConstantStream, time_ns: int) -> Stream:
 
 
 def _notes(sources: list[Rows], plane: Plane | None, mapping: LogMapping) -> dict[str, str]:
-    """Note the clock, the plane, and what was read of each file."""
+    """Write notes on the clock, the origin, and what was read from each file."""
     spans = [source.span_ns for source in sources if source.span_ns is not None]
     ends = min(low for low, _ in spans), max(high for _, high in spans)
     notes = {"clock": " to ".join(str(pd.Timestamp(stamp)) for stamp in ends)}

@@ -1,4 +1,4 @@
-"""Finds the layout of a text table from its first lines: delimiter, names and units of its columns."""
+"""Recognition of a text table's layout by its first lines: delimiter, names and units of columns."""
 
 import csv
 import re
@@ -8,7 +8,7 @@ from typing import BinaryIO, NamedTuple
 
 from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
 
-# How many lines are looked at, and at most about how many bytes of them.
+# How many lines, and about how many bytes, are examined at most.
 _LINES, _BYTES = 40, 1 << 20
 _DELIMITERS = (";", "\t", "|", ",")
 _QUOTED = re.compile(r'"[^"]*"')
@@ -20,16 +20,16 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "inf", "-inf"}
 
 
 class Layout(NamedTuple):
-    """Describes a text table.
+    """The layout of a text table.
 
     Attributes:
-        names: what its header says, empty without a header.
-        width: how many cells a row has.
-        delimiter: what is between cells, " " for any white space.
-        skipped: how many lines of the file come before the rows.
-        heads: the lines of the header, which are no rows where they are repeated.
-        units: what a row of units below the header says, by column; empty without one.
-        above: how many lines above the header were passed over.
+        names: names from the header, empty without a header.
+        width: number of cells in a row.
+        delimiter: delimiter of cells, " " for any white space.
+        skipped: number of lines of the file before the rows.
+        heads: lines of the header, which are not rows if they are repeated.
+        units: units from a row below the header, by column; empty without one.
+        above: number of lines above the header.
         is_empty: whether there are no rows below the header.
     """
 
@@ -44,7 +44,7 @@ class Layout(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """Holds one line that is no comment: its bytes, its text, and the number of the line after it."""
+    """A line that is not a comment: its bytes, its text, and the number of the line after it."""
 
     content: bytes
     text: str
@@ -54,14 +54,14 @@ class _Line(NamedTuple):
 def layout_of(
     file: BinaryIO, *, has_names: bool, has_header: bool | None, delimiter: str | None, skip: int
 ) -> Layout | None:
-    """Find the layout of a table; None for a file without rows.
+    """Recognise the layout of a table; return None for a file without rows.
 
     Args:
         file: the text.
-        has_names: whether the columns' names are known, so that no header has to be searched for.
-        has_header: whether the first line names the columns; None if the lines decide.
-        delimiter: what is between cells; None if the lines decide.
-        skip: how many lines at the start of the file to leave out.
+        has_names: whether the names of columns are known, so that no header is needed.
+        has_header: whether the first line names the columns; None to recognise it.
+        delimiter: delimiter of cells; None to recognise it.
+        skip: number of lines to skip at the start of the file.
 
     Raises ValueError if the header is not UTF-8.
     """
@@ -96,7 +96,7 @@ def layout_of(
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells, as RFC 4180 has them."""
+    """Split a line into cells, as in RFC 4180."""
     if delimiter == " ":
         return [cell.strip('"') for cell in line.split()]
     try:
@@ -107,7 +107,7 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def _joined(file: BinaryIO, skip: int) -> Iterator[_Line]:
-    """Yield the first lines that are not blank; a line that ends within quotation marks goes on."""
+    """Yield the first lines that are not blank; a line that ends within quotation marks is continued."""
     size = count = 0
     parts: list[bytes] = []
     for number, line in enumerate(lines_of(file)):
@@ -127,7 +127,7 @@ def _joined(file: BinaryIO, skip: int) -> Iterator[_Line]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """Return the delimiter by which most lines have the same number of cells."""
+    """Return the delimiter that gives most lines the same number of cells."""
     plain = [_QUOTED.sub("", line) for line in lines]
     alike = {}
     for each in _DELIMITERS:
@@ -138,9 +138,9 @@ def _delimiter(lines: Sequence[str]) -> str:
 
 
 def _first(rows: list[list[str]], has_header: bool | None, *, is_searched: bool) -> tuple[int, bool]:
-    """Return which line is the first of the table, and whether it names the columns.
+    """Return the index of the table's first line, and whether it names the columns.
 
-    Lines above a header, which have another number of cells than the rows, are no part of the table.
+    Lines above a header with another number of cells than the rows are not part of the table.
     """
     if has_header is not None:
         return 0, has_header
@@ -164,12 +164,12 @@ def _usual_width(rows: list[list[str]]) -> int:
 
 
 def _is_value(cell: str) -> bool:
-    """Tell whether a cell is a number, a time or a position."""
+    """Test whether a cell is a number, a time or a position."""
     return _VALUE.fullmatch(cell) is not None
 
 
 def _names_columns(head: list[str], below: Iterable[list[str]]) -> bool:
-    """Tell whether a line names columns: it has no values, or words above values and small numbers."""
+    """Test whether a line names columns: it has no values, or words above values and small numbers."""
     is_word = [not _is_value(cell) and cell.lower() not in MISSING for cell in head]
     values = [cell for cell in head if _is_value(cell)]
     if not values:
@@ -181,7 +181,7 @@ def _names_columns(head: list[str], below: Iterable[list[str]]) -> bool:
 
 
 def _are_units(below: list[list[str]]) -> bool:
-    """Tell whether the line below the names has no values, but units or blanks above values."""
+    """Test whether the line below the names has units or blanks above values."""
     if len(below) < 2 or any(_is_value(cell) or len(cell) > 24 for cell in below[0]):
         return False
     return any(

@@ -1,7 +1,7 @@
-"""Defines mappings of tables: a TOML file says which files and columns, and what becomes of them.
+"""Mappings of tables: a TOML file states the files, their columns, and the messages made from them.
 
 [[tables]]
-files = "imu_{unit}.csv"                          # {unit} stands for anything, and is {unit} below
+files = "imu_{unit}.csv"                          # {unit} matches any text, which replaces {unit} below
 time = { column = "stamp", unit = "ms", zero = "2026-01-31" }
 
 [[tables.streams]]
@@ -43,13 +43,13 @@ from fuselog.recorders.importers.tables.times import TimeMapping
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import read_toml
 
-# In s; a larger one is a slip.
+# In s; a larger delay is a mistake.
 Delay = Annotated[float, Field(ge=-1e9, le=1e9)]
 _SHIPPED = resources.files("fuselog_data") / "mappings"
 
 
 class Origin(Parameters):
-    """States where the local plane of east, north and up touches.
+    """The origin of the local tangent plane (east, north, up).
 
     Attributes:
         latitude_deg: latitude of the origin.
@@ -63,13 +63,13 @@ class Origin(Parameters):
 
 
 class Geodetic(Parameters):
-    """Names columns with a place; with them there are columns east_m, north_m and up_m.
+    """Columns with geodetic positions, from which the columns east_m, north_m and up_m are made.
 
     Attributes:
         latitude: column of the latitude.
         longitude: column of the longitude.
         altitude: column of the altitude, in m.
-        unit: what latitude and longitude are in.
+        unit: unit of latitude and longitude.
     """
 
     latitude: str
@@ -79,18 +79,17 @@ class Geodetic(Parameters):
 
 
 class Attitude(Parameters):
-    """Names columns with angles of a body of forward, left, up; they give quaternion_w to _z.
+    """Columns with angles of a body with axes forward, left, up, made into quaternion_w to quaternion_z.
 
-    They turn to a frame of east, north, up.
+    The quaternion rotates to a frame of east, north, up.
 
     Attributes:
-        heading: column of the angle clockwise from north; with it `pitch` is nose up, as aircraft have
-            it.
-        yaw: column of the angle anticlockwise from east, in place of a heading; with it `pitch` is nose
+        heading: column of the angle clockwise from north; with it `pitch` is nose up, as for aircraft.
+        yaw: column of the angle anticlockwise from east, instead of a heading; with it `pitch` is nose
             down.
         pitch: column of the pitch.
         roll: column of the roll, right side down.
-        unit: what angles are in.
+        unit: unit of the angles.
     """
 
     heading: str | None = None
@@ -101,15 +100,15 @@ class Attitude(Parameters):
 
 
 class TableStream(StreamMapping):
-    """Describes a stream of a table's rows.
+    """A stream made from a table's rows.
 
     Attributes:
         topic: name of the topic.
-        delay_s: a message was measured so long before its stamp.
-        only_first: whether the first row alone is taken, as for a prior.
-        every: of so many rows the first is taken.
-        noise: standard deviation of white Gaussian noise that is added, by field; so fixes are made of a
-            path that is known.
+        delay_s: how long before its stamp a message was measured.
+        only_first: whether only the first row is used, as for a prior.
+        every: uses the first of every so many rows.
+        noise: standard deviation of white Gaussian noise to add, by field; this makes fixes from a known
+            path.
     """
 
     topic: str = Field(pattern=r"^/\S+$")
@@ -121,43 +120,44 @@ class TableStream(StreamMapping):
     @model_validator(mode="after")
     def _has_fields_of_noise(self) -> Self:
         if unknown := self.noise.keys() - self.fields.keys():
-            raise ValueError(f"`noise` names {', '.join(sorted(unknown))}, which `fields` does not have")
+            raise ValueError(f"`noise` names {', '.join(sorted(unknown))}, which are not in `fields`")
         return self
 
 
 def _once(pattern: str) -> str:
     twice = [name for name, count in Counter(names_in(pattern)).items() if count > 1]
     if twice:
-        raise ValueError(f"{{{twice[0]}}} is there twice; give each a name of its own")
+        raise ValueError(f"{{{twice[0]}}} occurs twice; give each a different name")
     return pattern
 
 
 class TableMapping(Parameters):
-    """Describes the files of one kind, and the streams of their rows.
+    """Files of one kind, and the streams made from their rows.
 
     Attributes:
-        files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
-            stand for anything, ? for one letter; each name in braces comes once.
-        optional: whether there may be no such file.
-        format: what the files hold; without one the suffix tells, and CSV is what has no other.
-        columns: names of the columns, where the files do not name them.
-        header: whether the first line names the columns; without this its cells tell.
-        delimiter: what is between cells, " " for any white space; without one the first line tells.
-        decimal: the mark before fractions.
-        skip: how many lines at the start of the file are not part of the table.
+        files: a pattern of names relative to the given folder, or of the name of a given file; * and
+            {name} match any text, ? one letter; each name in braces occurs once.
+        optional: whether such a file may be missing.
+        format: format of the files; by default it follows from the suffix, and is CSV for unknown ones.
+        columns: names of the columns, if the files do not name them.
+        header: whether the first line names the columns; by default this is recognised.
+        delimiter: delimiter of cells, " " for any white space; by default it is recognised.
+        decimal: the decimal mark.
+        skip: number of lines at the start of the file that are not part of the table.
         split: columns whose cells hold several numbers, such as "47.5 8.7", and the names of these.
-        missing: by column the numbers that stand for a missing value, in all that is made of it.
-        degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as NMEA
-            has them.
+        missing: numbers that stand for a missing value, by column, in all that is made from it.
+        degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as in
+            NMEA.
         hemispheres: for columns of latitudes and longitudes the columns that say N or S, E or W.
-        vehicle: the column that says whose row it is; its value is {vehicle} in topics.
-        joined: whether the files are the rows of one table, one after the other by their names.
+        vehicle: the column that identifies the vehicle of a row; its value is {vehicle} in topics.
+        joined: whether the files are the rows of one table, in the order of their names.
         time: when a row was measured.
-        arrival: when a row reached the recorder, if that is stated.
-        sensor: what the sensor's own clock read, if that is stated and not the same as `time`.
-        geodetic: columns of latitude and longitude, from which positions in the plane are made.
+        arrival: when a row reached the recorder, if the table states it.
+        sensor: the reading of the sensor's own clock, if the table states it and it differs from `time`.
+        geodetic: columns of latitude and longitude, from which positions in the local tangent plane are
+            made.
         attitude: columns of angles, from which quaternions are made.
-        streams: the streams of the rows.
+        streams: streams made from the rows.
     """
 
     files: Annotated[str, AfterValidator(_once)] = "*"
@@ -192,14 +192,14 @@ class TableMapping(Parameters):
 
 
 class ConstantStream(Parameters):
-    """Holds messages that stand in the mapping, such as anchors; their stamps are the log's first.
+    """Messages that are stated in the mapping, such as anchors; their stamps are the log's first.
 
     Attributes:
         topic: name of the topic.
         becomes: name of the message.
         rows: fields of each message.
-        components: components of a vector that states them, with commas.
-        kinds: kinds of these components, with commas; linear without any.
+        components: components of a vector that states them, separated by commas.
+        kinds: kinds of these components, separated by commas; linear by default.
     """
 
     topic: str = Field(pattern=r"^/\S+$")
@@ -210,7 +210,7 @@ class ConstantStream(Parameters):
 
     @property
     def mapping(self) -> StreamMapping:
-        """Return the same in the language of streams: one row, and messages for each of these."""
+        """Return the equivalent mapping of a stream: one row, with a message for each entry."""
         rows = [dict(row) for row in self.rows]
         return StreamMapping(
             becomes=self.becomes, each=rows, components=self.components, kinds=self.kinds
@@ -218,16 +218,15 @@ class ConstantStream(Parameters):
 
 
 class LogMapping(Parameters):
-    """Maps the tables of a recording to a log.
+    """A mapping from the tables of a recording to a log.
 
     Attributes:
-        summary: what it is for.
-        origin: where the local plane touches; without one, at the first fix.
-        projection: a map that pyproj knows, whose plane is used from the origin on; without one, the
-            plane tangent to the ellipsoid.
+        summary: purpose of the mapping.
+        origin: origin of the local tangent plane; by default the first fix.
+        projection: a projection known to pyproj, used with the origin in place of the tangent plane.
         tables: the tables of a recording.
-        constants: messages that stand in the mapping itself.
-        clock_tolerance_s: tables that begin further apart are refused as those of several clocks.
+        constants: messages that are stated in the mapping itself.
+        clock_tolerance_s: tables that begin further apart are rejected, as they have different clocks.
     """
 
     summary: str = ""
@@ -239,14 +238,14 @@ class LogMapping(Parameters):
 
 
 def shipped() -> list[str]:
-    """Return the names of the mappings that ship."""
+    """Return the names of the mappings that are part of fuselog."""
     return sorted(
         each.name.removesuffix(".toml") for each in _SHIPPED.iterdir() if each.name.endswith(".toml")
     )
 
 
 def read_mapping(name: str) -> LogMapping:
-    """Read a mapping by name or file; raises BadInput where there is none, or it names none."""
+    """Read a mapping by name or file; raise BadInput if it does not exist or is not a mapping."""
     path = Path(name)
     if not name.endswith(".toml"):
         known = shipped()
@@ -271,9 +270,9 @@ def adapted(
     mounting_deg: tuple[float, float, float] | None = None,
     delays_s: Mapping[str, float] | None = None,
 ) -> LogMapping:
-    """Return the mapping with another mounting, of all streams that it turns, and other delays by topic.
+    """Replace the mounting of all streams that have one, and the delays of some topics.
 
-    Raises BadInput where it turns none, or has no such topic.
+    Raises BadInput if no stream has a mounting, or a topic is unknown.
     """
     delays_s = delays_s or {}
     streams = [stream for table in mapping.tables for stream in table.streams]
@@ -283,8 +282,8 @@ def adapted(
             raise BadInput(f"delays_s: the mapping has no topic '{topic}'; {choices(topic, topics)}")
     if mounting_deg is not None and all(stream.mounting_deg is None for stream in streams):
         raise BadInput(
-            "mounting_deg: no stream of the mapping has a mounting to replace; write mounting_deg into "
-            "the mapping first"
+            "mounting_deg: no stream of the mapping has a mounting to replace; add mounting_deg to the "
+            "mapping first"
         )
 
     def changed(stream: TableStream) -> TableStream:
@@ -301,7 +300,7 @@ def adapted(
 
 
 def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
-    """Find the folders at a place that have all files of a mapping; raises BadInput for none."""
+    """Find the folders under a path that have all files of a mapping; raise BadInput if none has."""
     below = [each for each in place.rglob("*") if each.is_dir()] if place.is_dir() else []
     folders = []
     for folder in sorted([place, *below], key=lambda each: (len(each.name), each)):
@@ -311,15 +310,15 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
     if not folders:
         patterns = some_of([table.files for table in mapping.tables if not table.optional])
         raise BadInput(
-            f"{place}: neither it nor a folder in it has the files that the mapping names ({patterns})"
+            f"{place}: neither this folder nor one in it has all files of the mapping ({patterns})"
         )
     return folders
 
 
 class FileMatch(NamedTuple):
-    """Holds a file, its mapping, what the names in braces stand for, and files that belong to it.
+    """A file, its mapping, the texts that match the names in braces, and files that belong to it.
 
-    `more` are the files whose rows follow, and `stamps` is the file with the times of all.
+    `more` holds the files whose rows follow, and `stamps` is the file with the times of all rows.
     """
 
     path: Path
@@ -330,11 +329,10 @@ class FileMatch(NamedTuple):
 
 
 def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch], list[Path]]:
-    """Find the files of a mapping among files and folders, and those of the folders that are not.
+    """Find the files of a mapping among files and folders; return them and the folders' other files.
 
-    A file of a folder is that of the first table whose pattern it fits; what this import or another one
-    is writing there is no file yet. Raises BadInput where a table
-    has no file, or a file that is given has no table.
+    A file belongs to the first table whose pattern matches. Files that an import is writing are ignored.
+    Raises BadInput if a table has no file, or a given file has no table.
     """
     found: list[FileMatch] = []
     others: list[Path] = []
@@ -367,7 +365,7 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch],
 def _joined(
     mapping: LogMapping, found: list[FileMatch], others: list[Path]
 ) -> tuple[list[FileMatch], list[Path]]:
-    """Join the files that are one table, and take the file of their times out of the others."""
+    """Join the files that are one table, and remove the file of their times from the others."""
     for table in mapping.tables:
         if not table.joined:
             continue
@@ -380,7 +378,7 @@ def _joined(
             if stamps is None:
                 raise BadInput(
                     f"{own[0].path}: there is no file {table.time.file} with its times; give the folder "
-                    "that has both, or another `file` in `time`"
+                    "that has both, or change `file` in `time`"
                 )
             own = [each for each in own if each.path != stamps]
             others = [path for path in others if path != stamps]
@@ -397,7 +395,7 @@ def _ends_with(path: Path, name: str) -> bool:
 
 
 def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:
-    """Yield the tables that a file is one of; the only file of the only table may have any name."""
+    """Yield the tables that a file matches; the only file for the only table may have any name."""
     for table in mapping.tables:
         pattern = (
             table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]

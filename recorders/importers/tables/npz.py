@@ -1,4 +1,4 @@
-"""Reads NumPy's archives of arrays (.npz) as columns, block by block: memory holds no whole array."""
+"""Reader of NumPy archives (.npz) as columns, block by block, so that memory holds no whole array."""
 
 import zipfile
 from collections.abc import Callable, Collection, Iterator
@@ -16,13 +16,13 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 class _Array(NamedTuple):
-    """Describes an array of an archive.
+    """An array in an archive.
 
     Attributes:
-        member: its name in the archive.
-        begin: where its values begin there.
-        shape, kind: as NumPy has them.
-        by_column: whether one column stands after the other, as Fortran has them.
+        member: name in the archive.
+        begin: offset of the values in the member.
+        shape, kind: shape and dtype.
+        by_column: whether columns are stored one after the other, in Fortran order.
     """
 
     member: str
@@ -33,29 +33,29 @@ class _Array(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Count how many columns it is."""
+        """Count the columns."""
         return self.shape[1] if len(self.shape) == 2 else 1
 
 
 class _Column(NamedTuple):
-    """Describes a column: of which array, and which one of it."""
+    """A column: its array, and its index there."""
 
     array: _Array
     number: int
 
 
 class Columns(NamedTuple):
-    """Reads columns of an archive by their names, block by block."""
+    """The columns of an archive: their names, and a function that reads some, block by block."""
 
     names: list[str]
     read: Callable[[Collection[str]], Iterator[dict[str, NDArray]]]
 
 
 def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
-    """Return the arrays as columns; those with a second axis are NAME.0, NAME.1, ...
+    """Describe the arrays of an archive as columns; two-dimensional ones are NAME.0, NAME.1, ...
 
-    Raises BadInput where they are not of one length, and ValueError where the archive is damaged, or has
-    more columns or larger values than can be read.
+    Raises BadInput if their lengths differ, and ValueError if the archive is damaged, or has too many
+    columns or too large values.
     """
     with _archive(path) as archive:
         arrays = {name.removesuffix(".npy"): _described(archive, name) for name in archive.namelist()}
@@ -67,7 +67,7 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
         )
     width = sum(each.width for each in arrays.values())
     if width > most_columns:
-        raise ValueError(f"it has {width} columns, of which at most {most_columns} can be read")
+        raise ValueError(f"it has {width} columns; at most {most_columns} can be read")
     columns = {
         f"{name}.{index}" if len(array.shape) == 2 else name: _Column(array, index)
         for name, array in arrays.items()
@@ -82,7 +82,8 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
             raise ValueError(f"its rows are of {row_bytes} bytes; at most {block_bytes} can be read")
         step = block_bytes // max(row_bytes, 1)
         with _archive(path) as archive, ExitStack() as stack:
-            # one file for an array, or for each of its columns where these stand one after the other
+            # one open file for an array, or for each of its columns if they are stored one after the
+            # other
             files: dict[_Column | _Array, IO[bytes]] = {}
             for column in chosen.values():
                 if _source(column) not in files:
@@ -116,20 +117,20 @@ def _block(source: _Column | _Array, file: IO[bytes], count: int) -> NDArray:
 
 
 def _described(archive: zipfile.ZipFile, member: str) -> _Array:
-    """Read what an array says of itself."""
+    """Read the header of an array."""
     with archive.open(member) as file:
         version = npy.read_magic(file)
         if version not in _HEADERS:
-            raise ValueError(f"{member} is of NumPy's format {version}, which is none of numbers")
+            raise ValueError(f"{member} has NumPy's format version {version}, which is not supported")
         shape, by_column, kind = _HEADERS[version](file)
         if kind.hasobject or kind.names is not None or kind.itemsize == 0:
-            raise ValueError(f"{member} holds {kind}, no numbers")
+            raise ValueError(f"{member} holds {kind}, not numbers")
         return _Array(member, file.tell(), shape, kind, bool(by_column and len(shape) == 2))
 
 
 @contextmanager
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; what is wrong with it is a ValueError."""
+    """Open an archive; convert its errors to ValueError."""
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive

@@ -1,4 +1,4 @@
-"""Follows the order of times: single late rows are sorted, a clock that begins again is refused."""
+"""Checks of the order of times: single late rows are sorted, a clock that was reset is rejected."""
 
 from collections.abc import Sequence
 
@@ -10,14 +10,14 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps
 from fuselog.recorders.importers.tables.times import DIGITS, TimeMapping
 
-# How many rows in a row, and by how many usual steps, are behind a row before where a clock began again.
+# How many successive rows, and by how many usual steps, are behind an earlier row if a clock was reset.
 _ROWS, _STEPS = 10, 5.0
 _ROWS_AT_END = 3
-# By how many usual steps a single row is not late but of another clock, or has no time.
+# Beyond this number of usual steps, a single row is not late, but has another clock or no time.
 _FAR_STEPS = 100.0
-# Share of the steps that go back in a file whose rows are newest first.
+# The share of steps that go back in a file with the newest row first.
 _REVERSED = 0.9
-# Numbers at which counters begin again: those of bits, and of days and weeks in several units.
+# Numbers at which counters roll over: powers of two, and days and weeks in several units.
 _ROLLOVERS = (
     *(2**bits for bits in (16, 24, 31, 32)),
     *(span * 10**digits for digits in (0, 3, 6) for span in (86_400, 604_800)),
@@ -27,7 +27,7 @@ _ROLLOVERS = (
 
 
 class Order:
-    """Follows the stamps of one clock; `label` names the file and the column."""
+    """A check of the order of one clock's stamps; `label` names the file and the column."""
 
     def __init__(self, label: str, mapping: TimeMapping) -> None:
         self._label, self._is_any = label, mapping.order == "any"
@@ -39,7 +39,7 @@ class Order:
         self._fall: tuple[int, int, int] | None = None  # its row, from where and to where
 
     def follow(self, stamps: Stamps, rows: NDArray[np.int64]) -> None:
-        """Take the next stamps (n,) and the numbers of their rows; raises BadInput as `end` does."""
+        """Process the next stamps (n,) and their row numbers; raises BadInput like `end`."""
         if self._is_any or not len(stamps):
             return
         steps = np.diff(stamps)
@@ -64,7 +64,7 @@ class Order:
             self._behind = 0
 
     def end(self) -> None:
-        """Raise BadInput if the last rows are behind those before them."""
+        """Raise BadInput if the last rows are behind earlier ones."""
         self._check(_ROWS_AT_END)
 
     def _check(self, fewest: int) -> None:
@@ -80,11 +80,9 @@ class Order:
         unwrap = f"`rollover = {rollover}` if the counter rolled over, " if rollover else ""
         raise BadInput(
             f"{self._label}: at row {row + 1} the time falls from {_written(high)} to {_written(low)}; "
-            "state "
-            f'in `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or in the '
-            "table "
-            '`vehicle = "COLUMN"` if a column says whose row it is; if the clock was restarted or set '
-            "back, split the file there"
+            f'add to `time` {unwrap}`order = "any"` if rows are to be sorted by their times, or to the '
+            'table `vehicle = "COLUMN"` if a column names the vehicle of each row; if the clock was '
+            "restarted or set back, split the file there"
         )
 
     def _rollover(self, high_ns: int, low_ns: int) -> int:
@@ -95,11 +93,11 @@ class Order:
 
 
 def rollover_of(counts: NDArray, usual: float) -> int:
-    """Return at which number a counter begins again; 0 if its falls are no rollovers.
+    """Return the number at which a counter rolls over; 0 if its falls are not rollovers.
 
     Args:
         counts: (n,), readings of the counter.
-        usual: its usual step: about so far it goes on beyond the number at which it falls.
+        usual: usual step, by which the counter continues after a rollover.
     """
     steps = np.diff(counts)
     falls = np.flatnonzero(steps < 0)
@@ -118,7 +116,7 @@ def rollover_of(counts: NDArray, usual: float) -> int:
 
 
 def is_reversed(parts: Sequence[Stamps]) -> bool:
-    """Tell whether rows are newest first; of each vehicle by itself."""
+    """Test whether rows are newest first, for each vehicle separately."""
     steps = np.concatenate([np.diff(part[part != NOT_A_TIME]) for part in parts] or [np.empty(0)])
     moving = steps[steps != 0]
     return len(moving) > 1 and float(np.mean(moving < 0)) >= _REVERSED

@@ -1,7 +1,7 @@
-"""Matches patterns of files' names: * and ? as in a shell, and {name} for what is known by it.
+"""Patterns of file names: * and ? as in a shell, and {name} for text that gets a name.
 
-A match takes time that grows with both lengths, whatever the pattern is: an expression of `re` tries all
-ways in which many stars may share a name.
+The time of a match grows with both lengths, whatever the pattern is; an expression of `re` would try all
+ways to distribute a name over many stars.
 """
 
 import re
@@ -15,13 +15,13 @@ def names_in(pattern: str) -> list[str]:
 
 
 def fitted(pattern: str, name: str) -> dict[str, str] | None:
-    """Return what the names in braces stand for where a name fits a pattern, else None.
+    """Match a name with a pattern; return the texts for the names in braces, or None.
 
-    Each stands for at least one character, and as the stars for as many as can be, from the left; no
-    wild part stands for a slash.
+    From the left, each name in braces and each star matches as many characters as possible, a name in
+    braces at least one; neither matches a slash.
     """
     parts = _WILD.split(pattern)
-    # bit k of a number: what follows a part fits the name from its character k on
+    # bit k of a number: the rest of the pattern after a part matches the name from character k on
     following = [1 << len(name)]
     for index in range(len(parts) - 1, -1, -1):
         following.append(_before(parts[index], is_wild=index % 2 == 1, name=name, after=following[-1]))
@@ -42,14 +42,14 @@ def fitted(pattern: str, name: str) -> dict[str, str] | None:
 
 
 def _before(part: str, *, is_wild: bool, name: str, after: int) -> int:
-    """Find where a part may begin, of which there is an end in `after`."""
+    """Find where a part may begin if it ends at one of the positions in `after`."""
     if not is_wild:
         return sum(1 << place for place in _places(part, name) if after >> (place + len(part)) & 1)
-    # bit k: character k is no slash
+    # bit k: character k is not a slash
     within = sum(1 << place for place, each in enumerate(name) if each != "/")
     found = after if part == "*" else after >> 1 & within
     width = 1
-    while part != "?" and width <= len(name):  # from every end to the left, as far as there is no slash
+    while part != "?" and width <= len(name):  # extend every end to the left up to a slash
         found |= found >> width & within
         within &= within >> width
         width *= 2

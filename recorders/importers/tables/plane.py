@@ -1,4 +1,4 @@
-"""Makes the plane that a log's positions are in of places on the earth."""
+"""The local plane of a log's positions, computed from geodetic positions."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -15,9 +15,9 @@ Floats = NDArray[np.float64]
 
 
 class Plane(NamedTuple):
-    """Gives east, north and up from an origin: tangent to the ellipsoid, or on a projection's map.
+    """A conversion to east, north and up from an origin, in the tangent plane or on a map projection.
 
-    Where the mapping states the origin, all positions of the log are in this plane.
+    If the mapping states the origin, all positions of the log are in this plane.
     """
 
     origin: Origin
@@ -26,17 +26,17 @@ class Plane(NamedTuple):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Return what the channels of streams in the plane state."""
+        """Return the metadata for channels of streams in the plane."""
         stated = {f"origin_{name}": repr(value) for name, value in self.origin}
-        # a model would take stated origins for those of a tangent plane
+        # a model would take a stated origin as that of a tangent plane
         return stated if self.projection is None else {"projection": self.projection}
 
     def place(
         self, latitude_deg: Floats, longitude_deg: Floats, altitude_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Compute east, north and up (n,) in m of places on WGS 84.
+        """Compute east, north and up (n,) in m from positions on WGS 84.
 
-        Raises BadInput where pyproj is needed and not installed, or knows no such projection.
+        Raises BadInput if pyproj is needed but not installed, or does not know the projection.
         """
         here = self.origin
         if self.projection is None:
@@ -64,6 +64,6 @@ def _onto_map(projection: str) -> Any:
         ) from None
     if not crs.is_projected:
         raise BadInput(
-            f"projection {projection}: has no east and north in m; give one that has, such as EPSG:25832"
+            f"projection {projection}: has no east and north in m; give a projected one: EPSG:25832"
         )
     return Transformer.from_crs("EPSG:4326", crs, always_xy=True)

@@ -1,4 +1,4 @@
-"""Reads the rows of one file, batch by batch, as streams."""
+"""Reader of one file's rows, batch by batch, as streams."""
 
 import re
 from collections import Counter
@@ -51,17 +51,17 @@ QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
 
 ReadCounts = Counter[tuple[str, str]]
 _MOST_VEHICLES = 1000
-# Rows by which it is told whether the newest one is first.
+# Rows by which the direction of time is recognised.
 _LOOKED_AT = 1000
-# The column of the stamps that have a file of their own.
+# The column for stamps from a separate file.
 _STAMP = "\0stamp"
 
 
 class Rows:
-    """Imports a file: its next batch lies ready, and what is left out is counted.
+    """The importer of one file, which reads one batch ahead and counts what is left out.
 
-    `generator` makes the noise that the mapping asks for; `quaternions` says what becomes of those that
-    are not of unit length. Raises BadInput if the file cannot be read, or lacks a column that its
+    `generator` draws the noise that the mapping asks for; `quaternions` says what to do with quaternions
+    that are not of unit length. Raises BadInput if the file cannot be read, or lacks a column that its
     mapping names.
     """
 
@@ -87,7 +87,7 @@ class Rows:
             self.table.column(name): self.table.column(side) for name, side in own.hemispheres.items()
         }
         self._in_minutes = {self.table.column(name) for name in own.degrees_minutes}
-        self._numbers_of: dict[str, NDArray] = {}  # of the rows in hand, by column
+        self._numbers_of: dict[str, NDArray] = {}  # in the current rows, by column
         self._exact = {
             self.table.column(source) for stream in own.streams for source in _times_in(stream)
         }
@@ -100,7 +100,7 @@ class Rows:
         self._vehicle = None if own.vehicle is None else self.table.column(own.vehicle)
         self._clocks: dict[str, tuple[Order, dict[str, Reading]]] = {}  # by vehicle
         self._reached: dict[str, int] = {}
-        self._vehicles: dict[str, str] = {}  # their names, by what they are in topics
+        self._vehicles: dict[str, str] = {}  # names of vehicles, by their form in topics
         self._texts, self._numbers = self._wanted()
         self._batches = self._timed(self.table.batches(self._numbers, self._texts))
         self._next = next(self._batches, None)
@@ -108,7 +108,7 @@ class Rows:
 
     @property
     def is_done(self) -> bool:
-        """Tell whether all rows were given."""
+        """Test whether all rows have been returned."""
         return self._next is None
 
     # What is read.
@@ -120,11 +120,11 @@ class Rows:
 
     @property
     def tag_name(self) -> str:
-        """Return the name of the time tag that tells when the file was begun; else an empty one."""
+        """Return the name of the time tag that states when the file was begun, or an empty string."""
         return self.path.name + self._time.tag if self._time.tag else ""
 
     def _clock(self, given: TimeMapping) -> TimeMapping:
-        """Return the time mapping with columns as the file names them; a counter is read here."""
+        """Return the time mapping with the file's names of columns; read a time tag's counter."""
         if self._stamps_path is not None and given.file is not None:
             return given.model_copy(update={"column": [_STAMP], "file": None})
         columns = [self.table.column(name) for name in given.columns]
@@ -140,7 +140,7 @@ class Rows:
         return own
 
     def _timed(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """Yield batches with the stamps of the file that has them, if there is one."""
+        """Add the stamps to batches if they are in a separate file."""
         if self._stamps_path is None:
             yield from batches
             return
@@ -151,18 +151,18 @@ class Rows:
             count += len(stamps)
             if len(stamps) < _size(batch):
                 raise BadInput(
-                    f"{self._stamps_path}: has {count} times, and there are more rows in {self.path} "
+                    f"{self._stamps_path}: has {count} times, but there are more rows in {self.path} "
                     "and the files after it; give a time for each row"
                 )
             yield {**batch, _STAMP: pa.array(stamps, pa.string())}
         if rest := sum(1 for _ in lines):
             raise BadInput(
-                f"{self._stamps_path}: has {count + rest} times, and there are {count} rows in "
+                f"{self._stamps_path}: has {count + rest} times, but there are {count} rows in "
                 f"{self.path} and the files after it; give a row for each time"
             )
 
     def _wanted(self) -> tuple[set[str], set[str]]:
-        """Return the columns that are wanted as text, and as numbers."""
+        """Return the columns to read as text, and those to read as numbers."""
         own = self.mapping
         clocks = [self._time, *self._others.values()]
         texts = {name for clock in clocks for name in clock.columns} - {_STAMP}
@@ -180,12 +180,12 @@ class Rows:
                     names.add(name)
         texts |= self._exact | {*self._halves.values()} | ({self._vehicle} if self._vehicle else set())
         columns = {self.table.column(name) for name in names if not self._is_given(name)}
-        if not (texts or columns):  # the rows have to be counted by some column
+        if not (texts or columns):  # one column is needed to count the rows
             columns = {self.table.columns[0]}
         return texts, columns - texts
 
     def _is_given(self, source: str) -> bool:
-        """Tell whether a source is no column but a part of the file's name, such as {anchor}."""
+        """Test whether a source is not a column but a part of the file's name, such as {anchor}."""
         return source.startswith("{") and source[1:-1] in self._names
 
     def _filled(self, text: str) -> str:
@@ -223,22 +223,26 @@ class Rows:
         return found
 
     def _finite(self, column: str, cells: pa.Array, found: NDArray) -> NDArray:
-        """Return a column's numbers (n,) with NaN for infinite ones; what is no number is counted."""
+        """Replace a column's infinite numbers (n,) by NaN; count them and cells that are not numbers."""
         if np.isfinite(found).all():
             return found
         is_odd = np.isinf(found)
         if self.table.is_text:
             is_odd |= np.isnan(found) & cells.is_valid().to_numpy(zero_copy_only=False)
         self._tell(
-            f"{self.path.name}: {column}", "cells that are no numbers, missing", int(is_odd.sum())
+            f"{self.path.name}: {column}",
+            "cells that are not numbers, read as missing",
+            int(is_odd.sum()),
         )
         return np.where(is_odd, np.nan, found)
 
     def _prepared(self, column: str, found: NDArray, sides: pa.Array | None) -> NDArray:
-        """Return a column's numbers (n,) without codes of missing values, in degrees and with a sign."""
+        """Remove codes of missing values from a column (n,), convert minutes, and apply hemispheres."""
         for code in self._missing.get(column, []):
             is_missing = found == code
-            self._tell(f"{self.path.name}: {column}", f"{code:g} is missing", int(is_missing.sum()))
+            self._tell(
+                f"{self.path.name}: {column}", f"{code:g}, read as missing", int(is_missing.sum())
+            )
             found = np.where(is_missing, np.nan, found)
         if column in self._in_minutes:
             size = np.abs(found)
@@ -246,8 +250,8 @@ class Rows:
             if np.any(minutes >= 60.0):
                 row = int(np.argmax(minutes >= 60.0))
                 raise BadInput(
-                    f"{self.path}: column {column} holds {found[row]:.9g}, which are no degrees and "
-                    "minutes (ddmm.mmmm); leave it out of degrees_minutes"
+                    f"{self.path}: column {column} holds {found[row]:.9g}, which is not in degrees and "
+                    "minutes (ddmm.mmmm); remove it from degrees_minutes"
                 )
             found = np.copysign(np.floor(size / 100.0) + minutes / 60.0, found)
         if sides is not None:
@@ -258,18 +262,20 @@ class Rows:
             if np.any(is_north & (found < 0.0)):
                 row = int(np.argmax(is_north & (found < 0.0)))
                 raise BadInput(
-                    f"{self.path}: column {column} holds {found[row]:.9g} where {self._halves[column]} "
-                    f"says '{letters[row]}'; leave it out of hemispheres if it has signs already"
+                    f"{self.path}: column {column} holds {found[row]:.9g}, but {self._halves[column]} "
+                    f"says '{letters[row]}'; remove it from hemispheres if it already has signs"
                 )
             unknown = ~(is_south | is_north) & np.isfinite(found)
             self._tell(
-                f"{self.path.name}: {column}", "without a hemisphere, missing", int(unknown.sum())
+                f"{self.path.name}: {column}",
+                "without a hemisphere, read as missing",
+                int(unknown.sum()),
             )
             found = np.where(is_south, -np.abs(found), np.where(is_north, found, np.nan))
         return found
 
     def _parts(self, batch: Batch, rows: NDArray[np.int64]) -> Iterator[tuple[Batch, NDArray[np.int64]]]:
-        """Yield the rows of a batch, vehicle by vehicle, whose name stands for {vehicle} meanwhile."""
+        """Yield the rows of a batch by vehicle; meanwhile {vehicle} stands for its name."""
         if self._vehicle is None:
             self._numbers_of.clear()
             yield batch, rows
@@ -284,8 +290,8 @@ class Rows:
             plain = re.sub(r"\W+", "_", name).strip("_") or "_"
             if (other := self._vehicles.setdefault(plain, name)) != name:
                 raise BadInput(
-                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which are both "
-                    f"{plain} in topics; give them names of letters and digits"
+                    f"{self.path}: column {self._vehicle} has '{name}' and '{other}', which both become "
+                    f"{plain} in topics; give them different names of letters and digits"
                 )
             self._names["vehicle"] = plain
             self._numbers_of.clear()
@@ -298,7 +304,7 @@ class Rows:
         return found if clock.tag is None else self._ticks.stamps_ns(found, str(self.path))
 
     def _goes_back(self, batch: Batch) -> bool:
-        """Tell whether rows are newest first, by the local times of the first ones."""
+        """Test by the local times of the first rows whether rows are newest first."""
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
         zone = "UTC" if self._time.zone else None
@@ -310,7 +316,7 @@ class Rows:
     # What the first rows say.
 
     def first_ns(self) -> int | None:
-        """Return the earliest stamp of the first rows; if these are newest first, of all rows."""
+        """Return the earliest stamp of the first rows, or of all rows if they are newest first."""
         if self._next is None:
             return None
         wanted = {*self._time.columns, *([self._vehicle] if self._vehicle else [])}
@@ -333,11 +339,11 @@ class Rows:
         return {name: cells.take(back) for name, cells in batch.items()}, clock, rows[::-1]
 
     def first_fix(self) -> Origin | None:
-        """Return the first place of the file."""
+        """Return the first position in the file."""
         fixes = next((each for each in self.mapping.streams if each.becomes == "GeodeticFix"), None)
         if self.mapping.geodetic is None and fixes is None:
             return None
-        counts, self._counts = self._counts, Counter()  # what is read here is read again, and told then
+        counts, self._counts = self._counts, Counter()  # these rows are read and counted again later
         try:
             for whole in self._open().batches(self._numbers, self._texts):
                 for batch, _ in self._parts(whole, np.arange(_size(whole))):
@@ -364,10 +370,10 @@ class Rows:
         finally:
             self._counts = counts
 
-    # What becomes of them.
+    # Messages.
 
     def block(self, plane: Plane | None) -> list[Stream]:
-        """Return the streams of the next batch."""
+        """Make the streams of the next batch."""
         assert self._next is not None
         whole, self._next = self._next, next(self._batches, None)
         size = _size(whole)
@@ -377,19 +383,19 @@ class Rows:
             streams += self._streams(batch, rows, plane)
         self.count += size
         if self._is_reversed:
-            self._tell(self.path.name, "rows are newest first, and are reversed", size)
+            self._tell(self.path.name, "rows are newest first, so they are reversed", size)
         if self.is_done:
             self._end()
         return streams
 
     def _streams(self, batch: Batch, rows: NDArray[np.int64], plane: Plane | None) -> list[Stream]:
-        """Return the streams of rows, all of one vehicle."""
+        """Make the streams of rows that belong to one vehicle."""
         vehicle = self._names.get("vehicle", "")
         if vehicle not in self._clocks:
             if len(self._clocks) == _MOST_VEHICLES:
                 raise BadInput(
                     f"{self.path}: column {self._vehicle} has more than {_MOST_VEHICLES} values; name "
-                    "the column of the vehicle, or leave `vehicle` out"
+                    "the column of the vehicle, or remove `vehicle`"
                 )
             label = f"{self.path}: column {' and '.join(self._time.columns)}"
             self._clocks[vehicle] = (
@@ -397,11 +403,11 @@ class Rows:
                 {name: Reading() for name in ("time", *self._others)},
             )
         order, readings = self._clocks[vehicle]
-        if self._is_reversed:  # the rows of a block are before those of the last one
+        if self._is_reversed:  # the rows of a block are earlier than those of the previous block
             if self._time.rollover and not (self.is_done and self.count == 0):
                 raise BadInput(
-                    f"{self.path}: its rows are newest first, and its counter begins again at "
-                    f"{self._time.rollover:g}; sort the file by its rows, the last one first"
+                    f"{self.path}: its rows are newest first, and its counter rolls over at "
+                    f"{self._time.rollover:g}; reverse the rows of the file"
                 )
             order = Order(f"{self.path}: column {' and '.join(self._time.columns)}", self._time)
             for reading in readings.values():
@@ -434,7 +440,7 @@ class Rows:
                 continue
             if own.only_first and self._is_reversed and not self.is_done:
                 raise BadInput(
-                    f"{self.path}: its rows are newest first, and `only_first` of {own.topic} needs the "
+                    f"{self.path}: its rows are newest first, but `only_first` of {own.topic} needs the "
                     "earliest one; sort the file by its times"
                 )
             found = self._mapped(own, batch, made_of)
@@ -442,7 +448,7 @@ class Rows:
         return streams
 
     def _end(self) -> None:
-        """Tell what was decided about times, and check the order of the last rows."""
+        """Report decisions about times, and check the order of the last rows."""
         for order, readings in self._clocks.values():
             if not self._is_reversed:
                 order.end()
@@ -451,26 +457,28 @@ class Rows:
                     self._tell(self.path.name, fact, count)
 
     def _note(self, stamps: Stamps, vehicle: str) -> None:
-        """Take up what stamps (n,) tell of the clock."""
+        """Update the facts about the clock from stamps (n,)."""
         if not len(stamps):
             return
         reached = self._reached.get(vehicle, int(stamps[0]) - 1)
         steps = np.diff(stamps, prepend=reached)
-        self._tell(self.path.name, "stamps repeat, and are kept", int((steps == 0).sum()))
+        self._tell(self.path.name, "stamps repeat, but are kept", int((steps == 0).sum()))
         if not self._is_reversed or len(stamps) > 1:
             back = steps[1:] if self._is_reversed else steps
-            self._tell(self.path.name, "stamps go back, and are sorted", int((back < 0).sum()))
+            self._tell(
+                self.path.name, "stamps go back in time, so they are sorted", int((back < 0).sum())
+            )
         self.reached_ns = self._reached[vehicle] = int(stamps[-1])
         low, high = self.span_ns or (self.reached_ns, self.reached_ns)
         self.span_ns = min(low, int(stamps.min())), max(high, int(stamps.max()))
 
     def _made(self, batch: Batch, plane: Plane | None, missing: Sequence[float]) -> dict[str, NDArray]:
-        """Make the columns that are made of others, without numbers that stand for missing ones."""
+        """Compute positions and quaternions from other columns, without numbers for missing values."""
         made: dict[str, NDArray] = {}
         if self.mapping.geodetic is not None:
             places = self._places(batch, missing)
             self._check_place(*places[:2])
-            # without a plane there is no place in the whole log
+            # without a plane there is no position in the whole log
             unknown = np.full((3, _size(batch)), np.nan)
             made |= zip(PLACE, unknown if plane is None else plane.place(*places), strict=True)
         if self.mapping.attitude is not None:
@@ -483,7 +491,7 @@ class Rows:
         return np.where(np.isin(found, missing), np.nan, found) if missing else found
 
     def _places(self, batch: Batch, missing: Sequence[float] = ()) -> tuple[NDArray, NDArray, NDArray]:
-        """Read latitude and longitude (deg), altitude (m, 0 where no column has it) of rows (n,)."""
+        """Read latitude and longitude (deg) and altitude (m, 0 without a column) of rows (n,)."""
         own = self.mapping.geodetic
         assert own is not None
         factor = conversion(own.unit, "latitude_deg")
@@ -501,13 +509,13 @@ class Rows:
             checked(str(self.path), field, values[np.isfinite(values)])
 
     def _quaternion(self, batch: Batch, own: Attitude, missing: Sequence[float]) -> NDArray:
-        """Compute orientations (n, 4), NaN where an angle is missing."""
+        """Compute orientations (n, 4), NaN if an angle is missing."""
         factor = conversion(own.unit, "angle_rad")
         names = (own.heading or own.yaw, own.pitch, own.roll)
         zero = np.zeros(_size(batch))
         angles = [zero if name is None else self._known(batch, name, missing) * factor for name in names]
         turns = np.stack(angles, axis=1)
-        if own.heading is not None:  # clockwise from north and nose up, as aircraft have them
+        if own.heading is not None:  # clockwise from north and nose up, as for aircraft
             turns = turns * (-1, -1, 1) + (np.pi / 2, 0, 0)
         known = np.isfinite(turns).all(axis=1)
         quaternion = np.full((len(turns), 4), np.nan)
@@ -542,7 +550,7 @@ class Rows:
     def _kept(
         self, own: TableStream, found: Mapped, timed: NDArray[np.bool_], rows: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Choose which of the messages are taken; the others are counted by reason."""
+        """Choose the messages to keep; count the others by reason."""
         topic = self._filled(own.topic)
         lacking = not_finite(schema_of(own, topic), found.columns)
         keep = timed[found.rows] & (rows[found.rows] % own.every == 0)
@@ -572,7 +580,7 @@ class Rows:
             metadata["delay_s"] = repr(own.delay_s)
         if plane is not None and is_planar(schema_of(own, where).full_name, metadata):
             is_geodetic = self.mapping.geodetic is not None or own.becomes == "GeodeticFix"
-            own_frame = {FRAME: self.path.name}  # nobody says where on earth that is
+            own_frame = {FRAME: self.path.name}  # its position on the earth is unknown
             metadata |= plane.metadata if plane.is_stated or is_geodetic else own_frame
         columns = {name: column[rows] for name, column in found.columns.items()}
         columns = with_unit_quaternions(columns, own.kinds)
@@ -590,14 +598,14 @@ class Rows:
             **columns,
         )
 
-    # What is told.
+    # Notes.
 
     def _tell(self, subject: str, fact: str, count: int) -> None:
         if count:
             self._counts[subject, fact] += count
 
     def notes(self) -> dict[str, str]:
-        """Describe what was read of the file."""
+        """Describe what was read from the file."""
         name = self.path.name
         self._names.pop("vehicle", None)
         topics = ", ".join(self._filled(stream.topic) for stream in self.mapping.streams)
@@ -606,7 +614,7 @@ class Rows:
         notes = {name: f"{self.count} rows{files} as {topics}{of}"}
         used = self._texts | self._numbers
         if rest := [each for each in self.table.columns if each not in used]:
-            notes[f"{name}: columns not taken"] = some_of(rest)
+            notes[f"{name}: columns not imported"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, trajectory"] = self.table.mended
         for doubt in sorted(self.table.doubts):
@@ -617,7 +625,7 @@ class Rows:
 
 
 class _Clocks(NamedTuple):
-    """Holds the stamps (n,) of rows: the measurement's, the recorder's and the sensor's own."""
+    """The stamps (n,) of rows by three clocks: of the measurement, the recorder and the sensor."""
 
     stamps: Stamps
     logged: Stamps
@@ -629,7 +637,7 @@ def _size(batch: Batch) -> int:
 
 
 def _times_in(stream: TableStream) -> Iterator[str]:
-    """Yield the sources of fields that are times, which are read to the last digit."""
+    """Yield the sources of fields that are times, which are read without loss of digits."""
     times = {
         entry.name for entry in list(schema_of(stream, stream.topic))[1:] if entry.kind == "time_ns"
     }

@@ -1,4 +1,4 @@
-"""Picks one kind of row out of receivers' logs whose lines begin with what they are."""
+"""Selection of one kind of row from receivers' logs whose lines begin with their kind."""
 
 import re
 from collections import Counter
@@ -27,9 +27,9 @@ _INSPVA_UNITS = {
 
 
 class Tagged(NamedTuple):
-    """Describes the rows of one kind: how they begin, between which marks, columns and their units.
+    """Rows of one kind: their beginnings, the marks around the cells, the columns and their units.
 
-    `invalid` is found in rows that say that they have no solution.
+    `invalid` matches rows that report that there is no solution.
     """
 
     what: str
@@ -41,7 +41,7 @@ class Tagged(NamedTuple):
     invalid: re.Pattern[bytes] | None = None
 
     def rows(self, blocks: Iterable[bytes], left_out: Counter[str]) -> Iterator[bytes]:
-        """Yield the cells of this kind's rows, block by block; count the lines of others."""
+        """Yield the cells of this kind's rows, block by block; count other lines."""
         for block in blocks:
             lines = block.splitlines()
             own = [line for line in lines if line.startswith(self.begins)]
@@ -49,21 +49,21 @@ class Tagged(NamedTuple):
             if len(own) < len(lines):
                 left_out[f"that are not {self.what}"] += len(lines) - len(own)
             if len(valid) < len(own):
-                left_out["that say that they have no solution"] += len(own) - len(valid)
+                left_out["without a solution"] += len(own) - len(valid)
             cells = (line.partition(self.after)[2].partition(self.before)[0] for line in valid)
             yield b"".join(each + b"\n" for each in cells)
 
 
 def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
-    """Return which rows of a receiver's log are read, by its first lines; None for another file.
+    """Recognise a receiver's log by its first lines, and return the rows to read; None for other files.
 
-    Raises BadInput if it is such a log of other rows.
+    Raises BadInput if it is such a log, but without rows that can be read.
     """
     lines = [line.rstrip() for line in islice(lines_of(file), 1)]
     first = lines[0] if lines else b""
     if _NMEA.match(first):
         raise BadInput(
-            f"{path}: holds sentences of NMEA, which are no table; convert it first, such as by "
+            f"{path}: holds NMEA sentences, which are not a table; convert them first, for example with "
             "gpsbabel -i nmea -f FILE -o unicsv -F track.csv"
         )
     if _NOVATEL.match(first):
@@ -79,8 +79,8 @@ def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
     names, units = said.get(("$COL", "GNSS")), said.get(("$UNIT", "GNSS"), [])
     if names is None:
         raise BadInput(
-            f"{path}: is a log of a FlySight without rows of GNSS; give its TRACK.CSV, or a table of "
-            "one kind of rows with their names above"
+            f"{path}: is a log of a FlySight without GNSS rows; give its TRACK.CSV, or a table with one "
+            "kind of rows and their names above"
         )
     of_columns = {name: unit for name, unit in zip(names, units, strict=False) if unit}
     return Tagged("GNSS of a FlySight", (b"$GNSS,",), b",", b"\r", tuple(names), of_columns)

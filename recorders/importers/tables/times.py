@@ -1,4 +1,4 @@
-"""Reads stamps of tables: numbers since some zero, dates, GPS weeks, or a rate; exact to the ns."""
+"""Stamps of tables: numbers since a zero, dates, GPS weeks, or a rate; exact to the nanosecond."""
 
 import re
 import struct
@@ -22,16 +22,16 @@ from fuselog.recorders.parameters import Parameters
 
 CountUnit = Literal["s", "ms", "0.1 ms", "us", "ns"]
 Unit = Literal["s", "ms", "0.1 ms", "us", "ns", "date"]
-# How many digits after the second (or what else the unit is) are nanoseconds.
+# How many digits after the unit's decimal point are nanoseconds.
 DIGITS = {"s": 9, "ms": 6, "0.1 ms": 5, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
-_WEEKS = 1024  # after which receivers with ten bits begin again at 0
+_WEEKS = 1024  # after which receivers with ten bits roll over to 0
 _WEEK_NS = 7 * 86400 * 10**9
-# What does not go with a column of frames.
+# Settings that do not go with a column of frames.
 _UNCOUNTED = {"unit", "week", "rollover"}
 MEND = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
-# Hours ahead of UTC of zones by their short names, as far as these mean one zone.
+# Offsets from UTC in h of zones with short names, if the name is unambiguous.
 ZONES = {
     "UTC": 0.0, "GMT": 0.0, "WET": 0.0, "WEST": 1.0, "CET": 1.0, "MEZ": 1.0, "CEST": 2.0, "MESZ": 2.0,
     "EET": 2.0, "EEST": 3.0, "EST": -5.0, "EDT": -4.0, "CDT": -5.0, "MST": -7.0, "MDT": -6.0,
@@ -45,44 +45,42 @@ _OFFSET = re.compile(r"(?<=\d)( ?)([Zz]|[-+][01]\d:?\d\d)$")
 _SPACED = r"(:[\d.]+) ([-+]\d\d:?\d\d)$"
 _CLOCK = r"(?:([ T,]*)(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
 _WRITTEN = re.compile(r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?" + _CLOCK)
-# With the day of the year, and with a time of day as AndroSensor and names of files have it.
+# Day of the year, and a time of day as in AndroSensor and in names of files.
 _ORDINAL = re.compile(r"\d{4}([-:./ ])\d{3}(?:([ T:])(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?)?")
 _DASHED = re.compile(r"\d{4}-\d\d-\d\d[ _T]\d\d(-\d\d-\d\d([_:.]\d{1,6})?|:\d\d:\d\d:\d{1,6})")
-# With the name of the month in second or first place.
+# Name of the month in the second or first place.
 _DAY_MONTH = re.compile(r"\d{1,2}([-/. ])([A-Z][a-z]{2,8})\1\d{4}" + _CLOCK)
 _MONTH_DAY = re.compile(r"([A-Z][a-z]{2,8}) \d{1,2}(,?) \d{4}" + _CLOCK)
 
 
 class Undecided(BadInput):
-    """Says that times can be read in several ways, and which setting decides."""
+    """An error for times that can be read in several ways; it names the setting that decides."""
 
 
 class TimeMapping(Parameters):
-    """States where a row's time stands.
+    """Where the time of a row is, and in which format.
 
     Attributes:
         column: one column, or several that belong together, such as the texts of date and time, or
             seconds and nanoseconds.
-        unit: unit of numbers; "date" is for dates and times as text. Of several columns of numbers each
-            has its own, such as ["s", "ns"], and they are added.
-        zero: date that numbers count from; by default 1970-01-01, with `week` 1980-01-06.
+        unit: unit of numbers; "date" is for dates and times as text. Several columns of numbers have a
+            list of units, such as ["s", "ns"], and are added.
+        zero: date from which numbers count; by default 1970-01-01, with `week` 1980-01-06.
         week: column of GPS weeks; `column` then has the seconds of the week.
-        rate_hz: rows per second of files without stamps, from `zero` on; with `column`, how many of its
-            counts there are in a second, as of numbers of frames.
-        utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
-        zone: name of the zone of these clocks, such as Europe/Berlin, which knows summer time, or CET.
-        format: format of dates that are not as ISO 8601 has them, in the letters of strptime; of times
+        rate_hz: rows per second of files without stamps, from `zero` on; with `column`, counts of that
+            column per second, as for frame numbers.
+        utc_offset_h: how far local clocks are ahead of UTC, for dates that do not state it.
+        zone: name of the local time zone, such as Europe/Berlin, which includes summer time, or CET.
+        format: format of dates that do not follow ISO 8601, in the letters of strptime; for times
             without a date, the day is that of `zero`.
-        leap_seconds: leap seconds that are subtracted, in s; GPS time is otherwise kept as it is
-            written.
-        tag: suffix of a file beside each file that says when its counter started, and how fast it goes
+        leap_seconds: leap seconds to subtract, in s; by default GPS time is kept as it is.
+        tag: suffix of a file next to each file that states when its counter started, and its rate
             (RTKLIB's time tags).
-        rollover: the number at which the counter begins again at 0, such as 4294967296; it is then
-            continued beyond that.
-        order: in which order rows are; "rising" allows single rows to be late, and a file whose rows
-            are newest first is reversed; "any" sorts rows whatever their times are.
-        file: a file with the times of the rows, one in each line, in place of a column; a path from the
-            given folder on.
+        rollover: number at which the counter rolls over to 0, such as 4294967296; it is then unwrapped.
+        order: order of the rows; "rising" allows single late rows, and reverses a file whose rows are
+            newest first; "any" sorts rows whatever their times are.
+        file: a file with the times of the rows, one in each line, instead of a column; a path relative
+            to the given folder.
     """
 
     column: str | list[str] = []
@@ -109,23 +107,23 @@ class TimeMapping(Parameters):
             and (len(self.columns) > 1 or self.model_fields_set & _UNCOUNTED)
         ):
             raise ValueError(
-                "`rate_hz` beside `column` counts numbers of frames in one column; leave out `unit`, "
-                "`week` and `rollover`, or `rate_hz`"
+                "`rate_hz` with `column` counts frame numbers in one column; remove `unit`, `week` and "
+                "`rollover`, or `rate_hz`"
             )
         counted = len(self.columns) - bool(self.week)
         if isinstance(self.unit, list) and len(self.unit) != counted:
             raise ValueError(f"unit has {len(self.unit)} units for {counted} columns; give one for each")
         if counted > 1 and self.unit != "date" and not isinstance(self.unit, list):
             raise ValueError(
-                'several columns together are a date, unit = "date", or numbers that are added, such as '
-                'unit = ["s", "ns"]'
+                'several columns together need unit = "date", or a list of units of numbers to add, '
+                'such as unit = ["s", "ns"]'
             )
         if self.rollover and self.unit == "date":
-            raise ValueError('`rollover` is for counters; leave it out with unit = "date"')
+            raise ValueError('`rollover` is for counters; remove it if unit = "date"')
         if self.zone is not None:
             offset_of(self.zone)
             if self.utc_offset_h or self.unit != "date":
-                raise ValueError("`zone` is for dates, and in place of `utc_offset_h`; give one of them")
+                raise ValueError("`zone` is for dates, and replaces `utc_offset_h`; give one of the two")
         try:
             _date_ns(self.zero)
         except ValueError:
@@ -136,33 +134,33 @@ class TimeMapping(Parameters):
 
     @property
     def columns(self) -> list[str]:
-        """Return all columns that are read, in order."""
+        """Return all columns to read, in order."""
         texts = [self.column] if isinstance(self.column, str) else self.column
         return [*texts, *([self.week] if self.week else [])]
 
     @property
     def zero_ns(self) -> int:
-        """Return what numbers count from, less leap seconds and the offset from UTC."""
+        """Return the zero of the numbers, minus leap seconds and the offset from UTC."""
         since = _date_ns(_GPS_ZERO if self.counts_all_weeks else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
 
     @property
     def counts_all_weeks(self) -> bool:
-        """Tell whether there are GPS weeks, and they count from the first one."""
+        """Test whether GPS weeks are used, and count from the first one."""
         return self.week is not None and "zero" not in self.model_fields_set
 
     @property
     def units(self) -> list[CountUnit]:
-        """Return the units of the columns of numbers, without that of weeks."""
+        """Return the units of the columns of numbers, except that of weeks."""
         if isinstance(self.unit, list):
             return self.unit
         return [] if self.unit == "date" else [self.unit]
 
 
 def offset_of(zone: str) -> float | ZoneInfo:
-    """Return how many hours a zone is ahead of UTC, or its rules where these are not always the same.
+    """Return how many hours a zone is ahead of UTC, or its rules if this changes over the year.
 
-    Raises ValueError where there is no such zone.
+    Raises ValueError for an unknown zone.
     """
     if zone in ZONES:
         return ZONES[zone]
@@ -175,7 +173,7 @@ def offset_of(zone: str) -> float | ZoneInfo:
 
 
 def formats_of(cell: str) -> Iterator[str]:
-    """Yield the formats that a date or time of day as text may have, the likeliest first.
+    """Yield possible formats of a text with a date or time of day, the likeliest first.
 
     >>> list(formats_of("05.10.2026 14:03:07,25"))
     ['%d.%m.%Y %H:%M:%S,%f']
@@ -223,7 +221,7 @@ def _month(name: str) -> str:
 
 
 def _dashed(cell: str) -> str:
-    """Return the format of a date and a time of day that are as `_DASHED` has them."""
+    """Return the format of a date and time of day that match `_DASHED`."""
     marks = re.split(r"\d+", cell)[1:-1]
     parts = ("%Y", "%m", "%d", "%H", "%M", "%S", "%f")
     return "".join(part + mark for part, mark in zip(parts, [*marks, ""], strict=False))
@@ -236,11 +234,11 @@ def _of_day(
     point: str | None,
     half: str | None = None,
 ) -> str:
-    """Return the format of a time of day as `_CLOCK` takes it apart."""
+    """Return the format of a time of day from the groups of `_CLOCK`."""
     if not clock:
         return ""
     parts = ["%I" if half else "%H", "%M", "%S"][: 2 + bool(second)]
-    if point and not second:  # of minutes nobody writes fractions
+    if point and not second:  # nobody writes fractions of minutes
         parts = ["%M", "%S"]
     of_day = (between or "") + ":".join(parts) + f"{point}%f" * bool(point)
     return of_day + (" %p" if half and half[0] == " " else "%p" * bool(half))
@@ -252,10 +250,10 @@ def _date_ns(text: str) -> int:
 
 
 class Reading:
-    """Holds what reading the times of a file has to remember from one block to the next.
+    """The state that is carried from one block of a file to the next while its times are read.
 
     Attributes:
-        facts: what was decided on the way, and for how many rows.
+        facts: decisions made on the way, with the number of rows.
     """
 
     def __init__(self) -> None:
@@ -263,21 +261,21 @@ class Reading:
         self.begin()
 
     def begin(self) -> None:
-        """Forget the rows before."""
-        self.count_ns = NOT_A_TIME  # the last number of a counter, as it stands in the file
-        self.turns = 0  # how often the counter has begun again
+        """Forget the earlier rows."""
+        self.count_ns = NOT_A_TIME  # the last number of a counter in the file
+        self.turns = 0  # how often the counter has rolled over
         self.local_ns = NOT_A_TIME  # the last local time
-        self.is_second = False  # whether a doubled hour is there for the second time
+        self.is_second = False  # whether a repeated hour is there for the second time
 
     def continued_ns(self, counted: Stamps, rollover_ns: int, label: str) -> Stamps:
-        """Return the numbers (n,) of a counter, continued beyond its rollovers."""
+        """Unwrap the numbers (n,) of a counter beyond its rollovers."""
         known = counted != NOT_A_TIME
         if not known.any():
             return counted
         values = counted[known]
         before = values[0] if self.count_ns == NOT_A_TIME else self.count_ns
         turns = self.turns + np.cumsum(-np.rint(np.diff(values, prepend=before) / rollover_ns))
-        self.facts["rollovers of the counter, which is continued"] += int(turns[-1]) - self.turns
+        self.facts["rollovers of the counter, which is unwrapped"] += int(turns[-1]) - self.turns
         self.count_ns, self.turns = int(values[-1]), int(turns[-1])
         continued = counted.copy()
         continued[known] = to_ns(turns, rollover_ns, values, where=label, mend=MEND)
@@ -291,16 +289,16 @@ def stamps_ns(
     where: str,
     reading: Reading | None = None,
 ) -> Stamps:
-    """Return the stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
+    """Compute the stamps (n,) of rows in ns, `NOT_A_TIME` for missing ones.
 
     Args:
-        mapping: says which columns have the time, and how.
+        mapping: the columns with the time, and their format.
         columns: cells (n,) by name.
-        rows: (n,), the numbers of the rows, from 0 on.
-        where: begins the sentence on a cell that cannot be used.
-        reading: what is known from the rows before.
+        rows: (n,), numbers of the rows, from 0.
+        where: beginning of error messages.
+        reading: state from earlier rows.
 
-    Raises BadInput if a cell holds no time, or one beyond what a log can hold.
+    Raises BadInput if a cell holds no time, or a time beyond what a log can hold.
     """
     reading = reading or Reading()
     if mapping.rate_hz is not None:
@@ -341,7 +339,7 @@ def stamps_ns(
 
 
 def _frames(cells: pa.Array, mapping: TimeMapping, where: str) -> NDArray[np.float64]:
-    """Return numbers of frames (n,), NaN for empty cells."""
+    """Read frame numbers (n,), NaN for empty cells."""
     label = f"{where}: column {mapping.columns[0]}"
     counts = read_ns(cells, 0, where=label, mend="give a column of whole numbers")
     return np.where(counts == NOT_A_TIME, np.nan, counts)
@@ -350,7 +348,7 @@ def _frames(cells: pa.Array, mapping: TimeMapping, where: str) -> NDArray[np.flo
 def _dates_ns(
     mapping: TimeMapping, cells: list[pa.Array], rows: NDArray[np.int64], label: str, reading: Reading
 ) -> Stamps:
-    """Read dates as ns since 1970 in UTC; the offset that a cell states itself comes before all else."""
+    """Read dates as ns since 1970 in UTC; an offset in a cell takes precedence."""
     leap_ns = round(mapping.leap_seconds * 1e9)
     zone = offset_of(mapping.zone) if mapping.zone is not None else mapping.utc_offset_h
     if len(cells) == 1 and pa.types.is_timestamp(cells[0].type):
@@ -360,7 +358,7 @@ def _dates_ns(
         return to_ns(found, 1, -leap_ns, where=label, mend=MEND)
     texts = [_padded(texts_of(each, is_part=len(cells) > 1), mapping.format) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
-    if mapping.format == ISO:  # pandas knows no fractions after a comma, and no space before an offset
+    if mapping.format == ISO:  # pandas accepts no fractions after a comma, and no space before an offset
         for mark, written in ((",", r"(:\d\d),(\d)"), (" -", _SPACED), (" +", _SPACED)):
             if pc.any(pc.match_substring(joined, mark)).as_py():
                 plain = r"\1.\2" if mark == "," else r"\1\2"
@@ -394,7 +392,7 @@ def _dates_ns(
             first, other = int(np.argmax(local)), int(np.argmax(stated))
             raise Undecided(
                 f"{label}: row {rows[first] + 1} holds '{joined[first]}' without a zone, and row "
-                f"{rows[other] + 1} states one; state the zone of rows without, such as "
+                f"{rows[other] + 1} states one; give the zone of rows without one, such as "
                 'zone = "UTC", in `time`'
             )
     elif zone and own.any():
@@ -406,14 +404,14 @@ def _dates_ns(
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
-    """Return cells as texts; of a date that is a part of a time without its midnight."""
+    """Convert cells to texts; a date that is a part of a time loses its midnight."""
     if is_part and pa.types.is_timestamp(cells.type):
         return pc.strftime(cells, format="%Y-%m-%d")
     return pc.utf8_trim_whitespace(cells.cast(pa.string()))
 
 
 def _padded(texts: pa.Array, pattern: str) -> pa.Array:
-    """Return numbers such as hhmmss with the zeros that they may have lost at their front."""
+    """Restore leading zeros of numbers such as hhmmss."""
     if not re.search("%H%M%S|%d%m%y", pattern):
         return texts
     for lost in range(1, 6):
@@ -428,7 +426,7 @@ def _since_ns(dates: pd.Series) -> Stamps:
 def _check_offsets(
     found: Stamps, texts: pa.Array, zone: float | ZoneInfo, rows: NDArray[np.int64], label: str
 ) -> None:
-    """Raise BadInput if a cell states another offset from UTC than a zone has then."""
+    """Raise BadInput if a cell states another offset from UTC than the zone has at that time."""
     parts = texts.to_pandas().str.extract(OWN_OFFSET)
     hours = pd.to_numeric(parts["h"], errors="coerce").fillna(0).to_numpy()
     minutes = pd.to_numeric(parts["m"], errors="coerce").fillna(0).to_numpy()
@@ -442,18 +440,18 @@ def _check_offsets(
     if is_other.any():
         first = int(np.argmax(is_other))
         raise BadInput(
-            f"{label}: row {rows[first] + 1} holds '{texts[first]}', which states another offset from "
-            f"UTC than the mapping, {zone_h[first]:+g} h; leave `zone` and `utc_offset_h` out of "
-            "`time`, as the cells have their own"
+            f"{label}: row {rows[first] + 1} holds '{texts[first]}', whose offset from UTC differs from "
+            f"that of the mapping, {zone_h[first]:+g} h; remove `zone` and `utc_offset_h` from `time`, "
+            "as the cells have their own"
         )
 
 
 def _from_zone(
     local_ns: Stamps, zone: float | ZoneInfo, rows: NDArray[np.int64], label: str, reading: Reading
 ) -> Stamps:
-    """Change stamps (n,) by a zone's clocks to UTC.
+    """Convert stamps (n,) from a zone's local time to UTC.
 
-    In an hour that comes twice, rows are of the second one from where their times go back. Raises
+    In an hour that occurs twice, rows belong to the second one after their times go back. Raises
     BadInput for a time that the clocks skip.
     """
     known = np.flatnonzero(local_ns != NOT_A_TIME)
@@ -466,8 +464,8 @@ def _from_zone(
     if (skipped := first == NOT_A_TIME).any():
         index = int(np.argmax(skipped))
         raise BadInput(
-            f"{label}: row {rows[known[index]] + 1} is of {local[index]}, a time that the clocks of "
-            f"{zone.key} skip; if the logger's clock knows no summer time, give utc_offset_h in place "
+            f"{label}: row {rows[known[index]] + 1} has {local[index]}, a time that the clocks of "
+            f"{zone.key} skip; if the logger's clock has no summer time, give utc_offset_h instead "
             "of zone"
         )
     doubled = first != second
@@ -479,14 +477,14 @@ def _from_zone(
         for index in np.flatnonzero(doubled).tolist():
             before = times[index - 1] if index else reading.local_ns
             is_inside = bool(doubled[index - 1]) if index else reading.is_second
-            # of rows an hour apart, two of one local time are an hour apart as well
+            # if rows are an hour apart, two with the same local time are too
             is_equal = times[index] == before and usual_ns >= second[index] - first[index]
             goes_back = before != NOT_A_TIME and (times[index] < before or is_equal)
             reading.is_second = goes_back or (reading.is_second and is_inside)
             is_second[index] = reading.is_second
         first = np.where(is_second, second, first)
         reading.facts[
-            f"times of the hour that comes twice in {zone.key}, placed by the order of rows"
+            f"times of the hour that occurs twice in {zone.key}, resolved by the order of rows"
         ] += int(doubled.sum())
     if len(known):
         reading.local_ns = int(local_ns[known[-1]])
@@ -496,16 +494,16 @@ def _from_zone(
 
 
 def _since_utc(local: pd.Series, zone: ZoneInfo, *, is_first: bool) -> Stamps:
-    """Return local times (n,) in UTC, `NOT_A_TIME` for those that the clocks skip."""
+    """Convert local times (n,) to UTC, `NOT_A_TIME` for those that the clocks skip."""
     first = np.full(len(local), is_first)
     placed = local.dt.tz_localize(zone, ambiguous=first, nonexistent="NaT")
     return _since_ns(placed.dt.tz_convert("UTC").dt.tz_localize(None))
 
 
 class Ticks(NamedTuple):
-    """Describes a file's own counter, in ns: where it begins, when that was, what one ns of it takes.
+    """A file's own counter: its first reading in ns, the stamp of that reading, and its rate.
 
-    `cut_ns` is the last reading where its line was cut off within it, else NOT_A_TIME.
+    `cut_ns` is the last reading if its line was truncated, else NOT_A_TIME.
     """
 
     first_ns: int
@@ -514,19 +512,19 @@ class Ticks(NamedTuple):
     cut_ns: int
 
     def stamps_ns(self, ticks_ns: Stamps, where: str) -> Stamps:
-        """Return the stamps (n,) of readings; one of a line that was cut off has none."""
+        """Compute the stamps (n,) of readings; a reading from a truncated line has none."""
         since = np.rint(to_ns(ticks_ns, 1, -self.first_ns, where=where) * self.rate)
         none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
         return to_ns(np.where(none, np.nan, since), 1, self.start_ns, where=where)
 
 
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Ticks:
-    """Return the counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
+    """Read the counter of a file from RTKLIB's time tag, named after the file with `suffix`.
 
-    A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
-    76 on pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are all readings.
+    From byte 64 on, a tag has a time_t and a fraction of a second, when the file was begun, and from
+    byte 76 on pairs of 4 bytes: ms since then, and the length of the file. `ticks_ns` are all readings.
 
-    Raises BadInput where there is no such file, or it is none.
+    Raises BadInput if the file is missing, or is not a time tag.
     """
     tag = path.with_name(path.name + suffix)
     try:
@@ -544,8 +542,8 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Ticks:
     first, last = (int(every[0]), int(every.max())) if len(every) else (0, 0)
     if last <= first:
         raise BadInput(
-            f"{path}: its counter does not increase, so that {tag.name} does not give its times; give "
-            "the file as RTKLIB wrote it"
+            f"{path}: its counter does not increase, so {tag.name} does not give its times; give the "
+            "file as RTKLIB wrote it"
         )
     rate = float(last_ms) * 1e6 / float(last - first)
     cut_ns = int(every[-1]) if every[-1] < last else NOT_A_TIME

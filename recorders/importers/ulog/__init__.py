@@ -1,5 +1,5 @@
-"""Reads ULog, the logs of PX4 autopilots; begin with `importer`.
+"""Importer of ULog, the logs of PX4 autopilots; begin with `importer`.
 
-Source: docs.px4.io, ULog File Format, version 1. `formats` lays out messages, `file` reads a file in
-blocks, `sensors` says what becomes of which topic, `estimator` what of the autopilot's filter.
+Source: docs.px4.io, ULog File Format, version 1. `formats` parses message formats, `file` reads a file
+in blocks, `sensors` converts the topics of sensors, `estimator` those of the autopilot's filter.
 """

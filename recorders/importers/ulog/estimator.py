@@ -1,7 +1,7 @@
-"""Imports the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
+"""Import of the autopilot's own filter, EKF2: states, innovations, and a simulator's truth.
 
-PX4's innovations are what was predicted minus what was measured; ours have the other sign. It fuses one
-component after the other, and logs the variance of each alone: the covariances here are diagonal.
+PX4's innovations are prediction minus measurement; ours have the other sign. EKF2 fuses components one
+by one, and logs the variance of each, so the covariances here are diagonal.
 """
 
 from collections import Counter
@@ -21,7 +21,7 @@ from fuselog.recorders.models.states import NAVIGATION, state_metadata
 Floats = NDArray[np.float64]
 TRUTH = f"{BODY}/truth"
 _POSE = NAVIGATION[:10]
-# How many states of which the variances are logged have an orientation of three.
+# The number of states with logged variances if an orientation has three of them.
 _TANGENT_STATES = 23
 _UNIT_TOLERANCE = 1e-2
 _INNOVATIONS = (
@@ -34,10 +34,10 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """Names the innovations of a sensor: their fields, what we call them, and the sign that is ours.
+    """The innovations of a sensor: their fields, our names, and the factors to our sign.
 
-    `bits` are by component those of the filter's status that say that it is in use: one of them is set;
-    none where no bit says it.
+    `bits` has, for each component, the bits of the filter's status that say that it is in use: one of
+    them is set. It is empty if no bit says so.
     """
 
     fields: tuple[str, ...]
@@ -47,7 +47,7 @@ class _Sensor(NamedTuple):
 
 
 def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
-    """Make a sensor of north, east, down: `fields` and `bits` are the horizontal's, the vertical's."""
+    """Make a sensor of north, east, down; `fields` and `bits` are horizontal, vertical."""
     (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
     every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
@@ -65,12 +65,13 @@ def _single(field: str, name: str, sign: float, *bits: int) -> _Sensor:
     return _Sensor((field,), (name,), (sign,), (bits,))
 
 
-# Signs and order by PX4's src/modules/ekf2/EKF: `_state.vel(i) - gps_sample.vel(i)` and `_state.pos(i) -
+# Signs and order follow PX4's src/modules/ekf2/EKF: `_state.vel(i) - gps_sample.vel(i)` and
+# `_state.pos(i) -
 # position(i)`, north, east, down (gps_fusion.cpp; of heights baro_height_control.cpp); `getEulerYaw -
 # measured_hdg`, clockwise (mag_control.cpp); `mag_I_body - mag_observation`; `predicted_flow -
 # opt_flow_rate` about forward and right (optflow_fusion.cpp); `pred_acc - mea_acc` (drag_fusion.cpp);
 # `v_tas_pred - true_airspeed` (airspeed_fusion.cpp). Bits by `filter_control_status_u` (common.h), the
-# same up to version 1.15. While EKF2 has no fix it holds its place, and logs innovations of that in the
+# same up to version 1.15. Without a fix, EKF2 holds its position, and logs innovations of that in the
 # fields of fixes: `_gps_pos_innov.xy() = Vector2f(_state.pos) - _last_known_posNE` (control.cpp).
 _SENSORS = {
     "gnss_velocity": _enu("v", "mps", ("gps_hvel", "gps_vvel"), (2, 2)),
@@ -95,7 +96,7 @@ _PARAMETERS = {
     "gravity": ("GRAV", ""), "flow": ("OF_N_MIN", "OF"), "drag": ("DRAG", ""),
     "airspeed": ("EAS", "TAS"), "sideslip": ("BETA", "BETA"),
 }  # fmt: skip
-# The names that old firmware has for the same, in one topic with their variances: "0-2 vel, 3-5 pos"
+# Names in old firmware, which has innovations and variances in one topic: "0-2 vel, 3-5 pos"
 # (estimator_interface.h). The height is that of the sensor in use.
 _OLD = {
     "gps_hvel[0]": "vel_pos_innov{}[0]", "gps_hvel[1]": "vel_pos_innov{}[1]",
@@ -110,7 +111,7 @@ _FIELDS = tuple(dict.fromkeys(name for sensor in _SENSORS.values() for name in s
 
 
 class _Table(NamedTuple):
-    """Holds rows (n,) of numbers (n, k) by their key in us, with their stamps."""
+    """Rows (n,) of numbers (n, k), their keys in us, and their stamps."""
 
     key_us: NDArray[np.int64]
     time_us: NDArray[np.int64]
@@ -130,14 +131,14 @@ class _Table(NamedTuple):
 
 
 def label_of(instance: int) -> str:
-    """Return what an instance of the filter is called as an estimator."""
+    """Return the name of an instance of the filter as an estimator."""
     return f"ekf2_{instance}" if instance else "ekf2"
 
 
 class Autopilot:
-    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block.
+    """A maker of estimates and truth from the topics of EKF2 and of a simulator, block by block.
 
-    `left_out` counts what it leaves out, by reason. The autopilot's `parameters` have its gates.
+    `left_out` counts what is left out, by reason. The gates come from the autopilot's `parameters`.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -151,7 +152,7 @@ class Autopilot:
         self._status: dict[int, _Table] = {}
 
     def parts(self, rows: list[Rows]) -> Iterator[Part]:
-        """Yield the parts of a block's rows; what lacks its counterpart waits for the next block."""
+        """Yield the parts of a block's rows; rows without their counterpart wait for the next block."""
         for each in rows:
             fields = Fields(each)
             if fields.has("control_mode_flags"):
@@ -183,7 +184,7 @@ class Autopilot:
         self._waiting[key] = self._waiting[key].then(table) if key in self._waiting else table
 
     def _joined(self, instance: int) -> Iterator[Part]:
-        """Join innovations with their variances, once these have come as well."""
+        """Join innovations with their variances, as soon as both are known."""
         tables = [self._waiting.get((topic, instance)) for topic in _INNOVATIONS]
         innovations, variances, ratios = tables
         if innovations is None or variances is None:
@@ -206,7 +207,7 @@ class Autopilot:
     def _innovations(
         self, instance: int, innovations: _Table, variances: _Table, ratios: Floats | None
     ) -> Iterator[Part]:
-        """Yield the innovations of every sensor that was fused: those that are new."""
+        """Yield the new innovations of every sensor that was fused."""
         for name, sensor in _SENSORS.items():
             columns = [_FIELDS.index(each) for each in sensor.fields]
             value, variance = innovations.values[:, columns], variances.values[:, columns]
@@ -225,7 +226,7 @@ class Autopilot:
                 continue
             kept = np.where(is_fused, value, np.nan)[which] * sensor.signs
             spread = np.where(is_fused, variance, np.nan)[which]
-            # By setEstimatorAidStatusTestRatio; the ratios that are logged may be of other samples.
+            # As in setEstimatorAidStatusTestRatio; the logged ratios may belong to other samples.
             tested = kept**2 / spread / self._gates[name] ** 2
             if ratios is not None:
                 stated = ratios[which][:, columns]
@@ -241,7 +242,7 @@ class Autopilot:
     def _is_in_use(
         self, instance: int, sensor: _Sensor, time_us: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
-        """Tell whether the filter's status says that it used a sensor's components (n, m)."""
+        """Test by the filter's status whether it used the components (n, m) of a sensor."""
         is_used = np.ones((len(time_us), len(sensor.fields)), bool)
         status = self._status.get(instance)
         if status is None:
@@ -277,7 +278,7 @@ class Autopilot:
 
 
 def _table(fields: Fields, names: list[str] | tuple[str, ...]) -> _Table:
-    """Read fields by name as numbers; NaN where there is none of the name."""
+    """Read fields by name as numbers; NaN for missing fields."""
     values = fields.vector(*names)
     key = "timestamp_sample" if fields.has("timestamp_sample") else "timestamp"
     key_us = fields.rows.data[key].astype(np.int64)
@@ -314,19 +315,19 @@ def _innovation(
 
 
 def _unit(quaternions: Floats) -> Floats:
-    """Scale quaternions (n, 4) to unit length; NaN where they are far from it."""
+    """Scale quaternions (n, 4) to unit length; NaN if they are far from it."""
     length = np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.where(np.abs(length - 1.0) < _UNIT_TOLERANCE, quaternions, np.nan) / length
 
 
 def _state(fields: Fields) -> Part:
-    """Make the filter's position, velocity and orientation of its states and their variances.
+    """Make the filter's position, velocity and orientation from its states and their variances.
 
-    The biases are left out: of old firmware they are increments over a step of the filter.
+    Biases are left out: in old firmware they are increments over a step of the filter.
     """
     states = fields.vector("states", width=10)
     count = sum(name.startswith("covariances[") for name in fields.rows.data.dtype.names or ())
-    # A quaternion's four variances, or of newer firmware those of a rotation about north, east, down.
+    # A quaternion's four variances, or with newer firmware those of a rotation about north, east, down.
     turns = 3 if count == _TANGENT_STATES else 4
     variances = fields.vector("covariances", width=turns + 6)
     quaternion = orientations(_unit(states[:, :4]))
@@ -352,14 +353,14 @@ def _tilts(quaternion: Floats, logged: Floats, variances: Floats) -> Floats:
     """Compute the covariances (n, 3, 3) of rotations about the body's forward, left and up axes.
 
     Args:
-        quaternion: (n, 4) from that body to east, north, up.
-        logged: (n, 4) as it was logged, from forward, right, down to north, east, down.
-        variances: (n, 4) of what was logged, or (n, 3) of rotations about north, east, down.
+        quaternion: (n, 4) from the body to east, north, up.
+        logged: (n, 4) as logged, from forward, right, down to north, east, down.
+        variances: (n, 4) of the logged quaternion, or (n, 3) of rotations about north, east, down.
     """
     if variances.shape[1] == 4:
         # A small rotation is twice the vector part of conj(q) dq, here about forward, right, down.
         by = 2.0 * left_matrix(conjugate(logged))[:, 1:] * np.array([1.0, -1.0, -1.0])[:, None]
     else:
         variances = np.abs(to_enu(variances))
-        by = rotate(quaternion[:, None], np.eye(3))  # rows: the body's axes in the plane
+        by = rotate(quaternion[:, None], np.eye(3))  # rows: the body's axes in the local tangent plane
     return np.einsum("nij,nj,nkj->nik", by, variances, by)

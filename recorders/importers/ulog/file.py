@@ -1,7 +1,7 @@
-"""Reads a ULog in blocks: what it defines at its beginning, then the rows of its topics.
+"""Reader of ULog files in blocks: definitions at the beginning, then the rows of topics.
 
-What cannot be read is counted in `losses`, and reading goes on after it: where a message is none, at the
-next synchronisation message or rows that follow one another; at its offset where a section was appended.
+Unreadable parts are counted in `losses`, and reading goes on: after a broken message at the next
+synchronisation message or rows in sequence, and for an appended section at its offset.
 """
 
 import struct
@@ -44,10 +44,10 @@ _LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info
 
 
 class Rows(NamedTuple):
-    """Holds some rows (n,) of a topic's instance, in the order of the file, or of their stamps.
+    """Some rows (n,) of an instance of a topic, in the order of the file or of their stamps.
 
-    `time_us` are their stamps, for rows without one those between which they lie in the file, of which
-    `untimed` counts how many.
+    `time_us` are their stamps; rows without a stamp get one between those of their neighbours in the
+    file, and `untimed` counts them.
     """
 
     topic: str
@@ -58,7 +58,7 @@ class Rows(NamedTuple):
 
 
 class Text(NamedTuple):
-    """Holds what the autopilot said: when, how grave it is, and what."""
+    """A message of the autopilot: time, severity and text."""
 
     time_us: int
     level: str
@@ -66,7 +66,7 @@ class Text(NamedTuple):
 
 
 class _Subscription(NamedTuple):
-    """Says what the rows of a number are."""
+    """The topic of rows with one number."""
 
     topic: str
     instance: int
@@ -74,17 +74,17 @@ class _Subscription(NamedTuple):
 
 
 class UlogFile:
-    """Reads a ULog once, from its beginning to its end.
+    """A ULog that is read once, from beginning to end.
 
     Attributes:
         path: the file.
-        start_us: the stamp at which logging began.
-        info: what it says of itself, by key.
-        parameters: the autopilot's parameters at the beginning, and `defaults` where they are stated.
-        changes: those that changed: when, name, value.
-        texts: what the autopilot said.
-        dropouts: stamp and length in us of what the logger knew to be lost.
-        rows: how many each topic and instance had so far.
+        start_us: stamp at which logging began.
+        info: information messages, by key.
+        parameters: parameters of the autopilot at the beginning, and `defaults` if they are stated.
+        changes: changed parameters: time, name, value.
+        texts: messages of the autopilot.
+        dropouts: stamp and length in us of losses that the logger reported.
+        rows: number of rows of each topic and instance so far.
         losses: what could not be read, and how often.
     """
 
@@ -111,7 +111,7 @@ class UlogFile:
             raise BadInput(f"{path}: cannot be read ({error.strerror}); give a .ulg file") from error
 
     def blocks(self, is_wanted: Callable[[str], bool]) -> Iterator[list[Rows]]:
-        """Yield the rows of the topics that are wanted, a block for some megabytes of the file."""
+        """Yield the rows of the wanted topics, with a block for some megabytes of the file."""
         ends = sorted({each for each in self._appended if self._begins <= each < self._size})
         if len(ends) < len(self._appended):
             self.losses["appended section that lies outside of the file"] += 1
@@ -122,10 +122,10 @@ class UlogFile:
         except OSError as error:
             raise BadInput(f"{self.path}: cannot be read ({error.strerror}); copy it anew") from error
 
-    # The beginning.
+    # Definitions.
 
     def _read_definitions(self, file: BinaryIO) -> int:
-        """Read all that is before the first subscription; where that is."""
+        """Read everything before the first subscription; return its position."""
         head = file.read(16)
         if head[:7] != MAGIC or len(head) < 16:
             what = "is empty" if not head else "is no ULog"
@@ -175,12 +175,12 @@ class UlogFile:
                 _text(value_bytes) if of.startswith("char") else str(_number(of, value_bytes))
             )
 
-    # The data.
+    # Data.
 
     def _section(
         self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
     ) -> Iterator[list[Rows]]:
-        """Yield the rows between two bytes of the file; the message that the end cuts is none."""
+        """Yield the rows between two bytes of the file; a message that crosses the end is ignored."""
         piece = min(_PIECE_BYTES, end - begin)
         held = bytearray(piece + BEYOND_BYTES)
         data, free = np.frombuffer(held, np.uint8), memoryview(held)[:piece]
@@ -217,14 +217,14 @@ class UlogFile:
     def _resumption(
         self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
     ) -> int:
-        """Find where messages begin again: at a mark, which old firmware lacks, or at rows; or -1."""
+        """Find where messages resume: at a mark, which old firmware lacks, or at rows; or -1."""
         found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
         return min((each for each in found if each >= 0), default=-1)
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
-        """Return where the last message of a piece at `place` ends, if one broke there, and the rows."""
+        """Parse a piece at `place`; return the last message's end, whether one broke, and the rows."""
         found = walk(data, size)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:
@@ -264,7 +264,7 @@ class UlogFile:
     def _count_strays(
         self, which: NDArray[np.int64], data: NDArray[np.uint8], at: NDArray[np.int64]
     ) -> None:
-        """Count the rows that are no topic's: of a number that none has, or that two have."""
+        """Count the rows without a topic: of a number that no topic has, or that two have."""
         begins = at[which] + HEAD_BYTES
         numbers = data[begins].astype(np.int64) + (data[begins + 1].astype(np.int64) << 8)
         is_known = self._known.since[numbers] < _NEVER
@@ -274,16 +274,16 @@ class UlogFile:
     def _times(
         self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """Compute stamps (n,) of rows, of those without one between their neighbours' in the file."""
+        """Compute stamps (n,) of rows; those without one are interpolated between their neighbours."""
         last_us = self._last_us
-        # Of a topic that stands still the stamp may be of long before.
+        # A topic that stands still may have a stamp from long before.
         recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
         known = np.concatenate([[0], stamps[recent] - last_us])
         between = np.interp(at, np.concatenate([[-1], at[recent]]), known)
         return np.where(timed, stamps, last_us + np.rint(between).astype(np.int64))
 
     def _subscribe(self, body: bytes, position: int) -> None:
-        """Take up which topic a number is of."""
+        """Register the topic of a number."""
         if len(body) < 4:
             self.losses["subscriptions that are too short"] += 1
             return
@@ -306,7 +306,7 @@ class UlogFile:
             column[number] = value
 
     def _take(self, kind: str, body: bytes, time_us: int) -> None:
-        """Take up a message of the data that is no row."""
+        """Process a message of the data section that is not a row."""
         try:
             if kind == "P":
                 self.changes.append((time_us, *_parameter(body)))
@@ -364,14 +364,14 @@ def _text(body: bytes) -> str:
 
 
 def _keyed(body: bytes) -> tuple[str, bytes]:
-    """Read type and name of a value, with a blank between them, and its bytes; raises Damaged."""
+    """Split a value's type and name from its bytes; raise Damaged if this fails."""
     if not body or len(body) < 1 + body[0]:
         raise Damaged("value without a name")
     return _text(body[1 : 1 + body[0]]), body[1 + body[0] :]
 
 
 def _parameter(body: bytes) -> tuple[str, float]:
-    """Name and value of a parameter; raises Damaged."""
+    """Read the name and value of a parameter; raise Damaged if this fails."""
     stated, value = _keyed(body)
     kind, _, name = stated.partition(" ")
     number = _number(kind, value) if kind in ("int32_t", "float") and name.isprintable() else None
@@ -381,7 +381,7 @@ def _parameter(body: bytes) -> tuple[str, float]:
 
 
 def _number(kind: str, value: bytes) -> float | None:
-    """Read a number of one of ULog's types; None where there is none."""
+    """Read a number of one of ULog's types; None if this fails."""
     dtype = np.dtype(TYPES[kind]) if kind in TYPES else None
     if dtype is None or len(value) != dtype.itemsize:
         return None

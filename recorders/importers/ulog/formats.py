@@ -1,4 +1,4 @@
-"""Lays out ULog's messages: format definitions, flattened to NumPy's types."""
+"""Layouts of ULog's messages: format definitions, flattened to NumPy's types."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -10,16 +10,16 @@ TYPES = {
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
     "bool": "<i1", "char": "<i1",
 }  # fmt: skip
-# A message's size is 16 bits, two bytes of which are its number.
+# A message's size has 16 bits, and two of its bytes are its number.
 _MOST_BYTES = 0xFFFF - 2
 
 
 class Damaged(Exception):
-    """Says why a definition cannot be used."""
+    """An error for a definition that cannot be used; the text gives the reason."""
 
 
 class FormatField(NamedTuple):
-    """Describes one field of a format: its type, how many of it (0: no array), and its name."""
+    """One field of a format: its type, the length of its array (0: no array), and its name."""
 
     type: str
     length: int
@@ -27,11 +27,11 @@ class FormatField(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Describes how the messages of a topic lie in a file.
+    """The layout of a topic's messages in a file.
 
-    `dtype` has a field for every number, as `q[0]` or `esc[1].rpm`; padding at its end, which a message
-    may lack, is not in it: a message has between `dtype.itemsize` and `most_bytes` bytes. `stamp` is
-    where its stamp begins.
+    `dtype` has a field for every number, such as `q[0]` or `esc[1].rpm`. It excludes padding at the end,
+    which a message may lack: a message has between `dtype.itemsize` and `most_bytes` bytes. `stamp` is
+    the position of its stamp.
     """
 
     dtype: np.dtype
@@ -40,7 +40,7 @@ class Layout(NamedTuple):
 
 
 def parsed(text: str) -> tuple[str, list[FormatField]]:
-    """Return the name and the fields of a format; raises Damaged."""
+    """Parse the name and fields of a format; raise Damaged if this fails."""
     name, colon, rest = text.partition(":")
     if not colon or not name:
         raise Damaged("a format has no name")
@@ -58,7 +58,7 @@ def _field(of: str, text: str) -> FormatField:
 
 
 def layout_of(name: str, formats: Mapping[str, list[FormatField]]) -> Layout:
-    """Return a topic's layout; raises Damaged where its format is unknown, too long or within itself."""
+    """Lay out a topic; raise Damaged if its format is unknown, too long or contains itself."""
     entries: list[tuple[str, str]] = []
     size = 0
     for entry, kind in _flat(name, formats, ()):
@@ -81,13 +81,13 @@ def layout_of(name: str, formats: Mapping[str, list[FormatField]]) -> Layout:
 def _flat(
     name: str, formats: Mapping[str, list[FormatField]], within: tuple[str, ...], prefix: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Yield every number of a format, by name, and its type."""
+    """Yield the name and type of every number in a format."""
     if name in within:
         raise Damaged(f"format {name} refers to itself")
     if name not in formats:
         raise Damaged(f"format {name} is not defined")
     if not formats[name]:
-        raise Damaged(f"format {name} has no fields")  # so that what is nested has an end
+        raise Damaged(f"format {name} has no fields")  # so that nesting ends
     for field in formats[name]:
         named = [f"{field.name}[{index}]" for index in range(field.length)] or [field.name]
         for each in named:

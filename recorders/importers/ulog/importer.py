@@ -1,4 +1,4 @@
-"""Imports ULog: topics become streams, and what is not taken is told."""
+"""Importer of ULog: topics become streams, and notes report what is not imported."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -24,15 +24,15 @@ _PLACED = ("vehicle_local_position", "vehicle_gps_position", "sensor_gps")
 
 
 class UlogParameters(Parameters):
-    """Nothing is chosen: all that can be imported is."""
+    """No parameters: everything that can be imported is."""
 
 
 class _Surroundings(NamedTuple):
-    """Holds what is read of a log beforehand.
+    """What is read from a log in advance.
 
     Attributes:
-        origin: of the filter's plane on the earth; None where the log states none.
-        separation_m: how far the ellipsoid is below the sea; 0 where no receiver tells.
+        origin: origin of the filter's local tangent plane; None if the log does not state it.
+        separation_m: how far the ellipsoid is below the sea; 0 if unknown.
         first: the first instance of every topic.
     """
 
@@ -42,7 +42,7 @@ class _Surroundings(NamedTuple):
 
 
 def _surroundings(path: Path) -> _Surroundings:
-    """Read a log up to where its filter says where it is, and a receiver both of its heights."""
+    """Read a log until its filter has stated its origin, and a receiver both of its heights."""
     place: list[float] | None = None
     separation_m: float | None = None
     file = UlogFile(path)
@@ -72,7 +72,7 @@ def _reference(fields: Fields) -> list[float] | None:
 
 
 class _Import:
-    """Imports one file: makes its streams, block after block, and keeps what is to be told."""
+    """The import of one file, which makes its streams, block by block, and collects the notes."""
 
     def __init__(self, file: UlogFile, around: _Surroundings) -> None:
         self._file, self._around = file, around
@@ -83,7 +83,7 @@ class _Import:
         self._first_ns: int | None = None
 
     def block(self, rows: list) -> list[Stream]:
-        """Return the streams of a block's rows."""
+        """Make the streams of a block's rows."""
         parts: list[Part] = []
         for each in rows:
             if each.untimed:
@@ -101,7 +101,7 @@ class _Import:
         return [stream for part in parts if (stream := self._stream(part)) is not None]
 
     def _named(self, part: Part, rows: Rows) -> Part:
-        """Give what another topic of the file gives under this name as well a name of its own."""
+        """Rename a part if another topic of the file has the same name."""
         source = rows.topic, rows.instance
         is_own = self._sources.setdefault(part.topic, source) == source
         name = part.topic if is_own else f"{part.topic}_{rows.topic}_{rows.instance}"
@@ -133,7 +133,7 @@ class _Import:
         return in_plane(stream, self._around.origin)
 
     def last(self) -> list[Stream]:
-        """Return the streams that are whole only at the end: parameters, and what the logger lost."""
+        """Make the streams that are complete only at the end: parameters, and the logger's losses."""
         file = self._file
         streams = []
         if file.parameters:
@@ -175,7 +175,7 @@ class _Import:
         return self._first_ns or 0
 
     def check(self) -> None:
-        """Raise BadInput where nothing has come of the file."""
+        """Raise BadInput if nothing could be imported."""
         if self._first_ns is None:
             topics = some_of(sorted({topic for topic, _ in self._file.rows})) or "none"
             raise BadInput(
@@ -184,7 +184,7 @@ class _Import:
             )
 
     def notes(self) -> dict[str, str]:
-        """Return what the file had, by subject."""
+        """Write notes on the contents of the file, by subject."""
         file = self._file
         notes = {
             "frames": "north, east, down became east, north, up; forward, right, down became forward, "
@@ -216,10 +216,10 @@ class _Import:
 
 
 def read(path: Path, parameters: UlogParameters) -> Blocks:  # noqa: ARG001
-    """Read a ULog block by block; what is lost, left out or not taken is told in the notes.
+    """Read a ULog block by block; notes report what is lost, left out or not imported.
 
-    The blocks raise BadInput where the file is no ULog, its definitions are damaged, or nothing of it
-    can be imported.
+    Iterating the blocks raises BadInput if the file is not a ULog, its definitions are damaged, or
+    nothing can be imported.
     """
     if path.is_dir():
         raise BadInput(f"{path}: is a folder; give one .ulg file")

@@ -1,4 +1,4 @@
-"""Loops over a ULog's data: where messages begin, which are whose; see `fuselog.recorders.log.loops`."""
+"""Loops over a ULog's data that find and assign messages; see `fuselog.recorders.log.loops`."""
 
 from typing import NamedTuple
 
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 from fuselog.recorders.log.loops import kernel, word
 
 HEAD_BYTES = 3
-# So many rows after one another, whose lengths are those of their topics, are no chance.
+# This many successive rows with the lengths of their topics are not a coincidence.
 CHAIN = 3
-# Beyond the bytes that are walked there have to be so many more, of any value.
+# How many bytes, of any value, must follow the bytes that are walked.
 BEYOND_BYTES = 16
 NUMBERS = 1 << 16
 
 
 class Walk(NamedTuple):
-    """States where the messages of a piece of a file begin, in bytes.
+    """The positions of the messages in a piece of a file, in bytes.
 
-    `data` are those with a topic's numbers, `others` all others. `end` is where the walk stopped, at a
-    message that is not whole, or that can be none if `is_broken`.
+    `data` are messages with a topic's rows, `others` all other messages. `end` is where the walk
+    stopped: at an incomplete message, or at an invalid one if `is_broken`.
     """
 
     data: NDArray[np.int64]
@@ -29,10 +29,10 @@ class Walk(NamedTuple):
 
 
 class Known(NamedTuple):
-    """Holds what is known of each number's topic (NUMBERS,); `since` of a number without one is never.
+    """What is known of each number's topic (NUMBERS,); `since` is "never" for a number without a topic.
 
-    A row has `least` to `most` bytes, begins from the byte `since` on and before the byte `until` of the
-    file, and has its stamp at the byte `stamp`.
+    A row has `least` to `most` bytes, begins in the file at byte `since` or later and before byte
+    `until`, and has its stamp at byte `stamp`.
     """
 
     least: NDArray[np.int64]
@@ -43,12 +43,12 @@ class Known(NamedTuple):
 
 
 class Sorted(NamedTuple):
-    """Holds rows (n,) of a piece, by their number.
+    """The rows (n,) of a piece, sorted by their number.
 
-    `order` has the rows number by number, each in the file's order, and `counts` (NUMBERS + 1,) how many
-    each has; those that are no topic's come last. `stamps` are in us, 0 of what is no topic's;
-    `is_timed` says which are between two times, and `reached` is the latest of these before every row,
-    and at the end. Rows stop before one of a length that is not its format's.
+    `order` has the rows number by number, each in file order, and `counts` (NUMBERS + 1,) their numbers
+    of rows; rows without a topic come last. `stamps` are in us, 0 for rows without a topic; `is_timed`
+    says which are between two times, and `reached` is the latest of these before every row, and at the
+    end. Rows stop before one whose length does not match its format.
     """
 
     order: NDArray[np.int64]
@@ -63,7 +63,7 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
 
     Args:
         data: the piece, and at least `BEYOND_BYTES` more.
-        size: how many bytes the piece has.
+        size: length of the piece in bytes.
     """
     found, others, sizes = (np.empty(count, np.int64) for count in (size // 5 + 1, size // 3 + 1, 3))
     is_broken = kernel(_walk)(data, size, found, others, sizes)
@@ -72,17 +72,17 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
 
 
 def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
-    """Find where rows begin again after bytes that are no messages: several, of lengths that fit.
+    """Find where rows resume after invalid bytes: several in sequence, with matching lengths.
 
     Args:
         data: a piece of the file, and at least `BEYOND_BYTES` more.
-        begin: from which byte of the piece on.
-        size: how many bytes the piece has.
-        place: where the piece begins in the file.
-        known: what rows there are.
+        begin: first byte of the piece to try.
+        size: length of the piece in bytes.
+        place: position of the piece in the file.
+        known: the known topics.
 
     Returns:
-        The byte of the piece; -1 where there is none.
+        The position in the piece; -1 if there is none.
     """
     return kernel(_resume)(data, begin, size, place, known)
 
@@ -98,11 +98,10 @@ def sort(
 
     Args:
         data: the piece, and at least `BEYOND_BYTES` more.
-        at: (n,), where the rows begin, in bytes of the piece, as `Walk.data`.
-        place: where the piece begins in the file.
-        known: what rows there are.
-        times: in us: a stamp lies between the first two, and not at them; the third is the latest so
-            far.
+        at: (n,), positions of the rows in the piece, as in `Walk.data`.
+        place: position of the piece in the file.
+        known: the known topics.
+        times: in us: valid stamps are strictly between the first two; the third is the latest so far.
     """
     whose, stamps = np.empty((2, len(at)), np.int64)
     is_timed = np.empty(len(at), np.bool_)
@@ -114,17 +113,17 @@ def sort(
 
 
 def _length(data: NDArray[np.uint8], position: int) -> int:
-    """Return how many bytes follow the head of the message at a place."""
+    """Return the number of bytes after the head of the message at a position."""
     return word(data, position) & 0xFFFF
 
 
 def _kind(data: NDArray[np.uint8], position: int) -> int:
-    """Return which kind of message is at a place: a letter."""
+    """Return the kind of the message at a position: a letter."""
     return word(data, position) >> 16 & 0xFF
 
 
 def _number(data: NDArray[np.uint8], position: int) -> int:
-    """Return the number that a row at a place has its topic by."""
+    """Return the number of the topic of the row at a position."""
     return word(data, position) >> 24 & 0xFFFF
 
 
@@ -140,7 +139,7 @@ def _examine(
     reached: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> int:
-    """Fill whose the rows are, and their stamps, up to the first of a wrong length; count them."""
+    """Fill in the topics and stamps of rows, up to the first of a wrong length; count them."""
     low, high, latest = times
     for row in range(len(at)):
         position = at[row]
@@ -163,7 +162,7 @@ def _examine(
 
 
 def _sort(whose: NDArray[np.int64], places: NDArray[np.int64], order: NDArray[np.int64]) -> None:
-    """Fill which rows come after one another, number by number; `places` has where each begins."""
+    """Fill in the rows, number by number; `places` has where each number begins."""
     for row in range(len(whose)):
         order[places[whose[row]]] = row
         places[whose[row]] += 1
@@ -176,7 +175,7 @@ def _walk(
     others: NDArray[np.int64],
     sizes: NDArray[np.int64],
 ) -> bool:
-    """Fill where messages begin, their counts and where they end; tell whether the next can be none."""
+    """Fill in where messages begin, their counts and their end; test whether the next is invalid."""
     count, other, position, is_broken = 0, 0, 0, False
     while position + 3 <= size:
         length, kind = _length(data, position), _kind(data, position)

@@ -1,4 +1,4 @@
-"""Reads the topics of sensors: one function for each, which makes parts of their rows."""
+"""Conversion of the topics of sensors, with one function for each topic."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,17 +15,17 @@ Floats = NDArray[np.float64]
 BODY = "/vehicle"
 _GAUSS_UT = 100.0
 _FIELD = ("field_x_ut", "field_y_ut", "field_z_ut")
-# A time that is not known, as PX4 has it in microseconds relative to the stamp.
+# An unknown time relative to the stamp, in microseconds, as in PX4.
 _INVALID_US = 2**31 - 1
-# Heights above the ellipsoid and the sea differ by no more than this.
+# The largest difference between heights above the ellipsoid and above the sea.
 FARTHEST_M = 150.0
 
 
 @dataclass(frozen=True)
 class Part:
-    """Holds messages (n,) of a stream: when they were measured and logged, in us, and their columns.
+    """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
-    Rows where a required number is not finite are left out by whoever makes the stream; `facts` counts
+    The maker of the stream leaves out rows in which a required number is not finite; `facts` counts
     others that are left out or changed.
     """
 
@@ -38,7 +38,7 @@ class Part:
     facts: Mapping[str, int] = field(default_factory=dict)
 
     def take(self, which: NDArray) -> "Part":
-        """Return the messages of some rows."""
+        """Select the messages of some rows."""
         columns = {name: column[which] for name, column in self.columns.items()}
         return replace(
             self, time_us=self.time_us[which], logged_us=self.logged_us[which], columns=columns
@@ -46,10 +46,10 @@ class Part:
 
 
 class Fields(NamedTuple):
-    """Holds the fields of a topic's rows, as numbers.
+    """The fields of a topic's rows, as numbers.
 
-    `is_first` says whether they are of the first of its instances, and `separation_m` how far the
-    ellipsoid is below the sea where the log was recorded; 0 where that is not known.
+    `is_first` says whether the rows belong to the first instance of the topic, and `separation_m` how
+    far the ellipsoid is below the sea at the place of recording; 0 if unknown.
     """
 
     rows: Rows
@@ -57,21 +57,21 @@ class Fields(NamedTuple):
     separation_m: float = 0.0
 
     def named(self, name: str) -> str:
-        """Name a stream of which most logs have one; that of another instance says of which it is."""
+        """Name a stream that most logs have once; the name of another instance contains its number."""
         return name if self.is_first else f"{name}_{self.rows.topic}_{self.rows.instance}"
 
     def has(self, name: str) -> bool:
-        """Tell whether there is such a field."""
+        """Test whether there is such a field."""
         return name in (self.rows.data.dtype.names or ())
 
     def of(self, name: str) -> Floats:
-        """Return a field (n,); NaN where there is none of the name."""
+        """Return a field (n,); NaN if it is missing."""
         if not self.has(name):
             return np.full(len(self.rows.data), np.nan)
         return self.rows.data[name].astype(float)
 
     def vector(self, *names: str, width: int = 0) -> Floats:
-        """Return fields as (n, width): those of these names, or the `width` of an array."""
+        """Return several fields, or the `width` elements of an array, as (n, width)."""
         every = [f"{names[0]}[{index}]" for index in range(width)] if width else names
         return np.stack([self.of(name) for name in every], axis=1)
 
@@ -87,13 +87,13 @@ class Fields(NamedTuple):
     def part(
         self, topic: str, schema: Schema, metadata: Mapping[str, str] | None = None, **columns: Floats
     ) -> Part:
-        """Return all rows as messages of a stream."""
+        """Make messages of a stream from all rows."""
         return Part(
             f"{BODY}/{topic}", schema, self.measured_us, self.rows.time_us, columns, metadata or {}
         )
 
     def values(self, topic: str, components: Mapping[str, str]) -> Part:
-        """Return fields as they are, under names that say their units."""
+        """Make plain numbers from fields, under names with their units."""
         there = {name: of for name, of in components.items() if self.has(of)}
         metadata = {"components": ",".join(there), "kinds": ",".join(["linear"] * len(there))}
         value = self.vector(*there.values())
@@ -101,7 +101,7 @@ class Fields(NamedTuple):
 
 
 def combined(fields: Fields) -> Iterator[Part]:
-    """Yield the inertial unit that the filter uses; of old firmware also magnetometer and barometer."""
+    """Yield the inertial unit that the filter uses; for old firmware also magnetometer and barometer."""
     force = to_flu(fields.vector("accelerometer_m_s2", width=3))
     rate = to_flu(fields.vector("gyro_rad", width=3))
     yield _inertial(fields, fields.named("inertial"), force, rate)
@@ -133,7 +133,7 @@ def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
 
 
 def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
-    """Return a sensor's messages whose time is stated relative to the row's, each of them once."""
+    """Apply a sensor's time, stated relative to the row's, and keep each of its messages once."""
     relative_us = fields.rows.data[f"{sensor}_timestamp_relative"].astype(np.int64)
     is_valid = relative_us != _INVALID_US
     time_us = part.time_us + np.where(is_valid, relative_us, 0)
@@ -143,7 +143,7 @@ def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
 
 
 def unit(fields: Fields) -> Iterator[Part]:
-    """Yield one of several inertial units: what it turned and gained, over how long that took."""
+    """Yield one of several inertial units, from its increments and their time spans."""
     spans = {}
     for of in ("angle", "velocity"):
         span = fields.of(f"delta_{of}_dt")
@@ -156,20 +156,20 @@ def unit(fields: Fields) -> Iterator[Part]:
 
 
 def accelerometer(fields: Fields) -> Iterator[Part]:
-    """Yield one accelerometer as it is, in its own axes."""
+    """Yield one accelerometer without conversion, in its own axes."""
     names = {f"force_{axis}_mps2": axis for axis in "xyz"}
     yield fields.values(f"accelerometer_{fields.rows.instance}", names)
 
 
 def gyro(fields: Fields) -> Iterator[Part]:
-    """Yield one gyro as it is, in its own axes."""
+    """Yield one gyroscope without conversion, in its own axes."""
     yield fields.values(f"gyro_{fields.rows.instance}", {f"rate_{axis}_radps": axis for axis in "xyz"})
 
 
 def magnetometer(fields: Fields) -> Iterator[Part]:
-    """Yield the magnetometer that the filter uses, under a name by which no model takes it unasked.
+    """Yield the magnetometer that the filter uses, under a name that no model reads by default.
 
-    A model needs to be told the field of the place: `--set topics.magnetic_field=/vehicle/magnetometer`.
+    A model has to be told the local field: `--set topics.magnetic_field=/vehicle/magnetometer`.
     """
     field_ut = _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
     yield _magnetic(fields, fields.named("magnetometer"), field_ut)
@@ -182,7 +182,7 @@ def raw_magnetometer(fields: Fields) -> Iterator[Part]:
 
 
 class Heights(NamedTuple):
-    """Holds heights (n,) of fixes above the ellipsoid and above the sea, and where these agree.
+    """Heights (n,) of fixes above the ellipsoid and above the sea, and whether these agree.
 
     Simulators and old drivers leave the height above the ellipsoid empty, or write garbage.
     """
@@ -248,19 +248,19 @@ def air(fields: Fields) -> Iterator[Part]:
 
 
 def barometer(fields: Fields) -> Iterator[Part]:
-    """Yield one barometer; its pressure is in Pa, of old firmware in hPa."""
+    """Yield one barometer; its pressure is in Pa, with old firmware in hPa."""
     names = {"pressure": "pressure", "temperature_degc": "temperature"}
     yield fields.values(f"barometer_{fields.rows.instance}", names)
 
 
 def airspeed(fields: Fields) -> Iterator[Part]:
-    """Yield the speed through the air."""
+    """Yield the airspeed."""
     names = {"indicated_mps": "indicated_airspeed_m_s", "true_mps": "true_airspeed_m_s"}
     yield fields.values(f"airspeed_{fields.rows.instance}", names)
 
 
 def flow(fields: Fields) -> Iterator[Part]:
-    """Yield by what angle about the body's x and y, and in what time, a camera saw the ground move."""
+    """Yield the angles about the body's x and y by which a camera saw the ground move, and the time."""
     old = fields.has("pixel_flow_x_integral")
     x, y = (
         ("pixel_flow_x_integral", "pixel_flow_y_integral") if old else ("pixel_flow[0]", "pixel_flow[1]")

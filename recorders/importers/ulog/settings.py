@@ -1,19 +1,19 @@
-"""Says what parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing."""
+"""Meaning of the parameters of PX4's EKF2 for the model `inertial`, and why others have none."""
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
-# EKF2's noise is the density over the root of its step: its variance is (step x noise)^2 in a step.
+# EKF2's noise is a density divided by the root of its step: its variance in a step is (step x noise)^2.
 _DENSITIES = {
     "EKF2_GYR_NOISE": "gyro_noise_density",
     "EKF2_ACC_NOISE": "force_noise_density",
     "EKF2_GYR_B_NOISE": "gyro_bias_density",
     "EKF2_ACC_B_NOISE": "force_bias_density",
 }
-_NAMED = 3  # of the parameters that share a reason; /vehicle/parameters has all
+_NAMED = 3  # names listed for parameters that share a reason; /vehicle/parameters has all
 _STEP_US = "EKF2_PREDICT_US"
 _DEFAULT_STEP_US = 10_000
-# By parameter, settings and what a unit of it is in theirs.
+# For each parameter, our settings and the factor to their unit.
 _SETTINGS = {
     "EKF2_GPS_DELAY": (("fix_delay_s", "velocity_delay_s"), 1e-3),
     "EKF2_ABIAS_INIT": (("force_bias_sigma_mps2",), 1.0),
@@ -21,7 +21,7 @@ _SETTINGS = {
     "EKF2_ANGERR_INIT": (("tilt_sigma_rad",), 1.0),
 }
 _LEVERS = {"X": ("lever_x_m", 1.0), "Y": ("lever_y_m", -1.0), "Z": ("lever_z_m", -1.0)}
-# Why parameters do not carry over, by their names; the first that fits counts.
+# Reasons why parameters do not carry over, by their names; the first pattern that matches counts.
 _REASONS = {
     "CAL_*": "had their effect before sensor_combined and vehicle_imu were logged; accelerometer_N, "
     "gyro_N and magnetometer_N are as they were before",
@@ -33,7 +33,7 @@ _REASONS = {
 
 
 def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
-    """Return what channels state of their noise, by the last part of their topics."""
+    """Return the noise densities that channels state, by the last part of their topics."""
     root_s = (1e-6 * parameters.get(_STEP_US, _DEFAULT_STEP_US)) ** 0.5
     stated = {
         ours: f"{parameters[name] * root_s:.6g}"
@@ -44,7 +44,7 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """Return what becomes of parameters, by subject: numbers of channels, settings, or why nothing."""
+    """Describe what becomes of parameters, by subject: metadata, settings, or why they are not used."""
     notes = {}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:

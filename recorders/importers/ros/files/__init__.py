@@ -1,1 +1,1 @@
-"""Reads the files of ROS bags record by record: bag, db3 and MCAP; begin with `bags`."""
+"""Readers of the files of ROS bags, record by record: bag, db3 and MCAP; begin with `bags`."""

@@ -1,4 +1,4 @@
-"""Finds the files of a bag: one, or those of a folder, split and compressed as ROS does it."""
+"""Search for the files of a bag: one, or those of a folder, split and compressed as in ROS."""
 
 import re
 from collections import Counter
@@ -22,10 +22,10 @@ _MAGIC = zstandard.FRAME_HEADER
 
 @dataclass
 class Bag:
-    """Holds the files of one bag, in the order of their splits, and what is known to be missing.
+    """The files of one bag, in the order of their splits, and what is known to be missing.
 
-    `stated` is how many messages metadata.yaml says that each topic has; `is_packed` says that every
-    message is compressed by itself.
+    `stated` has the number of messages of each topic according to metadata.yaml; `is_packed` says that
+    every message is compressed separately.
     """
 
     path: Path
@@ -47,18 +47,18 @@ class Bag:
 
     @property
     def others(self) -> list[str]:
-        """Return what is in all files beside messages."""
+        """Return the contents of all files other than messages."""
         return [each for file in self.files for each in file.others]
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, a sentence each; whole after the reading."""
+        """Return what cannot be read, a sentence each; complete after reading."""
         found = [*self.missing, *(loss for file in self.files for loss in file.losses)]
-        return list(dict.fromkeys(found))  # what is read twice is told twice
+        return list(dict.fromkeys(found))  # a part that is read twice is reported twice
 
 
 def looks_like_bag(path: Path) -> bool:
-    """Tell whether a path is named as a bag that is no MCAP file: a folder of one, a .bag or a .db3."""
+    """Test whether a path is named like a bag that is not MCAP: a folder of one, a .bag or a .db3."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_members(path, {}))
     return path.suffix in (".bag", ".db3")
@@ -66,9 +66,9 @@ def looks_like_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag; raises BadInput where there is none, or nothing of it can be read.
+    """Open a bag; raise BadInput if there is none, or none of its files can be read.
 
-    Files that are compressed as a whole lie uncompressed in a scratch folder meanwhile.
+    Files that are compressed as a whole are decompressed to a temporary folder.
     """
     about = _metadata(path) if path.is_dir() else {}
     paths = _members(path, about) if path.is_dir() else [path]
@@ -116,13 +116,13 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
 
 
 def _looks_packed(batch: Batch) -> bool:
-    """Tell whether messages are compressed though no metadata.yaml says so: no CDR begins like that."""
+    """Test whether messages are compressed although no metadata.yaml says so: CDR never begins so."""
     begin = int(batch.begins[0]) if len(batch.begins) else len(batch.data)
     return batch.connection.encoding == "cdr" and batch.data[begin : begin + 4].tobytes() == _MAGIC
 
 
 def _unpacked(batch: Batch) -> Batch:
-    """Uncompress messages; one that cannot be is empty."""
+    """Decompress messages; those that cannot be decompressed become empty."""
     parts = []
     for begin, length in zip(batch.begins.tolist(), batch.lengths.tolist(), strict=True):
         try:
@@ -133,11 +133,11 @@ def _unpacked(batch: Batch) -> Batch:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """Read metadata.yaml of a bag of ROS 2; nothing where there is none."""
+    """Read metadata.yaml of a ROS 2 bag; an empty dict if it is missing."""
     place = folder / "metadata.yaml"
     if not place.exists():
         return {}
-    from ruamel.yaml import YAML  # which takes long to import
+    from ruamel.yaml import YAML  # slow to import
     from ruamel.yaml.error import YAMLError
 
     try:
@@ -151,7 +151,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _members(folder: Path, about: dict[str, Any]) -> list[Path]:
-    """List the files of a folder, as its metadata does, else by their names, numbers in order."""
+    """List the files of a folder, from its metadata or sorted by their names and numbers."""
     stated = [folder / PurePath(str(name)).name for name in about.get("relative_file_paths") or []]
     if stated:
         return stated

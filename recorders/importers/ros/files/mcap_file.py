@@ -1,4 +1,4 @@
-"""Reads MCAP files of ROS by the log's own container, a chunk at a time."""
+"""Reader of MCAP files from ROS, based on the log's container, a chunk at a time."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -15,12 +15,12 @@ from fuselog.recorders.log.container.reading import Region, open_container, read
 from fuselog.recorders.log.loops import HEAD_BYTES, MESSAGE_HEAD_BYTES
 from fuselog.recorders.log.opening import Log
 
-# Where in a message's record the recorder's stamp is.
+# Offset of the recorder's stamp in a message's record.
 _LOG_TIME = HEAD_BYTES + 6
 
 
 class McapFile:
-    """Reads an MCAP file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """An MCAP file; see `BagFile`. Raises BadInput if the file is not MCAP, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -73,7 +73,7 @@ class McapFile:
 
 
 def _opened(path: Path, read: tuple[Region, bytes]) -> Contents | str:
-    """Open a region, or say why it cannot be read."""
+    """Open a region; return the reason if it cannot be read."""
     region, raw = read
     try:
         return open_region(raw, region.offset)

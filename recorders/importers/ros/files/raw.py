@@ -1,4 +1,4 @@
-"""Holds messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
+"""Messages as bytes with the stamps of the recorder, as files of a bag hold them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,9 +20,9 @@ UNDEFINED = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 class Connection(NamedTuple):
-    """Describes one publisher's topic in a file; its type is named as in ROS 2: `nav_msgs/msg/Odometry`.
+    """A topic of one publisher in a file; its type is named as in ROS 2: `nav_msgs/msg/Odometry`.
 
-    `encoding` is cdr or ros1 where the messages can be read.
+    `encoding` is cdr or ros1 if the messages can be read.
     """
 
     topic: str
@@ -33,7 +33,7 @@ class Connection(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Holds some messages (n,) of a connection, in file order: their place in `data`, and stamps."""
+    """Some messages (n,) of a connection, in file order: their positions in `data`, and stamps."""
 
     connection: Connection
     data: NDArray[np.uint8]
@@ -43,9 +43,9 @@ class Batch(NamedTuple):
 
 
 class BagFile(Protocol):
-    """Reads one file of a bag.
+    """A reader of one file of a bag.
 
-    `losses` is whole after the reading. `others` names what is in the file beside messages.
+    `losses` is complete after reading. `others` names the contents of the file other than messages.
     """
 
     path: Path
@@ -54,19 +54,19 @@ class BagFile(Protocol):
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, a sentence each."""
+        """Return what cannot be read, with a sentence for each loss."""
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """Return the messages of the wanted connections, a chunk of the file at a time."""
+        """Yield the messages of the wanted connections, a chunk of the file at a time."""
 
 
 def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[np.int64]) -> Batch:
-    """Lay messages that are apart in memory end to end.
+    """Join messages from separate buffers into one batch.
 
     Args:
-        connection: the publisher.
+        connection: the publisher's topic.
         parts: n messages.
-        log_time_ns: (n,), the stamps of the recorder.
+        log_time_ns: (n,), stamps of the recorder, in ns.
     """
     lengths = np.array([len(part) for part in parts], np.int64)
     data = np.frombuffer(b"".join(parts), np.uint8)
@@ -74,14 +74,14 @@ def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[
 
 
 def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDArray:
-    """Read numbers of one type out of bytes.
+    """Read numbers of one type from bytes.
 
     Args:
         data: the bytes.
-        places: (n,), at which byte each number begins.
-        dtype: their type, such as "<i8".
+        places: (n,), position of each number in bytes.
+        dtype: type of the numbers, such as "<i8".
 
     Returns:
-        (n,).
+        The numbers (n,).
     """
     return windows(data, np.dtype(dtype).itemsize)[places].view(dtype)

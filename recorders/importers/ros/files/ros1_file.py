@@ -1,4 +1,4 @@
-"""Reads the bags of ROS 1 (.bag) record by record: an index is of use, and not needed.
+"""Reader of the bags of ROS 1 (.bag), record by record; it uses the index but does not need it.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """
@@ -33,7 +33,7 @@ _DECOMPRESS: dict[bytes, Callable[[bytes], bytes]] = {
 
 
 class _Record(NamedTuple):
-    """Holds a record of the file: its header, and where its data is."""
+    """A record of the file: its header, and the position of its data."""
 
     header: dict[str, bytes]
     begin: int
@@ -41,14 +41,14 @@ class _Record(NamedTuple):
 
     @property
     def kind(self) -> int:
-        """Return what it is; 0 where it does not say."""
+        """Return the kind of record; 0 if it is not stated."""
         return int.from_bytes(self.header.get("op", b""), "little")
 
 
 class _Scanned(NamedTuple):
-    """Holds the records of a chunk (n,): what they are, which connection's, when, where their data is.
+    """The records of a chunk (n,): kinds, connections, stamps, and positions of headers and data.
 
-    `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
+    `end` is where the walk stopped: the chunk's length, or the first incomplete record.
     """
 
     kinds: NDArray[np.int64]
@@ -61,7 +61,7 @@ class _Scanned(NamedTuple):
 
 
 class Ros1File:
-    """Reads a .bag file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """A .bag file; see `BagFile`. Raises BadInput if it is not one, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -82,7 +82,7 @@ class Ros1File:
         self.connections = list(self._by_id.values())
 
     def _index(self, file: BinaryIO) -> None:
-        """Find the chunks, and the connections behind them; where these are missing, in the chunks."""
+        """Find the chunks, and the connections after them; if these are missing, in the chunks."""
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadInput(
                 f"{self.path}: is not a bag of ROS 1 in format 2.0; convert an older one with rosbag fix"
@@ -110,7 +110,7 @@ class Ros1File:
             elif record.kind == _CHUNK_INFO:
                 for number, count in np.frombuffer(_read(file, record), _COUNT).tolist():
                     self._counts[number] += count
-        if self._chunks and (self.losses or not has_index):  # an index that was cut off lacks some
+        if self._chunks and (self.losses or not has_index):  # a truncated index is incomplete
             if not self.losses:
                 self.losses.append(f"{self.path}: was not closed; it has no index, and is read without")
             self._counts.clear()
@@ -173,7 +173,7 @@ class Ros1File:
 
 
 def _record_at(file: BinaryIO, position: int, size: int) -> _Record | None:
-    """Read the record at a place, whose data may be cut off; None where its header is not whole."""
+    """Read the record at a position, whose data may be truncated; None if its header is incomplete."""
     file.seek(position)
     head = file.read(_LENGTH.size)
     length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else size
@@ -191,7 +191,7 @@ def _read(file: BinaryIO, record: _Record) -> bytes:
 
 
 def _fields(raw: bytes) -> dict[str, bytes]:
-    """Read the fields of a header by name, as far as they are whole."""
+    """Read the complete fields of a header by name."""
     found, position = {}, 0
     while position + _LENGTH.size <= len(raw):
         end = position + _LENGTH.size + _LENGTH.unpack_from(raw, position)[0]
@@ -204,7 +204,7 @@ def _fields(raw: bytes) -> dict[str, bytes]:
 
 
 def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] | str:
-    """Open a chunk's records, or say why they cannot be read."""
+    """Open a chunk's records; return the reason if they cannot be read."""
     record, raw = read
     compression = record.header.get("compression", b"")
     if compression not in _DECOMPRESS:
@@ -220,7 +220,7 @@ def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] |
 
 
 def _number(data: NDArray[np.uint8], place: int) -> int:
-    """Return the number that four bytes from a place on are, the lowest first."""
+    """Read the little-endian number in the four bytes at a position."""
     part, number = data[place : place + 4], 0
     for k in (3, 2, 1, 0):
         number = number << 8 | int(part[k])
@@ -237,7 +237,7 @@ def _scan(
     lengths: NDArray[np.int64],
     ends: NDArray[np.int64],
 ) -> int:
-    """Fill what the records of a chunk are, and where they end; count them."""
+    """Fill in the kinds and positions of the records of a chunk; count them."""
     size, count, position = len(data), 0, 0
     while position + 4 <= size:
         begin = position + 4

@@ -1,6 +1,6 @@
-"""Reads the sqlite3 files of ROS 2 (.db3) so that nothing beside them is made or changed.
+"""Reader of the sqlite3 files of ROS 2 (.db3) that creates or changes no files next to them.
 
-Source: rosbag2_storage_sqlite3; definitions of the types are in it since version 4 of its tables.
+Source: rosbag2_storage_sqlite3; definitions of types are included since version 4 of its tables.
 """
 
 import os
@@ -25,7 +25,7 @@ _Row = tuple[int, int, bytes]
 
 
 class SqliteFile:
-    """Reads a .db3 file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """A .db3 file; see `BagFile`. Raises BadInput if it is not one, or cannot be read."""
 
     def __init__(self, path: Path, scratch: Path) -> None:
         self.path = path
@@ -57,25 +57,25 @@ class SqliteFile:
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, a sentence each."""
+        """Return what cannot be read, with a sentence for each loss."""
         return [f"{self.path}: {loss}" for loss in self._losses.values()]
 
     def _open(self) -> sqlite3.Connection:
         database = sqlite3.connect(f"{self._place.resolve().as_uri()}?immutable=1", uri=True)
-        # nothing is written; but without this, a file that was cut off is refused as a whole
+        # nothing is written; but without this, SQLite rejects a truncated file as a whole
         database.execute("PRAGMA writable_schema = ON")
         return database
 
     def _counts(self, database: sqlite3.Connection) -> Counter[int]:
-        """Count the messages that each topic has, of a damaged file those that can be read."""
+        """Count the messages of each topic; in a damaged file, those that can be read."""
         try:
             return Counter(dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY 1")))
         except sqlite3.DatabaseError:
             return Counter(row[0] for row in self._rows(database, "NULL"))
 
     def _mend(self, error: sqlite3.Error) -> str:
-        """Name what may get back more of a damaged file."""
-        # Python's own errors, as of a text that is not UTF-8, have no code
+        """Name a command that may recover more of a damaged file."""
+        # Python's own errors, for example on a text that is not UTF-8, have no code
         if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_CORRUPT:
             return ""
         command = f"sqlite3 {quote(str(self.path))} .recover | sqlite3 whole.db3"
@@ -93,7 +93,7 @@ class SqliteFile:
                     yield joined(self._by_id[number], [row[2] for row in own], stamps_ns)
 
     def _messages(self, database: sqlite3.Connection, chosen: Sequence[int]) -> Iterator[_Row]:
-        """Yield the messages of some topics; rows that are no messages are counted."""
+        """Yield the messages of some topics; count rows that are not messages."""
         strange = 0
         where = f"WHERE topic_id IN ({','.join('?' * len(chosen))})"
         for row in self._rows(database, "data", where, chosen):
@@ -121,11 +121,11 @@ class SqliteFile:
 
 
 def _whole_pages(path: Path, scratch: Path) -> Path:
-    """Return a database without a last page that was cut off: SQLite takes what is missing for zeros."""
+    """Return a database without a truncated last page, which SQLite would fill with zeros."""
     with path.open("rb") as file:
         page_bytes = int.from_bytes(file.read(18)[16:], "big")
     size = path.stat().st_size
-    # 1 is written for 65536; what is neither is no database
+    # 1 stands for 65536; a file with another invalid size is not a database
     partial = size % (65536 if page_bytes == 1 else page_bytes or 1)
     if not partial:
         return path
@@ -136,7 +136,7 @@ def _whole_pages(path: Path, scratch: Path) -> Path:
 
 
 def _connections(database: sqlite3.Connection) -> Iterator[tuple[int, Connection]]:
-    """Yield the topics by their numbers, with the definitions of their types where the file has them."""
+    """Yield the topics by their numbers, with the definitions of their types if the file has them."""
     definitions = {}
     if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
         stated = database.execute(

@@ -87,7 +87,7 @@ def test_filters_that_know_different_axes_are_fused_to_what_each_knows():
 def test_a_folder_without_paths_is_refused(tmp_path: Path):
     name, experiment = load_experiment("quad-inertial", {}, {})
     with pytest.raises(
-        BadInput, match=r"neither it nor a folder in it has the files .* \(GT.csv, IMU_{unit}.csv\)"
+        BadInput, match=r"neither this folder nor one in it has .* \(GT.csv, IMU_{unit}.csv\)"
     ):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
 
