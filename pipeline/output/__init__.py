@@ -1,6 +1,6 @@
-"""Writes what commands leave: files, result folders, tables, charts, reports.
+"""Files, result folders, tables, charts and reports that commands write.
 
 Begin with `results`.
 """
 
-RESULT_FILE = "result.json"  # says what a result folder is
+RESULT_FILE = "result.json"  # marks a folder as a result folder

@@ -1,8 +1,8 @@
-"""Finds what makes a replay's numbers doubtful, the worst first: a sentence each, and what to do.
+"""Warnings about a replay's numbers, the worst first: one sentence each, and what to do.
 
-A filter whose covariances are right leaves NIS, NEES and the share that its gate keeps out within
-limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error that stays. What it says of
-the filter is decided by `fuselog.replay.judging.verdicts.Squares`.
+For a filter with correct covariances, NIS, NEES and the share of rejected measurements are within their
+limits in 999 of 1,000 logs. A value outside gives a warning, and so does a constant error. What the
+value means for the filter is decided by `fuselog.replay.judging.verdicts.Squares`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,9 +26,9 @@ from fuselog.replay.judging.verdicts import MATERIAL, Consistency, Squares
 if TYPE_CHECKING:
     import pandas as pd
 
-USUAL_GATE = 0.99  # where it is not known
-RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
-LARGEST = 1e300  # as JSON has no infinity
+USUAL_GATE = 0.99  # if it is unknown
+RARE = 0.01  # share of rejected measurements that serves as the unit of excess
+LARGEST = 1e300  # replaces infinity, which JSON does not have
 NIS = "nis_per_component"
 OF_DIVERGENCE = "it diverged, or its covariances are of another unit"
 REASONS = {
@@ -36,11 +36,11 @@ REASONS = {
     Consistency.CONSERVATIVE: "its covariances are too large",
     Consistency.CONSISTENT: f"its covariances are off by less than {MATERIAL:.0%}".replace("%", " %"),
 }
-UNUSED = 0.05  # of a topic's messages
+UNUSED = 0.05  # share of a topic's messages
 
 
 class _Range(NamedTuple):
-    """Holds NIS or NEES that is beyond the limits within which a consistent filter has it."""
+    """NIS or NEES outside the limits of a consistent filter."""
 
     of: Squares
     low: float
@@ -48,32 +48,32 @@ class _Range(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Return how many times it is beyond a limit."""
+        """Return the factor by which the value exceeds its limit."""
         value = self.of.found.value
         beyond = value / self.high if value > self.high else self.low / max(value, 1e-9)
         return min(beyond, LARGEST)
 
     @property
     def fact(self) -> str:
-        """Return the number and its limits."""
+        """Return the value and its limits as a phrase."""
         limits = f"where a consistent filter is within {self.low:.3g} and {self.high:.3g}"
         return f"is {self.of.found.value:.3g}{' per component' * (self.of.name == NIS)}, {limits}"
 
     @property
     def reason(self) -> str:
-        """Return what it says of the estimator."""
+        """Return what the value means for the estimator."""
         return OF_DIVERGENCE if self.of.has_diverged else REASONS[self.of.verdict]
 
 
 def alarms_of(
     judge: Judge, parameters: Mapping[str, Mapping[str, Any]], coverage: Sequence[Row] = ()
 ) -> list[Finding]:
-    """Return the alarms of a judged replay, the worst first.
+    """Find the warnings of a judged replay, the worst first.
 
     Args:
         judge: of all runs.
-        parameters: of the estimators by label, as far as they are known.
-        coverage: what became of the measurements.
+        parameters: of the estimators by label, if known.
+        coverage: how many measurements of each topic were used.
     """
     uninformed = [*_of_components(judge)]
     explained = {(each.where, each.part) for each in uninformed}
@@ -98,7 +98,7 @@ def alarms_of(
 
 
 def _of_components(judge: Judge) -> Iterator[Finding]:
-    """Find components that an estimator cannot estimate, for no measurement informs it of them."""
+    """Find components about which no measurement informs an estimator."""
     for (estimator, case), names in judge.uninformed.items():
         them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
         words = (
@@ -110,7 +110,7 @@ def _of_components(judge: Judge) -> Iterator[Finding]:
 
 
 def _beyond(judge: Judge, quantity: str) -> dict[tuple[str, str], _Range]:
-    """Return NIS or NEES of estimators and cases where it is beyond its limits."""
+    """Find NIS or NEES outside its limits, by estimator and case."""
     metrics, found = judge.metrics, dict[tuple[str, str], _Range]()
     for key, (low, high) in judge.intervals(CONSISTENT).items():
         estimator, own, case = split_metric(key)
@@ -125,9 +125,9 @@ def _of_innovations(
     nis: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
 ) -> Iterator[Finding]:
-    """Find a gate that keeps out too much, and NIS that is beyond its interval.
+    """Find gates that reject too much, and NIS outside its interval.
 
-    With the NEES of those that diverged: what one of the two says holds of the other.
+    The NEES of a diverged estimator is reported together with its NIS.
     """
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
@@ -136,7 +136,7 @@ def _of_innovations(
         facts, excess = [], 1.0
         gated = sums.messages - sums.accepted
         expected = (1.0 - gate) * sums.messages
-        # a count of rare things has Poisson's distribution, whose tail is chi-square's
+        # a count of rare events is Poisson distributed; its tail is a chi-square tail
         if gated and chi2.sf(2.0 * expected, 2 * gated) > CONSISTENT:
             share = gated / sums.messages
             excess = max(1.0, gated / max(expected, RARE * sums.messages))
@@ -163,7 +163,7 @@ def _of_errors(
     nees: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
 ) -> Iterator[Finding]:
-    """Find NEES beyond its interval, if none diverged; of positions whose error stays, that."""
+    """Find NEES outside its interval if the estimator did not diverge, or a constant position error."""
     constants, positions = judge.constants, _beyond(judge, "position_nees")
     for topic in judge.judged:
         what = estimator, case = split_topic(topic)
@@ -195,7 +195,7 @@ def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
 
 
 def dominating_run(nees: "pd.Series[float]") -> str:
-    """Say which run has more of the mean NEES than all others together; empty if none has."""
+    """Describe the run that contributes more to the mean NEES than all others; empty if none does."""
     values = np.asarray(nees, np.float64)
     place = dominating(values)
     if place is None:
@@ -205,7 +205,7 @@ def dominating_run(nees: "pd.Series[float]") -> str:
 
 
 def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
-    """Describe an error that stays."""
+    """Describe a constant error, in the axes of the body or of the plane."""
     offset = ", ".join(f"{each:.3g}" for each in constant.offset_m)
     name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
     words = f"{name}: {_percent(constant.share)} of the squared error is constant, "
@@ -222,7 +222,7 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
 
 
 def _of_costs(judge: Judge) -> Iterator[Finding]:
-    """Find searches of a trajectory that ended at more than their residuals leave."""
+    """Find trajectory searches that ended at a higher cost than their residuals explain."""
     metrics = judge.metrics
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
@@ -233,7 +233,7 @@ def _of_costs(judge: Judge) -> Iterator[Finding]:
             continue
         _, high = chi_square_interval(numbers, 1, CONSISTENT)
         high *= 0.5 / judge.runs
-        if cost > high * max(1.0, sums.squared / sums.degrees):  # noise that is too small raises both
+        if cost > high * max(1.0, sums.squared / sums.degrees):  # understated noise raises both
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
                 f"{numbers / judge.runs:.4g} measured numbers leave up to {high:.4g}: a minimum that is "
@@ -244,7 +244,7 @@ def _of_costs(judge: Judge) -> Iterator[Finding]:
 
 
 def _of_digits(judge: Judge) -> Iterator[Finding]:
-    """Find covariances, of estimates or innovations, of which rounding left next to nothing."""
+    """Find covariances of estimates or innovations that rounding has made almost singular."""
     for topic, found in judge.conditioning.items():
         if not found.lost:
             continue
@@ -268,7 +268,7 @@ def _of_digits(judge: Judge) -> Iterator[Finding]:
 
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
-    """Find measurements that came to nothing for a reason; what a tracker leaves over has none."""
+    """Find measurements that were not used for a reason; a tracker's unassociated ones have none."""
     measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
         is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
@@ -280,7 +280,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find estimators with different gates, where one kept something out: they are judged unlike."""
+    """Find estimators with different gates, if one rejected a measurement; they are not comparable."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

@@ -1,6 +1,6 @@
-"""Defines what results store of doubts about their numbers: alarms, causes, verdicts of stress.
+"""Types in which results store doubts about their numbers: warnings, causes, stress verdicts.
 
-`fuselog.pipeline.output.alarming` finds alarms, `fuselog run --diagnose` causes, and `--stress` its
+`fuselog.pipeline.output.alarming` finds warnings, `fuselog run --diagnose` causes, and `--stress` its
 verdicts.
 """
 
@@ -14,7 +14,7 @@ from fuselog.recorders.checks.finding import Finding
 
 
 def as_alarm(found: Finding) -> dict[str, Any]:
-    """Return a finding about a judged replay as results and `--json` have it, an alarm."""
+    """Convert a finding about a judged replay to the form of results and `--json`."""
     return {
         "kind": found.kind,
         "estimator": found.where,
@@ -25,7 +25,7 @@ def as_alarm(found: Finding) -> dict[str, Any]:
 
 
 def _of_alarm(value: Any) -> Any:
-    """Return the fields of a finding for those of an alarm."""
+    """Rename the fields of a stored warning to those of a finding."""
     if not isinstance(value, dict):
         return value
     names = {"estimator": "where", "case": "part", "excess": "value", "words": "evidence"}
@@ -37,14 +37,14 @@ Alarm = Annotated[Finding, BeforeValidator(_of_alarm), PlainSerializer(as_alarm)
 
 @dataclass(frozen=True)
 class Cause:
-    """Says why an estimator is likeliest inconsistent, as a diagnosis found it.
+    """The likeliest reason why an estimator is inconsistent, from a diagnosis.
 
     Attributes:
-        estimator: whose.
+        estimator: the estimator's label.
         words: the sentence.
         short: the same in a few words, for the report's first sentence.
-        setting: what undoes it, as `--set` has it; empty where none does.
-        mended: what came of the same runs with that; empty where they were not replayed.
+        setting: the `--set` value that corrects it; empty if none does.
+        mended: the outcome of the same runs with that setting; empty if they were not replayed.
     """
 
     estimator: str
@@ -60,14 +60,14 @@ NOT_TESTED = "not stress-tested: --stress says whether changes that should not m
 
 @dataclass(frozen=True)
 class Stressing:
-    """States what changes that should not matter do to an estimator, over all runs.
+    """The effect on an estimator of changes that should not matter, over all runs.
 
     Attributes:
-        estimator: whose.
-        verdict: the worst that more than one of a hundred runs have.
-        words: the verdict with its numbers, then what explains it.
-        moved: how far a change moves the mean of a metric over the runs at most, by `quantity.case`, and
-            by `quantity` over all cases.
+        estimator: the estimator's label.
+        verdict: the worst verdict that more than one in a hundred runs have.
+        words: the verdict with its numbers, then an explanation.
+        moved: the largest change of a metric's mean over the runs, by `quantity.case`, and by
+            `quantity` over all cases.
     """
 
     estimator: str

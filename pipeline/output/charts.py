@@ -1,7 +1,7 @@
-"""Describes charts once: figures made of series over axes.
+"""Charts as data: panels of series and bands over axes.
 
-A study says what there is to see: series, bands, labels with their units. The result folder keeps that
-as JSON, beside the SVG picture that is drawn of it here; the report draws it for a person to zoom.
+A study describes what to draw: series, bands, labels with units. The result folder keeps the description
+as JSON next to an SVG picture that is drawn here; the report draws it as an interactive chart.
 """
 
 import math
@@ -20,39 +20,39 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# A person sees no more points of a line than these.
+# More points of a line than this are not visible.
 MOST_POINTS = 1000
-LINE_LETTERS = 100  # of a picture's title
-# Each stands out from white and from black, by 3 to 1 at least (WCAG 2.2, 1.4.11), and from the others.
+LINE_LETTERS = 100  # characters in a line of a picture's title
+# Contrast with white and black is at least 3:1 (WCAG 2.2, 1.4.11); the colours differ clearly.
 COLOURS = (
     *("#2f7fd1", "#d2640a", "#2a9147", "#d8433b", "#9461d6"),
     *("#138f97", "#d0459a", "#9c6b3f", "#878a12", "#5f78a8"),
 )
 REFERENCE_COLOUR = "#808080"
 OUTSIDE_COLOUR = "#d6336c"
-LARGEST = 1e100  # that is drawn
+LARGEST = 1e100  # largest value that is drawn
 
 
 def _on_an_axis(value: Any) -> Any:
-    """Leave out what no axis shows: infinite, NaN, or as large as only a filter that diverged says."""
+    """Drop values that no axis can show: infinite, NaN, or huge because a filter diverged."""
     return value if not isinstance(value, float) or abs(value) < LARGEST else None
 
 
 Number = Annotated[float | None, BeforeValidator(_on_an_axis)]
 Numbers = list[Number]
 Places = list[Number] | list[str]
-# Triangles are landmarks, an area is closed, what is outside is red.
+# Triangles mark landmarks, an area is a closed polygon, "outside" is drawn in red.
 Style = Literal["line", "dashed", "markers", "dots", "line+markers", "triangles", "area", "outside"]
 
 
 class Axis(Parameters):
-    """Describes an axis.
+    """An axis of a panel.
 
     Attributes:
-        label: what it shows, with its unit.
-        log: whether it is logarithmic.
+        label: the quantity, with its unit.
+        log: whether the axis is logarithmic.
         limits: its ends; by default those of the data.
-        ticks: texts by place, where it has its own.
+        ticks: texts by position, if the axis has its own ticks.
     """
 
     label: str = ""
@@ -67,10 +67,10 @@ class Axis(Parameters):
 
 
 class Drawn(Parameters):
-    """Holds what is drawn over x, numbers or names.
+    """Something drawn over x, which holds numbers or names.
 
-    What has one label has one colour in all panels, and is hidden together. A reference is what the
-    others are seen against, such as the truth.
+    Everything with the same label has the same colour in all panels, and is hidden together. A
+    reference, such as the truth, is drawn for comparison with the others.
     """
 
     label: str
@@ -79,7 +79,7 @@ class Drawn(Parameters):
 
 
 class Series(Drawn):
-    """Holds values y over x."""
+    """Values y over x."""
 
     y: Numbers
     style: Style = "line"
@@ -91,7 +91,7 @@ class Series(Drawn):
 
 
 class Band(Drawn):
-    """Holds a range over x, such as where a value lies with 95 % if all is well."""
+    """A range over x, such as the 95 % range of a value if the estimator is consistent."""
 
     low: Numbers
     high: Numbers
@@ -108,14 +108,14 @@ def _check_lengths(*columns: Sequence[Any]) -> None:
 
 
 class Panel(Parameters):
-    """Draws series and bands over two axes; a `plane` has one scale on both.
+    """Series and bands over two axes.
 
     Attributes:
         x, y: the axes.
         series: curves over them.
         bands: ranges over x.
-        title: above it.
-        plane: whether both axes have one scale.
+        title: the text above the panel.
+        plane: whether both axes have the same scale.
     """
 
     x: Axis = Axis()
@@ -127,13 +127,13 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Arranges panels in rows, with one legend unless their titles say what is drawn.
+    """Panels in rows, with a common legend unless their titles identify the curves.
 
     Attributes:
         panels: row by row.
-        title: above all of them.
-        columns: how many panels stand in a row.
-        legend: whether there is one.
+        title: the text above all panels.
+        columns: the number of panels in a row.
+        legend: whether there is a legend.
     """
 
     panels: list[Panel]
@@ -142,7 +142,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Return the colour of every label; charts with the same labels `first` agree on theirs."""
+        """Assign a colour to every label; charts with the same `first` labels give these the same."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -160,14 +160,14 @@ def _has_own_colour(drawn: Drawn) -> bool:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> slice:
-    """Return every k-th of so many points: by default no more of them than a person sees in a line."""
+    """Return a slice that keeps every k-th of `count` points, so that at most `most` remain."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def curve(
     label: str, x: ArrayLike, y: ArrayLike, style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """Return a series of numbers y over x, numbers or names.
+    """Make a series of values y over x.
 
     Args:
         label: its name in the legend.
@@ -183,14 +183,14 @@ def curve(
 
 
 def curves(table: "pd.DataFrame", by: list[str], x: str, y: str, style: Style = "line") -> list[Series]:
-    """Return a series of y over x for each group of a table's rows, in order.
+    """Make a series of y over x for each group of a table's rows, in order.
 
     Args:
         table: with these columns.
         by: the columns that group the rows and name the series.
         x: a column of numbers or names.
         y: a column of numbers.
-        style: how all are drawn.
+        style: how all series are drawn.
     """
     return [
         curve(", ".join(map(str, key)), rows[x], rows[y], style)
@@ -201,7 +201,7 @@ def curves(table: "pd.DataFrame", by: list[str], x: str, y: str, style: Style = 
 def path(
     label: str, points: NDArray[np.float64], style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """Return a series of points in the plane.
+    """Make a series of points in the plane.
 
     Args:
         label: its name in the legend.
@@ -216,7 +216,7 @@ def path(
 
 
 def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference: bool = False) -> Band:
-    """Return a range over x, numbers or names.
+    """Make a range over x.
 
     Args:
         label: its name in the legend.
@@ -232,11 +232,11 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
 
 
 def level(label: str, x: ArrayLike, y: float) -> Series:
-    """Return a value that others are compared with, from end to end.
+    """Make a horizontal reference line from end to end of x.
 
     Args:
         label: its name in the legend.
-        x: (n,), numbers or names; only the first and the last count.
+        x: (n,), numbers or names; only the first and the last are used.
         y: the value.
 
     Returns:
@@ -247,11 +247,11 @@ def level(label: str, x: ArrayLike, y: float) -> Series:
 
 
 def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
-    """Return one range that others are compared with, from end to end.
+    """Make a constant reference range from end to end of x.
 
     Args:
         label: its name in the legend.
-        x: (n,), numbers or names; only the first and the last count.
+        x: (n,), numbers or names; only the first and the last are used.
         low: its lower end.
         high: its upper end.
 
@@ -263,7 +263,7 @@ def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
 
 
 def coverage(title: str, held: Mapping[str, Mapping[str, float]]) -> Chart:
-    """Draw by block and quantity how many of a hundred 95 % intervals hold the truth."""
+    """Draw how many of a hundred 95 % intervals contain the truth, by block and quantity."""
     names = list(next(iter(held.values())))
     places = np.arange(len(names), dtype=float)
     panel = Panel(
@@ -282,7 +282,7 @@ def _places(values: ArrayLike) -> Places:
 
 
 def _numbers(values: ArrayLike) -> Numbers:
-    """Write numbers as JSON has them, to seven digits, as no screen shows more; NaN becomes null."""
+    """Convert numbers for JSON: seven digits, more than a screen can show; NaN becomes null."""
     array = np.asarray(values, dtype=float)
     return [float(f"{value:.7g}") if np.isfinite(value) else None for value in array.tolist()]
 
@@ -314,7 +314,7 @@ def draw(chart: Chart) -> "Figure":
 
 
 def _height_in(panel: Panel) -> float:
-    """Choose how high a panel is: of a plane with limits as high as these ask for."""
+    """Choose the height of a panel; a plane with limits follows their ratio."""
     if panel.plane and panel.x.limits and panel.y.limits:
         wide, high = panel.x.limits[1] - panel.x.limits[0], panel.y.limits[1] - panel.y.limits[0]
         return min(4.5, 7.0 * high / wide + 0.9)
@@ -355,12 +355,12 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
 
 
 def _known(values: Places) -> list[Any]:
-    """Return values as matplotlib has them: NaN where there is none."""
+    """Convert values for matplotlib: NaN replaces None."""
     return [math.nan if value is None else value for value in values]
 
 
 def show_names_as_they_are(figure: "Figure") -> None:
-    """Keep a dollar sign in titles, labels and ticks from beginning a formula: names hold some."""
+    """Prevent dollar signs in titles, labels and ticks from starting a formula."""
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]

@@ -1,7 +1,7 @@
-"""Decides claims: statements of papers with our verdicts.
+"""Verdicts on claims, which are statements of papers.
 
-A claim is stated as data, beside an experiment's settings in data/experiments: a sentence, what the
-paper says, and a comparison of metrics that decides it; see `fuselog.pipeline.output.expressions`.
+A claim is data, next to an experiment's settings in data/experiments: a sentence, what the paper says,
+and a comparison of metrics that decides it; see `fuselog.pipeline.output.expressions`.
 """
 
 import re
@@ -34,23 +34,23 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import Claimed
 
-# The recording of a claim that is made of all there are.
+# Recording name of a claim about all recordings.
 ANY = "any"
 TOO_FEW = f"too few runs for a 95 % interval, which takes {FEWEST_RUNS}"
 
 
 @dataclass(frozen=True)
 class Claim:
-    """Represents a statement of a paper: what it prints, what we measured, our verdict and its reason.
+    """A statement of a paper: what the paper prints, what we measured, our verdict and its reason.
 
-    There is no verdict on a claim that is made of another recording.
+    A claim about another recording has no verdict.
 
     Attributes:
         claim: the statement.
         paper: what the paper prints, or where.
         ours: what we measured.
         verdict: a `Claimed`, or its word.
-        why: the reason of the verdict; of a refuted claim at least the numbers that are against it.
+        why: the reason for the verdict; for a refuted claim at least the numbers that contradict it.
     """
 
     claim: str
@@ -64,12 +64,12 @@ class Claim:
 
 
 def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str = "") -> Claim:
-    """Return a claim that a measured condition confirms or refutes.
+    """Make a claim that a measured condition confirms or refutes.
 
     Args:
         claim: as in `Claim`.
-        paper: likewise.
-        ours: likewise.
+        paper: as in `Claim`.
+        ours: as in `Claim`.
         holds: whether what was measured confirms the claim.
         why: as in `Claim`.
 
@@ -83,7 +83,7 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 
 
 def known(claim: Claim) -> Claim:
-    """Return the claim, neither confirmed nor refuted where a number of ours is missing."""
+    """Return the claim; if one of our numbers is missing, with the verdict not reproducible."""
     has_none = claim.verdict in (Claimed.NOT_REPRODUCIBLE, Claimed.NO_VERDICT) or claim.why == TOO_FEW
     if has_none or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
         return claim
@@ -92,30 +92,32 @@ def known(claim: Claim) -> Claim:
 
 
 class StatedClaim(Parameters):
-    """States a claim as an experiment's file has it.
+    """A claim as written in an experiment's file.
 
-    In texts, `{EXPRESSION:FORMAT}` is a number; everywhere `$NAME` is what `each` says.
+    In texts, `{EXPRESSION:FORMAT}` is replaced by a number; everywhere `$NAME` is replaced by its
+    value in `each`.
 
     Attributes:
-        sentence: what is claimed.
-        paper: what the paper says, or where the limit comes from.
-        holds: comparison that decides: confirmed, refuted, or inconclusive if an interval holds both;
-            without one the claim is not reproducible.
-        value: expression that the texts and the comparison name `value`.
+        sentence: the claim.
+        paper: what the paper says, or the source of the limit.
+        holds: the comparison that decides: confirmed, refuted, or inconclusive if an interval allows
+            both; without it the claim is not reproducible.
+        value: the expression that texts and comparison refer to as `value`.
         ours: what we found.
-        why: reason of the verdict, or what has to be known beside it. If a refuted claim has neither
-            this nor `unless`, it names the numbers that refute it.
-        unless: what is said beside every verdict but `confirmed`.
-        reproducible: comparison without which the claim is not reproducible, whatever `holds` says.
-        each: names and what they stand for; the claim is made of each, or of each combination. An entry
-            that is a table gives several names; `nees[ekf, *]` gives all that its `*` stands for.
-        given: numbers or expressions by the names that the texts and the comparison have for them.
-        optional: whether it is left out where the result lacks one of its metrics, in place of not
-            reproducible.
-        least_runs: with fewer runs it is inconclusive, unless each number that decides it has an
-            interval; by default as many as the file of the experiment states, if it makes runs.
-        recording: of which of the experiment's recordings it is claimed, by default of the first; `any`
-            for all data there are. Of other data it has its numbers, and no verdict.
+        why: the reason for the verdict, or a remark. If a refuted claim has neither this nor
+            `unless`, the reason lists the numbers that refute it.
+        unless: a remark for every verdict except `confirmed`.
+        reproducible: a comparison; if it is false, the claim is not reproducible, whatever `holds`
+            says.
+        each: names and their values; one claim is made for each value, or each combination. A table
+            as a value sets several names; `nees[ekf, *]` stands for everything that its `*` matches.
+        given: numbers or expressions, by the names that texts and comparison use.
+        optional: whether the claim is left out, instead of not reproducible, if the result lacks one
+            of its metrics.
+        least_runs: with fewer runs the claim is inconclusive, unless each number that decides it has
+            an interval; by default the number of runs in the experiment's file, if it makes runs.
+        recording: the experiment's recording that the claim is about, by default the first; `any`
+            stands for all data. For other data the claim has numbers, but no verdict.
     """
 
     sentence: str
@@ -141,17 +143,17 @@ class StatedClaim(Parameters):
         return self
 
     def decided_from(self, runs: int) -> "StatedClaim":
-        """Return the claim with this least number of runs, unless it states one."""
+        """Return the claim with this minimum number of runs, unless it has one."""
         return self if self.least_runs else self.model_copy(update={"least_runs": runs})
 
     @property
     def recordings(self) -> set[str]:
-        """Return the recordings that it is of: `*` for those a result will tell, "" for the first."""
+        """Return the claim's recordings: `*` if only a result can tell, "" for the first."""
         return {_named(self, meant).recording for meant in _combinations(self.each)}
 
     @property
     def names(self) -> set[str]:
-        """Return the names in its expressions that the claim lacks; raises BadInput for what is none."""
+        """Return the names that the claim uses but does not define; raises BadInput for bad ones."""
         found: set[str] = set()
         for meant in _combinations(self.each):
             claim = _named(self, meant)
@@ -166,7 +168,7 @@ class StatedClaim(Parameters):
 
 
 def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
-    """Read an expression; raises BadInput that names the claim where it cannot be read."""
+    """Read an expression; raises BadInput that names the claim if it cannot be read."""
     try:
         return read(*arguments)
     except BadInput as error:
@@ -174,7 +176,7 @@ def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
 
 
 def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: str) -> None:
-    """Raise BadInput that names `where` and the claim, where one names a number that is not there."""
+    """Raise BadInput that names `where` and the claim, if a claim uses an unknown number."""
     for claim in stated:
         for name in sorted(claim.names.difference(names)):
             raise BadInput(
@@ -183,7 +185,7 @@ def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: 
 
 
 def require_recordings(stated: Sequence[StatedClaim], recordings: Collection[str], where: str) -> None:
-    """Raise BadInput that names `where` and the claim, where one is of a recording that is not there."""
+    """Raise BadInput that names `where` and the claim, if a claim is about an unknown recording."""
     if ANY in recordings:
         raise BadInput(f"{where}: '{ANY}' stands for all recordings; give recordings.{ANY} another name")
     known = {"", "*", ANY, *recordings}
@@ -201,10 +203,10 @@ def decide(
     names: Mapping[str, float],
     recordings: Mapping[str, bool] | None = None,
 ) -> list[Claim]:
-    """Give claims verdicts by a result's metrics, 95 % intervals, and numbers by name.
+    """Decide claims from a result's metrics, their 95 % intervals, and numbers by name.
 
-    `recordings` tells of each recording whether the result is of it: there is no verdict on claims of
-    others. Raises BadInput where an expression of a claim cannot be evaluated.
+    `recordings` states for each recording whether the result is from it: claims about others get no
+    verdict. Raises BadInput if an expression of a claim cannot be evaluated.
     """
     values = Values(metrics, intervals, {name: exactly(value) for name, value in names.items()})
     found = []
@@ -218,7 +220,7 @@ def decide(
 
 
 def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
-    """Return the claim, without its verdict where it is of another recording; "" is the first."""
+    """Return the claim, without its verdict if it is about another recording; "" is the first one."""
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
@@ -228,9 +230,9 @@ def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim)
 def _combinations(
     each: Mapping[str, str | list[Any]], metrics: Mapping[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield what the names of `each` stand for, one combination after another.
+    """Yield the values of the names in `each`, one combination after another.
 
-    Without metrics, which are not known before a run, their `*` stands for itself.
+    Without metrics, which are unknown before a run, `*` stays as it is.
     """
     entries = {
         name: of if isinstance(of, list) else ["*"] if metrics is None else _found(of, metrics)
@@ -244,13 +246,13 @@ def _combinations(
 
 
 def _found(pattern: str, metrics: Mapping[str, Any]) -> list[str]:
-    """List what the `*` of a metric such as `nees[ekf, *]` stands for, each once."""
+    """List what the `*` of a metric such as `nees[ekf, *]` matches, without duplicates."""
     quantity, _, of = pattern.removesuffix("]").partition("[")
     return list(dict.fromkeys(keys_of(quantity, of, metrics).values()))
 
 
 def _named(claim: StatedClaim, names: Mapping[str, Any]) -> StatedClaim:
-    """Put into the claim what names stand for."""
+    """Replace the `$NAME`s of a claim by their values."""
 
     def put(text: str) -> str:
         return Template(text).safe_substitute(names)
@@ -267,7 +269,7 @@ _TEXTS = (
 
 
 def _decided(claim: StatedClaim, values: Values) -> Claim | None:
-    """Give the claim its verdict; None where it is left out."""
+    """Decide a claim; return None if it is left out."""
     try:
         return _reading(claim.sentence, _verdict, claim, values)
     except NoMetric as error:
@@ -280,7 +282,7 @@ def _decided(claim: StatedClaim, values: Values) -> Claim | None:
 
 
 def _as_far_as_known(text: str, values: Values) -> str:
-    """Put numbers into the text, or leave it as it stands where one of them is missing."""
+    """Put numbers into the text, or return it unchanged if one of them is missing."""
     try:
         return formatted(text, values)
     except (BadInput, NoMetric):
@@ -288,7 +290,7 @@ def _as_far_as_known(text: str, values: Values) -> str:
 
 
 def _few_runs(claim: StatedClaim, values: Values) -> str:
-    """Explain that a claim is of too few runs to be decided without an interval; empty if it is not."""
+    """Explain that a claim needs more runs to be decided without an interval; empty if it does not."""
     runs, least = values.names.get("runs"), claim.least_runs
     if not isinstance(runs, Interval) or least is None or runs.value >= least:
         return ""
@@ -299,7 +301,7 @@ def _few_runs(claim: StatedClaim, values: Values) -> str:
 
 
 def _stated(claim: StatedClaim) -> dict[str, str]:
-    """Return the claim's expressions by the names that it has for them."""
+    """Return the claim's expressions by the names that it gives them."""
     stated = {name: of for name, of in claim.given.items() if isinstance(of, str)}
     return stated | ({"value": claim.value} if claim.value else {})
 

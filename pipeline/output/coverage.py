@@ -1,4 +1,4 @@
-"""Makes the table `coverage`: what became of every topic of a log; nothing is unused in silence."""
+"""The table `coverage`: how many messages of every topic of a log were used."""
 
 import json
 import math
@@ -33,18 +33,19 @@ from fuselog.replay.judging.errors.truths import Doubt
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_TOPICS = 3  # that one sentence names
+MOST_TOPICS = 3  # topics named in one sentence
 COLUMNS = [*Row._fields]
-# An estimates log's note on the span and the clock of its replay, unless it is all by publish time.
+# Note of an estimates log on the span and clock of its replay; absent for a whole log by publish time.
 REPLAYED = "replayed"
 
 
 def untaken(
     sources: Sequence[Source], labels: Iterable[str], bound: Iterable[Bound], order: Clock
 ) -> list[Row]:
-    """Return the topics that an estimator does not take at all, in the replayed spans of all logs.
+    """List the topics that an estimator does not use at all, in the replayed spans of all logs.
 
-    Truths and maps are none, nor are controls but for those that it would take if told to.
+    Truths and maps do not count, nor do controls, unless a setting would make the estimator use
+    them.
     """
     taken: dict[str, set[str]] = {label: set() for label in labels}
     offers: dict[str, dict[str, str]] = {}
@@ -83,7 +84,7 @@ def _untaken(offer: str) -> str:
 
 
 def _messages(source: Source, topic: str, order: Clock) -> int:
-    """Count the messages of a topic that lie in the source's span."""
+    """Count the messages of a topic in the source's span."""
     if source.start_ns is None and getattr(source, "end_ns", None) is None:
         return source.topics[topic].messages
     return sum(len(block[topic]) for block in source.blocks([topic], order, BLOCK_MESSAGES))
@@ -95,10 +96,10 @@ def recounted(
     stated: Mapping[str, Any],
     doubts: Mapping[str, Doubt],
 ) -> list[Row]:
-    """Count the same table from estimates logs and the logs that they are of, as the replay did.
+    """Compute the coverage table from estimates logs and their source logs, as the replay did.
 
-    `stated` are the estimators' settings by label, `doubts` those about truths. What cannot be bound
-    here says so in its row.
+    `stated` holds the estimators' settings by label, `doubts` the doubts about truths. If an
+    estimator cannot be bound to the logs, its row says so.
     """
     rows: list[Row] = []
     bound: list[Bound] = []
@@ -124,14 +125,14 @@ def recounted(
 
 
 def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock]:
-    """Return the span of a log that estimates are of, and the clock that they go by."""
+    """Return the span of a log that its estimates cover, and the clock of their replay."""
     notes = estimates.run.notes if estimates.run else {}
     start_ns, end_ns, order = _noted(notes.get(REPLAYED, ""))
     return replace(source, start_ns=start_ns, end_ns=end_ns), order
 
 
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
-    """Return the note REPLAYED of a source's estimates; none where it is whole, by publish time."""
+    """Return the note REPLAYED for a source's estimates; empty for a whole log by publish time."""
     ends = source.start_ns, getattr(source, "end_ns", None)
     text = json.dumps([*ends, order])
     return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
@@ -151,7 +152,7 @@ def _noted(note: str) -> tuple[int | None, int | None, Clock]:
 def _recounted(
     estimates: LogSource, source: LogSource, order: Clock, bound: Sequence[Bound]
 ) -> dict[str, Usage]:
-    """Count one run by bound estimator: its messages, and what was said up to their last."""
+    """Count the messages of one run by bound estimator, and their use up to the last output."""
     usages = {each.name: Usage(each.name) for each in bound}
     maps = {
         topic: gather([source.read([topic])[topic]])
@@ -170,7 +171,7 @@ def _recounted(
         for topic, about in estimates.topics.items()
         if about.schema_name in (INNOVATION, SKIPPED) and topic.rpartition("/")[0] in _places(bound)
     ]
-    for topic in counted:  # that it has innovations is said by a topic without messages too
+    for topic in counted:  # a topic without messages also shows that the estimator has innovations
         usages[_places(bound)[topic.rpartition("/")[0]]].note_outputs([gather([estimates.empty(topic)])])
     outputs = estimates.blocks(counted, "publish_time", BLOCK_MESSAGES) if counted else iter(())
     inputs = source.blocks(streamed, order, BLOCK_MESSAGES) if streamed else iter(())
@@ -199,7 +200,7 @@ def _recounted(
 
 
 def _places(bound: Iterable[Bound]) -> dict[str, str]:
-    """Return the names of bound estimators by what their topics begin with."""
+    """Map the prefix of each bound estimator's topics to its name."""
     return {f"/estimates/{each.name}": each.name for each in bound}
 
 
@@ -209,9 +210,9 @@ def rows_of(
     doubts: Mapping[str, Doubt],
     left_out: Rejections,
 ) -> list[Row]:
-    """Return all lines, by estimator and topic: what was counted, other topics, and doubtful truths.
+    """Collect all rows by estimator and topic: counted messages, other topics, and doubtful truths.
 
-    What was left out, since it is impossible, counts among the messages.
+    Messages that were left out because they are impossible are included in the counts.
     """
     rows = [_whole(row, left_out) for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
@@ -232,7 +233,7 @@ def rows_of(
 
 
 def _whole(row: Row, left_out: Rejections) -> Row:
-    """Return a line on a topic with the messages that were left out before an estimator met them."""
+    """Add the messages to a row that were left out before an estimator received them."""
     if row.topic not in left_out:
         return row
     why = "; ".join(filter(None, (row.why, left_out.sentence(row.topic))))
@@ -240,7 +241,7 @@ def _whole(row: Row, left_out: Rejections) -> Row:
 
 
 def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
-    """Add lines on topics that are not taken, over runs and further ones."""
+    """Add rows on unused topics of further runs to those of earlier ones."""
     counts = {(row.estimator, row.topic): row for row in rows}
     for row in more:
         before = counts.get((row.estimator, row.topic))
@@ -251,7 +252,7 @@ def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
 
 
 def stored_rows(folder: Path) -> list[Row]:
-    """Return the table `coverage` of a result; older ones have none."""
+    """Read the table `coverage` of a result; older results have none."""
     path = folder / "tables" / "coverage.parquet"
     if not path.is_file():
         return []
@@ -260,21 +261,21 @@ def stored_rows(folder: Path) -> list[Row]:
 
 
 def rows_of_candidate(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
-    """Return the lines of one estimator, under a candidate's name."""
+    """Return the rows of one estimator, under a candidate's name."""
     return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
-    """Return a row per estimator and topic; see `Row`."""
-    import pandas as pd  # which takes long to import
+    """Make a table with a row per estimator and topic; see `Row`."""
+    import pandas as pd  # slow to import
 
     return pd.DataFrame(rows, columns=COLUMNS).astype({"used": "Int64", "gated": "Int64"})
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:
-    """Report what was not used: topics that an estimator does not take in one sentence.
+    """Report what was not used, with one sentence for all topics that an estimator does not use.
 
-    That an estimator takes no measurements at all is its nature, and not reported.
+    An estimator that uses no measurements at all does so by design and is not reported.
     """
     measuring = {
         row.estimator for row in rows if row.used is not None and not row.why.startswith(UNTAKEN)
@@ -293,7 +294,7 @@ def sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def _of_untaken(rows: Sequence[Row]) -> str:
-    """Name the topics that one estimator does not take, the first of many."""
+    """Name the topics that one estimator does not use, or the first few of many."""
     if len(rows) == 1:
         return rows[0].sentence
     topics = [row.topic for row in rows]

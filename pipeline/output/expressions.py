@@ -1,12 +1,12 @@
-"""Evaluates expressions over a result's metrics, which decide claims and give their numbers.
+"""Evaluation of expressions over a result's metrics, which decide claims and give their numbers.
 
     nees[ekf, robot1]          the metric `ekf.nees.robot1`
     nees[ekf]                  the metric `ekf.nees`
     nees[ekf | ukf, *]         a list: of both estimators in all cases, in this order
     gain[ekf, wind][0]         an entry of a list
-    rmse_m[ekf] < 2 * limit    a comparison: true, false, or open where an interval holds both
+    rmse_m[ekf] < 2 * limit    a comparison: true, false, or open if an interval allows both
 
-What `*` and `|` stand for gives numbers their names. The functions are `numbers.FUNCTIONS`.
+Numbers are named after what `*` and `|` match. The functions are `numbers.FUNCTIONS`.
 """
 
 import ast
@@ -39,16 +39,16 @@ from fuselog.replay.judging.intervals import Interval
 
 
 class NoMetric(Exception):
-    """Says that a metric which an expression names is not in the result."""
+    """The result lacks a metric that an expression names."""
 
 
 class Values(NamedTuple):
-    """Holds what an expression may name.
+    """Everything that an expression may name.
 
     Attributes:
         metrics: by their keys, `estimator.quantity[.case]`.
-        intervals: where metrics lie with 95 %, of those that have such an interval.
-        names: of other numbers.
+        intervals: the 95 % intervals of metrics that have one.
+        names: other numbers by name.
     """
 
     metrics: Mapping[str, Any]
@@ -57,9 +57,9 @@ class Values(NamedTuple):
 
 
 def evaluate(expression: str, values: Values) -> Value:
-    """Return the value of an expression.
+    """Evaluate an expression.
 
-    Raises BadInput where it is none, and `NoMetric` where the result lacks one of its metrics.
+    Raises BadInput if it is invalid, and `NoMetric` if the result lacks one of its metrics.
     """
     try:
         return value_of(parse(expression), values)
@@ -70,7 +70,7 @@ def evaluate(expression: str, values: Values) -> Value:
 
 
 def truth(expression: str, values: Values) -> Truth:
-    """Tell whether an expression holds, a list in all entries; raises as `evaluate` does."""
+    """Test whether an expression holds, in all entries if it is a list; raises as `evaluate` does."""
     found = evaluate(expression, values)
     if isinstance(found, Interval):
         raise BadInput(f"'{expression}' is a number, no comparison; compare it with a limit")
@@ -78,10 +78,10 @@ def truth(expression: str, values: Values) -> Truth:
 
 
 def formatted(template: str, values: Values) -> str:
-    """Write a sentence with its expressions' values: `{EXPRESSION:FORMAT}`, lists with commas.
+    """Fill a sentence with the values of its expressions: `{EXPRESSION:FORMAT}`, lists with commas.
 
-    A number that has an interval stands before it; `{EXPRESSION!n:FORMAT}` says the names of numbers
-    too. Raises as `evaluate` does.
+    A number with an interval is followed by it; `{EXPRESSION!n:FORMAT}` also writes the names of
+    numbers. Raises as `evaluate` does.
     """
     parts = []
     for text, expression, form, conversion in Formatter().parse(template):
@@ -96,7 +96,7 @@ def formatted(template: str, values: Values) -> str:
 
 
 def expressions_in(template: str) -> list[str]:
-    """Return the expressions of a template; raises BadInput where its braces do not match."""
+    """Return the expressions of a template; raises BadInput if its braces do not match."""
     try:
         return [each for _, each, _, _ in Formatter().parse(template) if each is not None]
     except ValueError as error:
@@ -104,7 +104,7 @@ def expressions_in(template: str) -> list[str]:
 
 
 def in_words(value: Value, form: str, *, named: bool = False) -> str:
-    """Write a value, with its interval if it has one, and with the names of numbers if `named`."""
+    """Format a value, with its interval if it has one, and with the names of numbers if `named`."""
     if isinstance(value, list):
         return ", ".join(in_words(each, form, named=named) for each in value)
     if not isinstance(value, Interval):
@@ -117,7 +117,7 @@ def in_words(value: Value, form: str, *, named: bool = False) -> str:
 
 @cache
 def parse(expression: str) -> ast.expr:
-    """Return the tree of an expression; raises BadInput where it has more in it than expressions may."""
+    """Parse an expression; raises BadInput if it contains syntax that expressions do not allow."""
     quoted = re.sub(r"(\w)\[(?!-?\d+\])([^\[\]]*)\]", lambda each: f"{each[1]}[{each[2]!r}]", expression)
     try:
         tree = ast.parse(quoted.strip(), mode="eval").body
@@ -138,7 +138,7 @@ def parse(expression: str) -> ast.expr:
 
 @cache
 def names_in(expression: str) -> frozenset[str]:
-    """Return the names of numbers in an expression; raises BadInput where it is none."""
+    """Return the names of numbers in an expression; raises BadInput if it is invalid."""
     tree = parse(expression)
     nodes = list(ast.walk(tree))
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
@@ -154,15 +154,15 @@ def names_in(expression: str) -> frozenset[str]:
 
 
 def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:
-    """Tell whether only many runs decide a comparison: chance may carry it across its limit.
+    """Test whether a comparison needs many runs, because chance may carry it across its limit.
 
-    That is so if it reads a metric without an interval, takes one end of an interval, or asks what lies
-    in it, which is the wider the fewer runs there are.
+    This is so if it reads a metric without an interval, uses only one end of an interval, or asks
+    what an interval contains, which gets wider with fewer runs.
 
     Args:
         expression: the comparison.
-        stated: expressions by the names that it has for them.
-        values: what it may name.
+        stated: expressions by the names that stand for them.
+        values: everything that it may name.
     """
     tree = _expanded(expression, stated)
     for node in ast.walk(tree):
@@ -177,7 +177,7 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
 
 
 def lacks_interval(expression: str, stated: Mapping[str, str], values: Values) -> bool:
-    """Tell whether an expression reads a metric whose interval too few runs leave unknown.
+    """Test whether an expression reads a metric whose interval is unknown for lack of runs.
 
     The arguments are those of `needs_runs`.
     """
@@ -187,18 +187,18 @@ def lacks_interval(expression: str, stated: Mapping[str, str], values: Values) -
 
 
 def _keys_in(tree: ast.expr, values: Values) -> list[str]:
-    """Return the keys of the metrics that an expression reads."""
+    """List the keys of the metrics that an expression reads."""
     return [key for each in metrics_of(tree) for key in keys_of(*each, values.metrics)]
 
 
 def _expanded(expression: str, stated: Mapping[str, str]) -> ast.expr:
-    """Return the tree of an expression, with the expressions in it that names stand for."""
+    """Parse an expression, and replace names by the expressions that they stand for."""
     tree: ast.expr = _Expanded(stated).visit(deepcopy(parse(expression)))
     return tree
 
 
 class _Expanded(ast.NodeTransformer):
-    """Puts expressions in place of the names that stand for them."""
+    """A transformer that replaces names by the expressions that they stand for."""
 
     def __init__(self, stated: Mapping[str, str]) -> None:
         self.stated = stated
@@ -220,7 +220,7 @@ class _Expanded(ast.NodeTransformer):
 
 
 def metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
-    """Return the metrics that an expression names: quantity, and what stands in brackets."""
+    """Return the metrics that an expression names: the quantity, and the text in brackets."""
     found = []
     for node in ast.walk(tree):
         match node:
@@ -230,7 +230,7 @@ def metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
 
 
 def value_of(node: ast.expr, values: Values) -> Value:
-    """Return the value of a part of an expression."""
+    """Evaluate a part of an expression."""
     match node:
         case ast.Constant(value=bool()):
             raise BadInput("true and false are no numbers; compare numbers")
@@ -272,9 +272,9 @@ def value_of(node: ast.expr, values: Values) -> Value:
 
 
 def metric(quantity: str, of: str, values: Values) -> Value:
-    """Return the metric of `estimator, case`, or a list where these have `*` or `|`.
+    """Look up the metric of `estimator, case`, or a list if these contain `*` or `|`.
 
-    Raises `NoMetric` where there is none.
+    Raises `NoMetric` if there is none.
     """
     keys = keys_of(quantity, of, values.metrics)
     if not keys:
@@ -284,9 +284,9 @@ def metric(quantity: str, of: str, values: Values) -> Value:
 
 
 def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
-    """Return the keys of the metrics of `estimator, case`, and what `*` and `|` stand for in each.
+    """Find the metrics of `estimator, case`: their keys, and what `*` and `|` match in each.
 
-    Raises `NoMetric` where there is not what is named without a `*`.
+    Raises `NoMetric` if a metric that is named without `*` is missing.
     """
     estimator, _, case = (part.strip() for part in of.partition(","))
     found = {}
@@ -316,7 +316,7 @@ def _name(key: str, quantity: str, label: str, one: str, estimator: str, case: s
 
 
 def is_many(of: str) -> bool:
-    """Tell whether the brackets of a metric stand for a list."""
+    """Test whether the brackets of a metric select a list."""
     return "*" in of or "|" in of
 
 

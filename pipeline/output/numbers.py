@@ -1,7 +1,7 @@
-"""Computes with intervals, as expressions need it.
+"""Arithmetic with intervals, as expressions need it.
 
-What an interval leaves open is neither true nor false. Operations and comparisons on lists are entry by
-entry.
+A comparison that an interval leaves open is neither true nor false. Operations and comparisons on lists
+apply to each entry.
 """
 
 import ast
@@ -14,19 +14,19 @@ from typing import Any, Literal
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.judging.intervals import Interval
 
-# True, false, None where an interval leaves it open, or "missing" where a number is NaN.
+# True, false, None if an interval leaves it open, or "missing" if a number is NaN.
 Truth = bool | Literal["missing"] | None
 Value = Interval | Truth | list[Any]
 
 
 def exactly(value: float | None, name: str = "") -> Interval:
-    """Return a number that is exact; NaN for None."""
+    """Make an exact number, whose interval has no width; NaN for None."""
     value = math.nan if value is None else float(value)
     return Interval(value, value, value, name=name)
 
 
 def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
-    """Return the function of numbers, or of the entries of lists, which are of one length."""
+    """Apply a function to numbers, or to the entries of lists of equal length."""
     lengths = {len(each) for each in arguments if isinstance(each, list)}
     if not lengths:
         return function(*arguments)
@@ -38,7 +38,7 @@ def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
 
 
 def combined(operation: Callable[[float, float], float]) -> Callable[[Interval, Interval], Interval]:
-    """Return an operation on numbers with intervals: its ends are among those of its arguments' ends."""
+    """Extend an operation to intervals; the ends of its result come from the ends of its arguments."""
 
     def of(one: float, other: float) -> float:
         try:
@@ -55,7 +55,7 @@ def combined(operation: Callable[[float, float], float]) -> Callable[[Interval, 
 
 
 def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Interval, Interval], Truth]:
-    """Make a comparison that is missing where one of its numbers is."""
+    """Make a comparison that is "missing" if one of its numbers is."""
 
     def found(one: Interval, other: Interval) -> Truth:
         if not (isinstance(one, Interval) and isinstance(other, Interval)):
@@ -66,7 +66,7 @@ def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Inter
 
 
 def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Interval], Truth]:
-    """Make the test whether a number is on one side of another, with all of both intervals."""
+    """Make a test whether one number is below, or above, another with all of both intervals."""
 
     def compare(one: Interval, other: Interval) -> Truth:
         if one.low == one.high and other.low == other.high:
@@ -82,7 +82,7 @@ def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Inter
 
 
 def _within(one: Interval, other: Interval) -> Truth:
-    """Tell whether a number, with all of its interval, lies within another's interval."""
+    """Test whether a number, with its whole interval, is inside another's interval."""
     if other.low <= one.low and one.high <= other.high:
         return True
     return False if one.high < other.low or one.low > other.high else None
@@ -95,14 +95,14 @@ def _equal(one: Interval, other: Interval) -> Truth:
 
 
 def negated(of: Truth) -> Truth:
-    """Negate a truth; what is open or missing stays so."""
+    """Negate a truth value; open and missing stay as they are."""
     return not of if isinstance(of, bool) else of
 
 
 def all_hold(truths: Sequence[Any]) -> Truth:
-    """Tell whether all of truths, and of lists of them, are true; open where one is, and none is false.
+    """Test whether all truth values, nested lists included, are true.
 
-    Where one is missing, so is this.
+    The result is missing if one is missing, else false if one is false, else open if one is open.
     """
     known = flat(truths)
     if "missing" in known:
@@ -111,17 +111,17 @@ def all_hold(truths: Sequence[Any]) -> Truth:
 
 
 def any_holds(truths: Sequence[Any]) -> Truth:
-    """Tell whether one of truths, and of lists of them, is true; open or missing as in `all_hold`."""
+    """Test whether one truth value, nested lists included, is true; open or missing as in `all_hold`."""
     return negated(all_hold([negated(each) for each in flat(truths)]))
 
 
 def flat(values: Sequence[Any]) -> list[Any]:
-    """List the entries of lists within lists."""
+    """Flatten nested lists."""
     return [one for each in values for one in (flat(each) if isinstance(each, list) else [each])]
 
 
 def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Interval]:
-    """Make a function of numbers or lists of them, such as the least one, end by end."""
+    """Make a function of numbers or lists, such as the minimum, that is applied to values and ends."""
 
     def found(*arguments: Value) -> Interval:
         numbers = flat(arguments)
@@ -135,7 +135,7 @@ def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Inter
 
 
 def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
-    """Make a function that rises, of a number or the entries of a list."""
+    """Make an increasing function of a number or of the entries of a list."""
 
     def of(number: float) -> float:
         try:
@@ -147,7 +147,7 @@ def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
 
 
 def negative(number: Interval) -> Interval:
-    """Return the number with its sign changed."""
+    """Negate a number and its interval."""
     return Interval(-number.value, -number.high, -number.low, name=number.name)
 
 
@@ -174,34 +174,34 @@ def _deviation(numbers: Sequence[float]) -> float:
 
 
 def _plus_minus(number: Interval, spread: Interval) -> Interval:
-    """Return a number that is no surer than a spread."""
+    """Replace the interval of a number by plus and minus a spread."""
     low, high = number.value - spread.value, number.value + spread.value
     return Interval(number.value, low, high, name=number.name)
 
 
 def _chi_square(share: Interval, size: Interval) -> Interval:
-    """Find below what a share of chi-square numbers of so many degrees lies; NaN without any degree."""
+    """Compute a quantile of the chi-square distribution; NaN without a degree of freedom."""
     from fuselog.replay.engine import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
 
 
 def _count(values: list[Any]) -> Interval:
-    """Count the comparisons that are true; with one missing, how many are is not known."""
+    """Count the comparisons that are true; if one is missing, the count has no interval."""
     known = flat(values)
     count = float(sum(each is True for each in known))
     return Interval(count) if "missing" in known else exactly(count)
 
 
 def _falls(values: list[Interval]) -> Truth:
-    """Tell whether each entry is below the one before it."""
+    """Test whether each entry is below the previous one."""
     return all_hold([COMPARISONS[ast.Lt](later, one) for one, later in pairwise(values)])
 
 
 def _consistent(size: Interval, count: Interval) -> Interval:
-    """Return the interval of a mean NEES of so many components, over independent estimates.
+    """Compute the 95 % interval of the mean NEES of `size` components over `count` estimates.
 
-    NaN where one of these is missing.
+    NaN if one of these is missing.
     """
     from fuselog.replay.judging.errors.evaluation import chi_square_interval
 

@@ -1,8 +1,8 @@
-"""Guards what is there: no command changes or deletes a file that fuselog did not write for it.
+"""Protection of existing files: no command changes or deletes a file that fuselog did not write for it.
 
-A file that exists is replaced only where it is what the same command writes there, and says so itself.
-An output is never an input, another output or a symbolic link, by whatever names they are given; what is
-judged is the place that will be written.
+An existing file is replaced only if the same command wrote it, which its content must show. An output is
+never an input, another output or a symbolic link, whatever names are given: what counts is the actual
+path that will be written.
 """
 
 import json
@@ -20,13 +20,13 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.recorders.parsing import parse_json
 
-MOST_SETTINGS = 3  # that one sentence names
-# The notes of a log's run that tell how it was cut, merged or relabelled, and which command did so last.
+MOST_SETTINGS = 3  # settings named in one sentence
+# Notes of a log's run on how it was cut, merged or relabelled, and by which command last.
 CHANGES, CHANGED_BY = "changes", "changed by"
 
 
 class Kind(NamedTuple):
-    """Describes a kind of file that a command writes: its suffix, what it is, and how it is known."""
+    """A kind of file that a command writes: suffix, description, and a test that recognises it."""
 
     suffix: str
     what: str
@@ -34,11 +34,11 @@ class Kind(NamedTuple):
 
 
 def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Iterable[Path]]) -> None:
-    """Raise BadInput where a command may not write one of its outputs.
+    """Raise BadInput if a command may not write one of its outputs.
 
     Args:
         outputs: the files to write.
-        inputs: the files that are read, by what they are to the user: `{"log": [...]}`.
+        inputs: the files to read, by their role for the user: `{"log": [...]}`.
     """
     taken = {_identity(path): f"{role} {path}" for role, paths in inputs.items() for path in paths}
     for named, kind in outputs:
@@ -58,7 +58,7 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
 
 
 def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
-    """Raise BadInput where a folder that is to be replaced is a link, a root or holds an input."""
+    """Raise BadInput if a folder to be replaced is a link or a root, or contains an input."""
     folder = settled(folder)
     if not folder.name:
         raise BadInput(f"{folder}: is the root of a file system; give a folder in it with --out")
@@ -73,9 +73,9 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
 def check_outputs(
     folder: Path | None, timeline: Path | None, inputs: Mapping[str, Iterable[Path]]
 ) -> None:
-    """Raise BadInput where a command may not write its result folder or its timeline, if it does.
+    """Raise BadInput if a command may not write its result folder or its timeline.
 
-    Before its work, of which nothing would be left where the folder has to stay as it is.
+    This is checked before the work starts, so that none is lost.
     """
     if timeline is not None:
         check_files([(timeline, TIMELINE)], inputs)
@@ -91,7 +91,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def _is_of_result(path: Path) -> bool:
-    """Tell whether a result folder lists a file as its own."""
+    """Test whether a result folder lists a file as its own."""
     place = Path(os.path.realpath(path))
     for folder in place.parents:
         if (folder / RESULT_FILE).is_file():
@@ -101,7 +101,7 @@ def _is_of_result(path: Path) -> bool:
 
 
 def _identity(path: Path) -> Hashable:
-    """Return what is equal for two names of one file, also where that does not exist yet."""
+    """Return a key that is equal for all names of the same file, even if it does not exist yet."""
     try:
         state = path.stat()
     except OSError:
@@ -110,12 +110,12 @@ def _identity(path: Path) -> Hashable:
 
 
 def run_written(path: Path) -> RunMetadata | None:
-    """Return the run of a log that is there already, if fuselog wrote it."""
+    """Return the run of an existing log that fuselog wrote, or None."""
     return _run_of(path) if path.is_file() else None
 
 
 def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
-    """Describe how a log that was replaced had been made; empty if as the one that is there now."""
+    """Describe the settings in which a replaced log differs from the new one; empty if none do."""
     if before is None or now is None:
         return ""
     old, new = _settings_of(before), _settings_of(now)
@@ -126,7 +126,7 @@ def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) ->
 
 
 def _settings_of(run: RunMetadata) -> dict[str, str]:
-    """Return what a run, or the estimates of one, were made with: values as JSON by name."""
+    """Return the settings of a run, or of the estimates of one: values as JSON by name."""
     found: dict[str, Any] = {"scenario": run.scenario, "seed": run.seed, "run": run.run}
     found |= run.parameters
     if _is_estimates(run):
@@ -140,7 +140,7 @@ def _shown(settings: Mapping[str, str], name: str) -> str:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """Return the run of a log that fuselog wrote: as the run gave it, or changed since."""
+    """Return the run of a log that fuselog wrote: as recorded, or changed since if `is_changed`."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None
@@ -148,7 +148,7 @@ def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
 
 
 def _is_log(path: Path) -> bool:
-    """Tell whether fuselog wrote a log, which is whole."""
+    """Test whether a file is a complete log that fuselog wrote."""
     from mcap.reader import make_reader
 
     from fuselog.recorders.log.container.writing import LIBRARY
@@ -176,7 +176,7 @@ def _holds_estimates(path: Path) -> bool:
 
 
 def changed(command: str) -> Kind:
-    """Return the log that one of the commands on logs made of others."""
+    """Describe the kind of log that a command on logs, such as cut or merge, writes."""
 
     def is_changed(path: Path) -> bool:
         run = _run_of(path, is_changed=True)
@@ -186,7 +186,7 @@ def changed(command: str) -> Kind:
 
 
 def imported(source: str) -> Kind:
-    """Return the log of an importer."""
+    """Describe the kind of log that an importer writes."""
 
     def is_imported(path: Path) -> bool:
         run = _run_of(path)
@@ -200,7 +200,7 @@ def _is_timeline(path: Path) -> bool:
 
     from fuselog.replay.timeline.sinks import rerun_path
 
-    with warnings.catch_warnings(action="ignore"):  # of what is cut off
+    with warnings.catch_warnings(action="ignore"):  # warnings about truncated files
         try:
             stores = RrdReader(rerun_path(path)).recordings()
         except (BadInput, OSError, RuntimeError, ValueError):
@@ -226,7 +226,7 @@ def _is_report(path: Path) -> bool:
     return is_report(path)
 
 
-# A mapping is for editing: none is replaced.
+# Users edit mappings, so none is replaced.
 MAPPING = Kind(".toml", "a mapping that may be replaced", lambda _: False)
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)

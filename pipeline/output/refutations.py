@@ -1,4 +1,4 @@
-"""Says which parts of a claim's comparison are false, with the numbers that decide it."""
+"""Explanations of refuted claims: the parts of the comparison that are false, with their numbers."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ from fuselog.pipeline.output.expressions import (
 from fuselog.pipeline.output.numbers import COMPARISONS, Truth, by_entry, exactly, flat
 from fuselog.replay.judging.intervals import Interval
 
-MOST_ENTRIES = 4  # that a sentence names
+MOST_ENTRIES = 4  # entries named in a sentence
 _WORDS: dict[type[ast.cmpop], str] = {
     ast.Lt: "below",
     ast.LtE: "at most",
@@ -37,7 +37,7 @@ _MIRRORED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 
 
 class _Entry(NamedTuple):
-    """Holds one comparison of two numbers, and whether it is true."""
+    """One comparison of two numbers, and whether it is true."""
 
     number: Interval
     limit: Interval
@@ -45,9 +45,9 @@ class _Entry(NamedTuple):
 
 
 class _Comparison(NamedTuple):
-    """Holds a comparison of numbers, one by one, and what the claim wants it to be.
+    """A comparison of numbers, entry by entry, and the outcome that the claim requires.
 
-    `subject` is what the numbers are, `other` what the limits are if these are measured as well.
+    `subject` names the numbers, `other` names the limits if these are measured as well.
     """
 
     op: type[ast.cmpop]
@@ -58,25 +58,25 @@ class _Comparison(NamedTuple):
 
 
 def refutation(comparison: str, stated: Mapping[str, str], values: Values) -> str:
-    """Return a sentence on the parts of a comparison that make it false; empty if it is true.
+    """Describe the parts of a comparison that make it false; empty if it is true.
 
     Args:
         comparison: the expression that decides a claim.
-        stated: expressions by the names that it has for them.
-        values: what it may name.
+        stated: expressions by the names that stand for them.
+        values: everything that the comparison may name.
     """
     found = _Reader(stated, values).read(parse(comparison), wanted=True)
     return "; ".join(filter(None, map(_sentence, found)))
 
 
 class _Reader(NamedTuple):
-    """Finds the comparisons in a condition."""
+    """A reader that finds the comparisons in a condition."""
 
     stated: Mapping[str, str]
     values: Values
 
     def read(self, node: ast.expr, *, wanted: bool) -> list[_Comparison]:
-        """List the comparisons of a condition that is wanted to be true, or false."""
+        """List the comparisons of a condition that should be true, or false if not `wanted`."""
         match node:
             case ast.Name(id=name) if name in self.stated:
                 return self.read(parse(self.stated[name]), wanted=wanted)
@@ -107,7 +107,7 @@ class _Reader(NamedTuple):
     def _compare(
         self, op: type[ast.cmpop], one: ast.expr, other: ast.expr, *, wanted: bool
     ) -> _Comparison:
-        """Compare two sides one by one; what is measured is the subject, what is given the limit."""
+        """Compare two sides entry by entry; a measured side is the subject, a given one the limit."""
         if op in _MIRRORED and not self._is_measured(one) and self._is_measured(other):
             op, one, other = _MIRRORED[op], other, one
 
@@ -117,14 +117,14 @@ class _Reader(NamedTuple):
         return _Comparison(op, wanted, self._name(one), limit, entries)
 
     def _is_measured(self, node: ast.expr) -> bool:
-        """Tell whether an expression reads a metric, by itself or by the names in it."""
+        """Test whether an expression reads a metric, directly or through names."""
         names = {each.id for each in ast.walk(node) if isinstance(each, ast.Name)} & self.stated.keys()
         return bool(metrics_of(node)) or any(
             self._is_measured(parse(self.stated[name])) for name in names
         )
 
     def _name(self, node: ast.expr) -> str:
-        """Name what an expression is: its metric, the claim's own name for it, or its text."""
+        """Name an expression: its metric, the claim's name for it, or its text."""
         match node:
             case ast.Name(id="value") if "value" in self.stated:
                 return self._name(parse(self.stated["value"]))
@@ -143,7 +143,7 @@ def _compared(op: type[ast.cmpop], number: Interval, limit: Interval) -> _Entry:
 
 
 def _only(found: _Comparison, truths: Sequence[Truth], *, wanted: bool) -> _Comparison:
-    """Blame no entry for which the condition that the comparison is a part of is as wanted."""
+    """Exempt entries for which the enclosing condition already has the required outcome."""
     of_each = truths if len(truths) == len(found.entries) else [*truths[:1]] * len(found.entries)
     entries = [
         entry._replace(truth=found.wanted) if truth is wanted else entry
@@ -153,7 +153,7 @@ def _only(found: _Comparison, truths: Sequence[Truth], *, wanted: bool) -> _Comp
 
 
 def _sentence(found: _Comparison) -> str:
-    """Say which numbers are not on the side of their limits that is wanted; nothing if all are."""
+    """List the numbers that are on the wrong side of their limits; empty if there are none."""
     against = [
         (place, each)
         for place, each in enumerate(found.entries, start=1)
@@ -185,7 +185,7 @@ def _sentence(found: _Comparison) -> str:
 
 
 def _written(entry: _Entry, op: type[ast.cmpop]) -> tuple[str, str]:
-    """Write a number and its limit, with so many digits that they differ if the numbers do."""
+    """Format a number and its limit with enough digits to show that they differ."""
     number, limit = entry[:2]
     ends = [exactly(each) for each in limit[1:3]] if op is ast.In else [limit]
     own, texts = "", [""]
@@ -197,5 +197,5 @@ def _written(entry: _Entry, op: type[ast.cmpop]) -> tuple[str, str]:
 
 
 def _digits(number: Interval, digits: int) -> int:
-    """Return a number of digits that writes no power of ten for what is large."""
+    """Raise the number of digits so that large numbers are written without an exponent."""
     return max(digits, len(f"{max(map(abs, number[:3])):.0f}"))

@@ -1,7 +1,7 @@
-"""Holds what an experiment yields, and its folder: tables, figures, claims, result.json.
+"""The results of an experiment, and their folder: tables, figures, claims, result.json.
 
-A result folder is built beside its place and moved there when it is whole. result.json lists what is in
-it, so that nothing else is ever replaced with it.
+A result folder is built next to its final path and moved there when it is complete. result.json lists
+its content, so that nothing else is ever replaced with it.
 """
 
 import hashlib
@@ -32,38 +32,38 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# Longer tables are no reading matter: they are Parquet alone.
+# Longer tables are not for reading and are written only as Parquet.
 CSV_ROWS = 20_000
-# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+# Increased when result.json changes incompatibly; a file without it has format 1.
 FORMAT = 1
 # The table of runs, in a result's folder.
 RUNS = Path("tables", "runs.parquet")
-# What estimators cost, which no two runs have alike: beside result.json, and without a hash in it.
+# Run times of estimators, which differ in every run: next to result.json, and without a hash in it.
 TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
-# What made a result, by which the report opens it.
+# What made a result; the report's opening depends on it.
 Kind = Literal["run", "sweep", "compare", "tune", "diagnose", "replay", "evaluate", "noise", "ellipsoid"]
 
 
 @dataclass
 class Outcome:
-    """Holds what a study found.
+    """The findings of a study.
 
     Attributes:
         metrics: by `estimator.quantity_unit[.case]`.
         claims: the statements of the paper, with our verdicts.
         tables: by name.
-        figures: charts, or pictures of another kind, by name.
-        input_sha256: a hash of the data that went in.
-        parameters: those of all estimators, defaults included.
-        bounds: where a metric lies with 95 % if all is well.
-        intervals: where the true metric lies with 95 %, by the spread over runs.
-        alarms: what makes the metrics doubtful.
-        causes: why an estimator is inconsistent, where it was diagnosed.
-        stress: what changes do that should not matter, where it was stressed.
+        figures: charts, or other pictures, by name.
+        input_sha256: a hash of the input data.
+        parameters: those of all estimators, including defaults.
+        bounds: the 95 % range of a metric if the estimator is consistent.
+        intervals: the 95 % interval of the true metric, from the spread over runs.
+        alarms: warnings about the metrics.
+        causes: why an estimator is inconsistent, if it was diagnosed.
+        stress: the effect of changes that should not matter, if it was tested.
         timings: the seconds and messages of each estimator.
-        kind: what made it.
+        kind: the command that made it.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -81,19 +81,20 @@ class Outcome:
     kind: Kind = "run"
 
     def measure(self, key: str, number: Interval) -> None:
-        """Keep the value of an Interval `number`, and its ends, as the metric `key`."""
+        """Store the value of an Interval `number`, and its ends, as the metric `key`."""
         self.metrics[key], self.intervals[key] = float(number.value), (number.low, number.high)
 
 
 class Result(Parameters):
-    """Holds what result.json says.
+    """The content of result.json.
 
-    `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
-    without it. What depends on the clock has none: a timeline, whose rows Rerun numbers by it, and
-    `TIMINGS`. `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one
-    lies with 95 %; `alarms` are what makes the metrics doubtful, the worst first; `causes` why
-    estimators are inconsistent, by a diagnosis; `stress` what changes do that should not matter, where
-    that was asked for: else its text has none. `kind` is what made it; older results do not state it.
+    `files` lists the files in the folder with their SHA-256; the hash of result.json itself is that
+    of its text without this entry. Files that depend on the clock have none: timelines, whose rows
+    Rerun numbers by time, and `TIMINGS`. `bounds` are the 95 % ranges of metrics of a consistent
+    estimator, `intervals` the 95 % intervals of the true metrics; `alarms` are warnings about the
+    metrics, the worst first; `causes` explain why estimators are inconsistent, if diagnosed;
+    `stress` is the effect of changes that should not matter, and is left out of the text if it was
+    not tested. `kind` is the command that made the result; older results do not state it.
     """
 
     format: int = FORMAT
@@ -120,7 +121,7 @@ class Result(Parameters):
 
     @property
     def made_by(self) -> Kind:
-        """Return what made it; of an older result, by its settings and name."""
+        """Return the command that made the result; for older results, infer it."""
         if self.kind is not None:
             return self.kind
         if "sides" in self.settings:
@@ -131,14 +132,14 @@ class Result(Parameters):
 
     @property
     def contents(self) -> list[str]:
-        """Return the folders and files at the top of the result's folder."""
+        """Return the top-level folders and files of the result's folder."""
         return [*dict.fromkeys(Path(name).parts[0] for name in self.files)]
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
     """Split a metric key `estimator.quantity_unit[.case]` into estimator, quantity and case.
 
-    A key without a dot is a quantity of what has no estimator: a trajectory from a file.
+    A key without a dot is a quantity without an estimator, as for a trajectory file.
     """
     if "." not in key:
         return "", key, ""
@@ -148,21 +149,21 @@ def split_metric(key: str) -> tuple[str, str, str]:
 
 
 def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
-    """Return the metrics of these estimators first and in their order, those of others as they were."""
+    """Sort metrics: those of these estimators first, in this order; the others keep their order."""
     place = {label: index for index, label in enumerate(estimators)}
     keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
     return {key: metrics[key] for key in keys}
 
 
 class Measured(NamedTuple):
-    """Holds a metric's value, or the word for it, and where it lies with 95 % if all is well."""
+    """A metric's value, or a word for it, and its 95 % range if the estimator is consistent."""
 
     value: MetricValue | str = None
     bounds: Bounds | None = None
 
     @property
     def place(self) -> Literal["below", "within", "above", ""]:
-        """Return where the value lies; nowhere where there is none, or no bounds."""
+        """Return the position of the value relative to its bounds; empty if either is missing."""
         if self.bounds is None or not isinstance(self.value, int | float):
             return ""
         low, high = self.bounds
@@ -171,7 +172,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricTable:
-    """Holds the metrics of one case, by quantity and then estimator; all estimators in one order."""
+    """The metrics of one case, by quantity and then estimator; all estimators in the same order."""
 
     case: str
     estimators: list[str]
@@ -179,9 +180,9 @@ class MetricTable:
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """Return a table of a result's folder; raises BadInput if it is damaged.
+    """Read a table of a result's folder; raises BadInput if it is damaged.
 
-    Arrow itself opens no name beyond the locale's characters.
+    Arrow itself cannot open file names outside the locale's encoding.
     """
     import pandas as pd
 
@@ -197,7 +198,7 @@ def metric_tables(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> list[MetricTable]:
-    """Return the metrics by case; with a table of runs also the interval of the mean NEES over them."""
+    """Group metrics by case; a table of runs adds the interval of the mean NEES over them."""
     over_runs = {} if runs is None else _nees_over_runs(runs)
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
     cases: dict[str, dict[str, dict[str, Measured]]] = {}
@@ -213,9 +214,9 @@ def metric_tables(
 
 
 def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
-    """Return the mean of the runs' NEES with its 95 % interval, by estimator and case.
+    """Compute the mean of the runs' NEES with its 95 % interval, by estimator and case.
 
-    Fewer than `FEWEST_RUNS` have none. A study may have a table of runs without NEES.
+    Fewer than `FEWEST_RUNS` runs have none. A study may have a table of runs without NEES.
     """
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}
@@ -229,16 +230,16 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
-    """Return a folder to fill, beside its place; it replaces an earlier result when all went well.
+    """Open a temporary folder next to `folder`; it replaces an earlier result if all goes well.
 
-    Raises BadInput where something else than a result of ours is in the place, where another process
-    is filling it, or where it cannot be written.
+    Raises BadInput if `folder` is something other than one of our results, if another process is
+    filling it, or if it cannot be written.
     """
     return whole_folder(folder, lambda found: require_ours(found, folder))
 
 
 def require_ours(found: Path, place: Path) -> None:
-    """Raise BadInput unless a folder holds a result of ours, as it was written, and nothing else."""
+    """Raise BadInput unless a folder contains an unchanged result of fuselog and nothing else."""
     try:
         result = read_result(found)
     except BadInput:
@@ -269,13 +270,13 @@ def require_ours(found: Path, place: Path) -> None:
 
 
 def _sealed(result: Result) -> Result:
-    """Put the SHA-256 of the result's own text among its files."""
+    """Add the SHA-256 of the result's own text to its files."""
     digest = _digest(result.model_dump(mode="json"))
     return result.model_copy(update={"files": {**result.files, RESULT_FILE: digest}})
 
 
 def _digest(values: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a result's own text, which is of all but itself."""
+    """Compute the SHA-256 of a result's text without its own hash."""
     files = {name: digest for name, digest in values["files"].items() if name != RESULT_FILE}
     return hashlib.sha256(_text({**values, "files": files}).encode()).hexdigest()
 
@@ -289,7 +290,7 @@ def _is_by_clock(path: Path) -> bool:
 
 
 def hash_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Compute the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -297,11 +298,11 @@ def hash_of(path: Path) -> str:
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
-    """Write tables (Parquet, short ones CSV too), figures (SVG; charts as JSON too) and result.json.
+    """Write tables (Parquet, short ones also CSV), figures (SVG, charts also JSON) and result.json.
 
-    Returns what result.json says.
+    Returns the content of result.json.
     """
-    # here, since lists and --help need none of it
+    # imported here, because lists and --help do not need them
     import matplotlib as mpl
     import pyarrow
     import pyarrow.csv
@@ -356,7 +357,7 @@ def write_outcome(
 def keep(
     folder: Path, result: Result, **found: Sequence[Cause] | Sequence[Stressing] | Sequence[Claim]
 ) -> Result:
-    """Write what was found afterwards, `causes`, or `stress` and `claims`, into a result's folder."""
+    """Add later findings (`causes`, or `stress` and `claims`) to a result's folder."""
     sealed = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
     with whole_file(folder / RESULT_FILE) as new:
         new.write_text(_text(sealed.model_dump(mode="json")), encoding="utf-8")
@@ -366,7 +367,7 @@ def keep(
 def read_result(folder: Path) -> Result:
     """Read the result.json of a result folder.
 
-    Raises BadInput where it is missing, damaged or of another format.
+    Raises BadInput if it is missing, damaged or of another format.
     """
     path = folder / RESULT_FILE
     try:
@@ -382,7 +383,7 @@ def read_result(folder: Path) -> Result:
 
 
 def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:
-    """Write metrics as JSON has them: NaN and infinity become null."""
+    """Convert metrics for JSON: NaN and infinity become null."""
     return {
         key: [_number(entry) for entry in value] if isinstance(value, list) else _number(value)
         for key, value in metrics.items()

@@ -1,4 +1,4 @@
-"""Shows what an object of the Python interface holds: in a few lines, and as tables in a notebook."""
+"""Display of objects of the Python interface: a few lines of text, and tables in a notebook."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -15,11 +15,11 @@ MOST_SENTENCES = 5
 
 
 class Shown(NamedTuple):
-    """Holds what is shown of an object.
+    """What is displayed of an object.
 
     Attributes:
-        title: what it is, in a line.
-        sentences: what has to be known of it, of which the first few are shown.
+        title: a description in one line.
+        sentences: remarks, of which the first few are displayed.
         tables: its numbers.
     """
 
@@ -29,12 +29,12 @@ class Shown(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Return it as text."""
+        """Return the display as text."""
         return "\n".join([self.title, *self._first(), *map(printed, self.tables)])
 
     @property
     def html(self) -> str:
-        """Return it as HTML for a notebook's cell."""
+        """Return the display as HTML for a notebook's cell."""
         lines = [f"<b>{escape(self.title)}</b>", *map(escape, self._first())]
         return "".join(f"<div>{line}</div>" for line in lines) + "".join(map(_html, self.tables))
 
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
 
 
 class Showing(ABC):
-    """Prints as what `_shown` gives: as text, and as HTML in a notebook."""
+    """An object that displays what `_shown` returns: as text, and as HTML in a notebook."""
 
     @property
     @abstractmethod
@@ -64,7 +64,7 @@ def shown_metrics(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> Shown:
-    """Show metrics: of several cases the medians."""
+    """Display metrics; several cases are summarised by their medians."""
     return Shown(title, sentences, tables_of(metrics, bounds, runs, most_cases=1))
 
 

@@ -1,4 +1,4 @@
-"""Summarises judged replays: metrics, tables, and figures of errors, modes, particles, late messages."""
+"""Summaries of judged replays: metrics, tables, and charts of errors, modes, particles, delays."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,12 +22,12 @@ def summarise(
     coverage: Sequence[Row] = (),
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Outcome:
-    """Sum up a judged replay: metrics, alarms, tables, figures, and what became of the log's topics.
+    """Summarise a judged replay: metrics, warnings, tables, figures, and the use of the log's topics.
 
     Args:
         judge: of all runs.
-        coverage: what became of the topics.
-        parameters: of the estimators by label, as far as they are known.
+        coverage: how many messages of each topic were used.
+        parameters: of the estimators by label, if known.
     """
     outcome = Outcome(alarms=alarms_of(judge, parameters or {}, coverage))
     if coverage:
@@ -57,7 +57,7 @@ def summarise(
 
 
 def error_charts(judge: Judge) -> dict[str, Chart]:
-    """Draw the errors of each case over time, where there are any."""
+    """Draw the errors of each case over time, if there are any."""
     steps = {topic: table for topic, table in judge.steps.items() if len(table)}
     judged = {topic: each for topic, each in judge.judged.items() if topic in steps}
     shown: dict[str, list[tuple[Errors, pd.DataFrame]]] = {}
@@ -67,15 +67,16 @@ def error_charts(judge: Judge) -> dict[str, Chart]:
 
 
 def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
-    """Return one row per metric: estimator, quantity, case, value."""
+    """Make a table with a row per metric: estimator, quantity, case, value."""
     rows = [(*split_metric(key), value) for key, value in metrics.items()]
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
 def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
-    """Draw RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent.
+    """Draw RMSE and NEES over time for all runs together, with the 95 % band of a consistent estimator.
 
-    A panel shows one estimator, a row of them has one pair of axes: curves never lie on one another.
+    Each panel shows one estimator, and the panels of a row share their axes, so that curves never
+    overlap.
     """
     first, table = judged[0]
     named = {
@@ -125,7 +126,7 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
 
 
 def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis:
-    """Make one axis for all tables: from below the least to above the greatest, none of them zero."""
+    """Make one logarithmic axis that covers the positive values of all tables."""
     values = pd.concat([table[name] for table in tables for name in columns if name in table])
     positive = values[(values > 0) & (values < float("inf"))]
     if positive.empty:
@@ -135,7 +136,7 @@ def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis
 
 
 def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
-    """Write an estimator's name, and at how many of the steps it is outside."""
+    """Write an estimator's name, and the share of steps at which it is outside its interval."""
     known = steps[[quantity, low, low.replace("_low", "_high")]].dropna()
     if known.empty:
         return label
@@ -154,7 +155,7 @@ def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
 def _outside(
     steps: pd.DataFrame, quantity: str, low: "pd.Series[float]", high: "pd.Series[float]", axis: Axis
 ) -> list[Series]:
-    """Draw a strip along the foot where a curve is outside."""
+    """Draw a strip along the bottom where a curve is outside its band."""
     is_out = (steps[quantity] < low) | (steps[quantity] > high)
     if not is_out.any() or axis.limits is None:
         return []
@@ -170,7 +171,7 @@ def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> 
 
 
 def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
-    """Draw the mean probability of each mode over time, over all runs, a panel per estimator."""
+    """Draw the mean probability of each mode over time, over all runs, one panel per estimator."""
     x, y = Axis(label="time (s)"), Axis(label="mean probability", limits=(0.0, 1.0))
     panels = {name: Panel(x=x, y=y, title=name) for name in modes["estimator"].unique()}
     for (name, mode, smoothed), rows in modes.groupby(["estimator", "mode", "smoothed"], sort=False):
@@ -183,7 +184,7 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
 
 
 def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
-    """Draw the mean share of the particles that is effective over time, all runs together."""
+    """Draw the mean effective share of the particles over time, over all runs."""
     x, y = Axis(label="time (s)"), Axis(label="effective share", limits=(0.0, 1.0))
     series = [
         curve(str(name), rows["elapsed_s"], rows["effective_share"])
@@ -194,9 +195,9 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
 
 
 def late_counts(late: pd.DataFrame) -> pd.DataFrame:
-    """Count late messages: a row per estimator, case and what became of them; see `Judge.late`.
+    """Count out-of-sequence messages: a row per estimator, case and outcome; see `Judge.late`.
 
-    With their mean delay in seconds, and how many messages were used again for them.
+    Each row has their mean delay in seconds, and how many messages were reprocessed because of them.
     """
     rows = late.assign(late_s=late["late_s"] * late["messages"])
     if "repeated" in late:
@@ -207,7 +208,7 @@ def late_counts(late: pd.DataFrame) -> pd.DataFrame:
 
 
 def late_chart(late: pd.DataFrame, case: str) -> Chart:
-    """Draw how late messages came over time and what became of them, a panel for each estimator."""
+    """Draw the delay of out-of-sequence messages over time by their outcome, one panel per estimator."""
     counts, panels = late_counts(late), []
     for name, rows in late.groupby("estimator", sort=False):
         series = [

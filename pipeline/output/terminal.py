@@ -1,6 +1,6 @@
-"""Shows progress bars and tables on the terminal. Standard output is for results alone.
+"""Progress bars and tables on the terminal. Standard output is for results only.
 
-Texts may come from a log or a file's name: what could steer a terminal is shown, not obeyed.
+Texts may come from a log or a file name, so terminal control characters are printed as visible codes.
 """
 
 import json
@@ -38,37 +38,37 @@ from fuselog.replay.judging.verdicts import Claimed
 if TYPE_CHECKING:
     import pandas as pd
 
-# Metrics of more cases than these are summarised, and stand one by one in files alone.
+# With more cases, metrics are summarised; only files list each case.
 MOST_CASES = 6
-# Who is no terminal is told how long work goes so often.
+# Interval of progress lines if standard error is not a terminal.
 TOLD_EVERY_S = 60.0
 
 
 def _console(*, stderr: bool) -> Console:
-    """Make a console for plain text, wide where no terminal breaks it."""
+    """Make a console for plain text, wide unless a terminal limits it."""
     console = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 1000
     return console
 
 
-MOST_ALARMS = 5  # that are printed
+MOST_ALARMS = 5  # number of warnings printed
 out = _console(stderr=False)
 err = _console(stderr=True)
 
 
 class OnceAMinute:
-    """Tells on standard error how long work goes where no terminal shows it, a line a minute at most."""
+    """Progress lines on standard error if it is not a terminal, at most one a minute."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Let the minute begin, as a command does."""
+        """Start the minute; called when a command begins."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
-        """Write a line, unless there was one within the last minute, or the command began in it."""
+        """Write a line, unless another was written, or the command began, within the last minute."""
         now_s = monotonic()
         if now_s - self._last_s >= TOLD_EVERY_S:
             self._last_s = now_s
@@ -79,16 +79,16 @@ once_a_minute = OnceAMinute()
 
 
 def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:
-    """Pass items through with a progress bar on standard error; no terminal has a line a minute.
+    """Yield items with a progress bar on standard error, or one line a minute if it is not a terminal.
 
-    The title is asked again after every item, as it may say how the work goes.
+    The title is converted to text again after every item, since it may report progress.
     """
     if not err.is_terminal:
         for done, item in enumerate(items, start=1):
             yield item
             once_a_minute.tell(f"{title}: {done}" + ("" if total is None else f" of {total}"))
         return
-    from rich.progress import MofNCompleteColumn, Progress  # which take long to import
+    from rich.progress import MofNCompleteColumn, Progress  # slow to import
 
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=err, transient=True) as bar:
@@ -100,7 +100,7 @@ def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable
 
 @contextmanager
 def status() -> Iterator[Callable[[str], None]]:
-    """Show how work goes, in one line on standard error; no terminal has a line a minute."""
+    """Show progress in one line on standard error, or one line a minute if it is not a terminal."""
     with err.status("", spinner="line") if err.is_terminal else nullcontext() as line:
 
         def show(text: str) -> None:
@@ -113,7 +113,7 @@ def status() -> Iterator[Callable[[str], None]]:
 
 
 def say(text: str) -> None:
-    """Print a line; the terminal breaks it, not we, so that paths stay whole."""
+    """Print a line; the terminal wraps it, so that paths stay whole."""
     out.print(printable(text), soft_wrap=True)
 
 
@@ -128,7 +128,7 @@ def warn(text: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON document, whole or not at all: what is no finite number is null."""
+    """Print one complete JSON document; numbers that are not finite become null."""
     sys.stdout.write(json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
 
 
@@ -141,7 +141,7 @@ def _finite(value: Any) -> Any:
 
 
 class PrintedTable(NamedTuple):
-    """Holds a table as it is printed."""
+    """A table to be printed."""
 
     title: str
     columns: Sequence[str]
@@ -149,12 +149,12 @@ class PrintedTable(NamedTuple):
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> None:
-    """Print a table; columns of numbers are set right, long texts are broken into lines."""
+    """Print a table; numeric columns are right-aligned, long texts are wrapped."""
     out.print(_drawn(PrintedTable(title, columns, list(rows))))
 
 
 def printed(table: PrintedTable) -> str:
-    """Return a table as text."""
+    """Format a table as text."""
     console = Console(file=StringIO(), highlight=False, markup=False, emoji=False, width=1000)
     with console.capture() as captured:
         console.print(_drawn(table))
@@ -179,9 +179,9 @@ def _drawn(printed: PrintedTable) -> Table:
 
 
 def format_value(value: object) -> str:
-    """Write four significant digits of floats, the range of many numbers, or text.
+    """Format a value: floats with four significant digits, the range of many numbers, or text.
 
-    What is no value, as NaN and infinity, is empty; see `is_value`.
+    Missing values, such as NaN and infinity, are empty; see `is_value`.
     """
     if isinstance(value, list):
         known = [each for each in value if is_value(each)]
@@ -198,7 +198,7 @@ def format_value(value: object) -> str:
 
 
 def is_value(value: object) -> bool:
-    """Tell whether a cell has a value: None, NaN, infinity and what pandas has for missing are none.
+    """Test whether a cell has a value; None, NaN, infinity and pandas' missing values do not count.
 
     >>> [is_value(each) for each in (0.0, "", None, math.nan, math.inf)]
     [True, True, False, False, False]
@@ -209,7 +209,7 @@ def is_value(value: object) -> bool:
 
 
 def has_many_cases(metrics: Mapping[str, MetricValue]) -> bool:
-    """Tell whether metrics are of so many cases that they are summarised."""
+    """Test whether metrics have so many cases that they are summarised."""
     return _number_of_cases(metrics) > MOST_CASES
 
 
@@ -225,9 +225,9 @@ def print_metrics(
 ) -> None:
     """Print metrics as tables: one per case, a row per quantity, a column per estimator.
 
-    A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
-    of runs there is also the mean NEES over them, see `metric_tables`, or why there is none. Of many
-    cases there is one table of their medians; `details` says where each of them is.
+    A value with bounds is followed by them: the 95 % range of a consistent estimator. A table of
+    runs adds the mean NEES over them, see `metric_tables`, or why there is none. Many cases are
+    summarised in one table of medians; `details` names the place with each case.
     """
     for title, columns, rows in tables_of(metrics, bounds, runs):
         print_table(columns, rows, title)
@@ -243,7 +243,7 @@ def tables_of(
     runs: "pd.DataFrame | None" = None,
     most_cases: int = MOST_CASES,
 ) -> list[PrintedTable]:
-    """Return the tables of metrics, see `print_metrics`; of more cases than `most_cases` the medians."""
+    """Make the tables of metrics, see `print_metrics`; with more cases than `most_cases`, of medians."""
     tables = metric_tables(metrics, bounds, runs)
     is_summarised = _number_of_cases(metrics) > most_cases
     found = []
@@ -259,7 +259,7 @@ def tables_of(
 
 
 def _over_cases(tables: Sequence[MetricTable]) -> PrintedTable:
-    """Return the medians over cases, the least and the greatest: a row per quantity with numbers."""
+    """Make a table of the median, minimum and maximum over cases: a row per quantity with numbers."""
     found: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for quantity, values in table.quantities.items():
@@ -292,7 +292,7 @@ def _with_bounds(measured: Measured) -> object:
 
 
 def print_pose_errors(metrics: Mapping[str, float]) -> None:
-    """Print APE and RPE: a row each, a column per statistic; then how many poses and pairs."""
+    """Print APE and RPE: a row each, a column per statistic; then the numbers of poses and pairs."""
     rows: dict[str, dict[str, float]] = {}
     counts = []
     for key, value in metrics.items():
@@ -312,7 +312,7 @@ def print_parameters(
 ) -> None:
     """Print the parameters of estimators by label: a row each, a column per estimator.
 
-    Those that a log's channels state come last, with the topic of the channel.
+    Parameters that a log's channels state come last, with the topic of the channel.
     """
     names = dict.fromkeys(name for values in parameters.values() for name in values)
     rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
@@ -322,13 +322,13 @@ def print_parameters(
 
 
 def print_worst(alarms: Sequence[Finding]) -> None:
-    """Print the worst of what makes the numbers below doubtful."""
+    """Print the worst warning about the numbers that follow."""
     for alarm in alarms[:1]:
         say(f"doubtful: {alarm.sentence}")
 
 
 def print_others(alarms: Sequence[Finding]) -> None:
-    """Print a few of the others."""
+    """Print a few of the other warnings."""
     for alarm in alarms[1:MOST_ALARMS]:
         say(f"also doubtful: {alarm.sentence}")
     if len(alarms) > MOST_ALARMS:
@@ -336,7 +336,7 @@ def print_others(alarms: Sequence[Finding]) -> None:
 
 
 def print_claims(claims: Sequence[Claim]) -> None:
-    """Print the claims, each with what the paper says and what we found, after those undecided."""
+    """Print the claims with the paper's and our numbers, after a line on claims without verdict."""
     elsewhere = sum(claim.verdict == Claimed.NO_VERDICT for claim in claims)
     if elsewhere:
         say(

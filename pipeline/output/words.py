@@ -1,4 +1,4 @@
-"""Puts quantities and numbers in words: what a person reads for `position_rmse_m`."""
+"""Names of quantities and formats of numbers for people: `position_rmse_m` becomes "position error"."""
 
 import math
 import re
@@ -9,20 +9,20 @@ from typing import NamedTuple
 from fuselog.recorders.units import parted, written
 
 DIGITS = 3
-MOST_APART = 30.0  # numbers of which one is more times another have decimals of their own
-# As people write them, not as keyboards do.
+MOST_APART = 30.0  # largest ratio of numbers that share their number of decimals
+# Typographic characters.
 MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
 
 
 class Quantity(NamedTuple):
-    """Names a quantity in words.
+    """The name and description of a quantity.
 
     Attributes:
-        name: what a person calls it.
+        name: the usual name.
         meaning: what it is, in a sentence.
-        group: of the table, which it is in.
-        unit: in which it is kept; empty where it has none.
-        aim: what it should be where that is a number that all estimators share.
+        group: the group of table rows that it belongs to.
+        unit: the unit in which it is stored; empty if it has none.
+        aim: the right value, if it is the same number for all estimators.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Quantity(NamedTuple):
 ACCURACY, CONSISTENCY, COST = "Accuracy", "Consistency", "Cost and failures"
 TRACKING, OTHER = "Targets and tracks", "Other quantities"
 _RMS = "Root mean square over all steps of all runs."
-# By pattern; the order is that of the table.
+# By key; the order is that of the table.
 QUANTITIES: dict[str, Quantity] = {
     "position_rmse_m": Quantity("position error, RMS", f"Distance to the truth. {_RMS}", ACCURACY, "m"),
     "orientation_rmse_deg": Quantity(
@@ -117,7 +117,7 @@ LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "l
 
 
 def quantity(key: str) -> Quantity:
-    """Return a quantity of a result in words; one that is not known by its own name, readably.
+    """Describe a quantity of a result; an unknown one by its own name in readable form.
 
     >>> quantity("turn_rmse_radps").name, quantity("turn_rmse_radps").unit
     ('turn error, RMS', 'rad/s')
@@ -134,7 +134,7 @@ def quantity(key: str) -> Quantity:
 
 
 def label_of(key: str, meaning: str = "") -> str:
-    """Return a quantity or a parameter as an axis has it, with the unit in which a result keeps it.
+    """Label a quantity or a parameter for an axis, with the unit in which a result stores it.
 
     >>> label_of("position_rmse_m"), label_of("sigma_range_m", "standard deviation of a range")
     ('position error, RMS (m)', 'standard deviation of a range (m)')
@@ -145,13 +145,13 @@ def label_of(key: str, meaning: str = "") -> str:
 
 
 def is_error(key: str) -> bool:
-    """Tell whether less of a quantity is better, so that estimators may be compared by it."""
+    """Test whether lower values of a quantity are better, so that estimators can be compared by it."""
     is_less_better = any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
-    return is_less_better and not key.startswith("standard_error")  # which says how sure a number is
+    return is_less_better and not key.startswith("standard_error")  # which is the precision of a number
 
 
 def meaning_alone(text: str) -> str:
-    """Return a sentence that begins with a parameter's name, with what that means in its place.
+    """Replace a parameter's name at the beginning of a sentence by its meaning.
 
     >>> meaning_alone("sigma_range_m (standard deviation of a range) is too small")
     'the standard deviation of a range is too small'
@@ -160,27 +160,27 @@ def meaning_alone(text: str) -> str:
 
 
 class Scale(NamedTuple):
-    """Gives numbers a unit that suits their size: what they are multiplied by, and the unit's sign."""
+    """A display unit for numbers: the factor they are multiplied by, and the unit's sign."""
 
     factor: float = 1.0
     sign: str = ""
 
     def text(self, value: float | None, digits: int = DIGITS) -> str:
-        """Return a number in this unit, without the unit."""
+        """Format a number in this unit, without the unit."""
         return number(None if value is None else value * self.factor, digits)
 
     def with_unit(self, value: float | None, digits: int = DIGITS) -> str:
-        """Return a number with the unit."""
+        """Format a number with the unit."""
         text = self.text(value, digits)
         return text if text == MISSING else self.signed(text)
 
     def signed(self, text: str) -> str:
-        """Return a number that was written in this unit with the unit's sign."""
+        """Append the unit's sign to a number that was formatted in this unit."""
         return f"{text}{self.sign}" if self.sign in ("", "°", "°/s") else f"{text} {self.sign}"
 
 
 def scale(unit: str, *values: float | None) -> Scale:
-    """Choose a unit for values that stand together: in it the least has a digit before the point.
+    """Choose a unit for values shown together, in which the smallest has a digit before the point.
 
     >>> scale("m", 0.0162, 0.414).with_unit(0.414), scale("rad", 0.00544).with_unit(0.00544)
     ('41.4 cm', '0.312°')
@@ -210,7 +210,7 @@ def _sign(unit: str) -> str:
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:
-    """Return a number as people write it: so many digits, no e, a true minus, commas in thousands.
+    """Format a number for people: `digits` digits, no e, a true minus, commas in thousands.
 
     >>> [number(each) for each in (0.0266714, -7514.7, 3.0, 1e-7, 0.99999, None)]
     ['0.0267', '−7,515', '3', '1 × 10⁻⁷', '1', '–']
@@ -228,27 +228,27 @@ def number(value: float | None, digits: int = DIGITS) -> str:
 
 
 def stated(value: float) -> str:
-    """Return a number that a person set, as it was set: 0.05, not 0.0500."""
+    """Format a number that a person set as it was set: 0.05, not 0.0500."""
     return f"{value:.4g}".replace("-", MINUS) if 1e-4 <= abs(value) < 1e6 else number(value)
 
 
 def _exponent(value: float, digits: int) -> int:
-    """Return the power of ten of a number that is rounded to so many digits."""
+    """Return the power of ten of a number after rounding to `digits` digits."""
     return math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
 
 
 def _bare(text: str) -> str:
-    """Remove zeros at the end that say nothing of a whole number."""
+    """Remove trailing zeros that add nothing to a whole number."""
     return re.sub(r"\.0+$", "", text)
 
 
 def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
-    """Write two ends in one unit, without the unit."""
+    """Format two ends in one unit, without the unit."""
     return " to ".join(alike([low, high], own, digits))
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Write numbers that stand together with the decimals of the largest; very unlike ones apart.
+    """Format numbers shown together with the decimals of the largest; very different ones separately.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])
@@ -267,7 +267,7 @@ def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str
 
 
 def count(number_of: int, one: str, many: str = "") -> str:
-    """Return a number of things.
+    """Format a number of things.
 
     >>> count(1, "run"), count(1200, "run")
     ('1 run', '1,200 runs')
@@ -276,5 +276,5 @@ def count(number_of: int, one: str, many: str = "") -> str:
 
 
 def listed(words: list[str]) -> str:
-    """Write words one after the other, `and` before the last."""
+    """Join words with commas, and with `and` before the last."""
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -1,10 +1,10 @@
-"""Writes the report: results as one HTML page that fetches nothing and runs only our scripts.
+"""The report: results as one HTML page that loads nothing and runs only our scripts.
 
-Begin here; `kinds` has what a section opens with, `story` the first sentences and the cards, `scene` the
-pictures of a run.
+Begin here; `kinds` writes the opening of a section, `story` the first sentences and the cards, `scene`
+the pictures of a run.
 
-Plotly draws the charts: its bundle of basic traces, which is small enough to be in every page, lies here
-as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
+Plotly draws the charts. Its bundle of basic traces, small enough to be part of every page, is in this
+folder as published (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
 """
 
 import base64
@@ -43,25 +43,25 @@ from fuselog.recorders.errors import BadInput, printable
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
 
-# On pages that have one of these, each has its own colour.
+# Each has a fixed colour on pages that show one of them.
 USUAL = ("dead-reckoning", "ekf", "ukf")
-# Longer tables (one row per step, say) stay in their Parquet and CSV files.
+# Longer tables, such as one row per step, are only in their Parquet and CSV files.
 LONGEST_TABLE = 60
-SCENES = ("scene", "lens")  # figures that a comparison keeps, which has no logs to draw
+SCENES = ("scene", "lens")  # figures kept by a comparison, which has no logs to draw
 MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
 
 class _Timings(Parameters):
-    """Holds what timings.json says: by estimator, its seconds and messages."""
+    """The content of timings.json: seconds and messages by estimator."""
 
     of: dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Holds a figure of the page, a chart or a picture, and its words for those who cannot see it."""
+    """A figure of the page, a chart or a picture, with a description for screen readers."""
 
     name: str
     caption: str
@@ -72,7 +72,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Section:
-    """Holds what the page shows of one result folder, from above to below."""
+    """What the page shows of one result folder, from top to bottom."""
 
     name: str
     title: str
@@ -97,13 +97,13 @@ def write_report(
     viewer: bool = False,
     diagnose: Callable[[Path, Result], Sequence[Cause]] | None = None,
 ) -> None:
-    """Render result folders, in the order given, as one HTML page.
+    """Render result folders, in the given order, as one HTML page.
 
-    The same folders give the same bytes, but for the pictures that `viewer` takes of their timelines.
-    `diagnose` finds the likeliest causes of a result that has none yet.
+    The same folders give the same bytes, except for screenshots of their timelines (`viewer`).
+    `diagnose` finds the likeliest causes for a result that has none yet.
 
-    Raises BadInput where a folder holds no result or a damaged one, the page cannot be written, or the
-    viewer has no driver.
+    Raises BadInput if a folder has no result or a damaged one, the page cannot be written, or the
+    viewer has no graphics driver.
     """
     results = [read_result(folder) for folder in folders]
     if diagnose is not None:
@@ -146,18 +146,18 @@ def _template() -> Template:
 
 
 def is_report(page: Path) -> bool:
-    """Tell whether a file is a page that `write_report` wrote, as it was written."""
+    """Test whether a file is an unchanged page that `write_report` wrote."""
     content = page.read_bytes()
     return content == _signed(content.rpartition(_SIGNATURE)[0])
 
 
 def _signed(page: bytes) -> bytes:
-    """Sign the page with its own SHA-256 at its end."""
+    """Append the SHA-256 of the page as its signature."""
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
 
 
 def _visible(value: object) -> object:
-    """Show control characters of a text by their numbers, in all that the page is made of."""
+    """Replace control characters of a text by their codes, everywhere on the page."""
     if not isinstance(value, str) or value.isprintable():
         return value
     hidden = {each for each in {*value} - {*"\n\t"} if not each.isprintable() and category(each) != "Zs"}
@@ -165,7 +165,7 @@ def _visible(value: object) -> object:
 
 
 def empty_cells(table: pd.DataFrame) -> list[str]:
-    """Say why cells of a table are empty: nothing to compute them from, or an infinite value."""
+    """Explain why cells of a table are empty: nothing to compute them from, or an infinite value."""
     cells = [value for row in table.itertuples(index=False) for value in row if not is_value(value)]
     infinite = sum(isinstance(value, float) and math.isinf(value) for value in cells)
     counts = {
@@ -180,24 +180,24 @@ def _asset(name: str) -> str:
 
 
 def _hashes(scripts: Sequence[str]) -> Markup:
-    """List the scripts that a browser may run, as a content security policy has them."""
+    """List the hashes of scripts that a browser may run, for the content security policy."""
     digests = [base64.b64encode(hashlib.sha256(each.encode()).digest()).decode() for each in scripts]
     return Markup(" ".join(f"'sha256-{digest}'" for digest in digests))
 
 
 def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
-    """Write a chart for the script, an estimator in one colour in a section; `<` ends no element."""
+    """Write a chart as JSON for the script, with fixed colours per estimator; `<` is escaped."""
     values = {**chart.model_dump(mode="json"), "colours": chart.colours(estimators)}
     return Markup(json.dumps(values, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _hues(labels: Sequence[str]) -> dict[str, str]:
-    """Return the class by which the page colours the name of an estimator."""
+    """Assign a CSS class for its colour to the name of each estimator."""
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
 
 
 def _named(text: str, labels: Sequence[str]) -> Markup:
-    """Write a sentence in which estimators have their colours."""
+    """Write a sentence in which the names of estimators are coloured."""
     hues = _hues(labels)
     if not hues:
         return escape(text)
@@ -249,7 +249,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         result,
         list(dict.fromkeys([*USUAL, *labels])) if {*USUAL} & {*labels} else labels,
         begun,
-        Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # which lets no HTML through
+        Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # escapes HTML
         looks,
         [*over_time, *([_chart("nis", nis)] if nis else [])],
         _legend(begun),
@@ -262,13 +262,13 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
 
 
 def _legend(begun: Opening) -> str:
-    """Say what estimators are compared by, where that is no plain error."""
+    """Explain the quantity by which estimators are compared, if it is not a plain error."""
     by = quantity(begun.found.main) if begun.found.compared else None
     return f"{by.name}: {by.meaning} Less is better." if by and by.group == TRACKING else ""
 
 
 def _timings(folder: Path, result: Result) -> Timings:
-    """Return what estimators cost; nothing where the result does not keep it."""
+    """Read the timings of estimators; empty if the result has none."""
     path = folder / TIMINGS
     if TIMINGS not in result.files or not path.is_file():
         return {}
@@ -279,7 +279,7 @@ def _timings(folder: Path, result: Result) -> Timings:
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:
-    """Rank figures: errors first, then what is drawn with intervals, then what compares the most."""
+    """Return a sort key for figures: errors first, then intervals, then the most curves."""
     chart = shown.chart or Chart(panels=[])
     has_bands = any(panel.bands for panel in chart.panels)
     return (
@@ -290,7 +290,7 @@ def _rank(shown: Shown) -> tuple[bool, bool, int]:
 
 
 def _figure(path: Path) -> Shown:
-    """Show a figure by its SVG file: as a chart where it is one, else as a picture."""
+    """Load a figure by its SVG file: as a chart if it has a description, otherwise as a picture."""
     name = unquote(path.stem)
     described = path.with_suffix(".json")
     if described.is_file():
@@ -311,7 +311,7 @@ def _chart(name: str, chart: Chart) -> Shown:
 
 
 def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: bool) -> list[Shown]:
-    """Show the first run in space: as the viewer does, or from above where it has paths, and a lens."""
+    """Show the first run in space: as in the viewer, or from above with a magnified detail."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
         return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
@@ -326,7 +326,7 @@ def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: b
 
 
 def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
-    """Return what an estimator errs in each case."""
+    """Return an estimator's error in each case."""
     by_case = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
     return {
         case: float(each.value)
@@ -336,5 +336,5 @@ def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
 
 
 def _address(kind: str, image: bytes) -> str:
-    """Write an image as its own address; what scripts and links it may hold are dead in it."""
+    """Encode an image as a data URL, in which its scripts and links are inactive."""
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"

@@ -1,6 +1,6 @@
-"""Collects what a result knows of each estimator, run by run: error, consistency, failures.
+"""Evidence about each estimator of a result, run by run: error, consistency, failures.
 
-It is computed of the metrics and of the table of runs, which all kinds of results have in one form.
+It is computed from the metrics and from the table of runs, which all kinds of results share.
 """
 
 import math
@@ -32,24 +32,24 @@ from fuselog.replay.judging.intervals import (
 )
 from fuselog.replay.judging.verdicts import DIFFER, Comparison, Consistency, Squares, decisive
 
-Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and the messages it was given
-# By what estimators are compared, where they have it; else by the first error that there is.
+Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds and number of messages
+# Estimators are compared by the first of these that they have, or else by the first error.
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
-MARGIN = 0.02  # as `fuselog compare` has it
+MARGIN = 0.02  # the default of `fuselog compare`
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Holds what is known of one estimator.
+    """Everything known about one estimator.
 
     Attributes:
         estimator: its label.
-        error: of what estimators are compared by; None where it has none.
-        squares: NEES, or that of the position, and NIS, as far as there are any.
-        failed: how many runs failed; None where that is not known.
-        runs: how many there were, of all cases.
-        share: of the time that was estimated.
-        outside: cases in which it is inconsistent, of so many.
+        error: the quantity by which estimators are compared; None if it has none.
+        squares: NEES, or NEES of the position, and NIS, if available.
+        failed: the number of failed runs; None if unknown.
+        runs: the number of runs, over all cases.
+        share: the share of the time with estimates.
+        outside: the number of cases in which it is inconsistent, and the number of cases.
     """
 
     estimator: str
@@ -62,33 +62,33 @@ class Evidence:
 
     @property
     def has_failed(self) -> bool:
-        """Tell whether it fails in every run."""
+        """Test whether the estimator fails in every run."""
         return bool(self.failed and self.failed >= self.runs)
 
     @property
     def decisive(self) -> Squares | None:
-        """Return by what it is judged: NEES, or NIS where that alone is off."""
+        """Return the squares that decide: NEES, or NIS if only NIS is off."""
         return decisive(self.squares)
 
     @property
     def verdict(self) -> Consistency:
-        """Return whether its covariances are right; undecided if it fails in every run."""
+        """Return the verdict on its covariances; undecided if it fails in every run."""
         by = None if self.has_failed else self.decisive
         return by.verdict if by is not None else Consistency.UNDECIDED
 
     @property
     def is_broken(self) -> bool:
-        """Tell whether nobody can believe it."""
+        """Test whether the estimator cannot be trusted: it fails in every run or is overconfident."""
         return self.has_failed or self.verdict == Consistency.OVERCONFIDENT
 
     @property
     def has_diverged(self) -> bool:
-        """Tell whether errors are no matter of covariances."""
+        """Test whether its errors are too large to be a matter of covariances."""
         return self.decisive is not None and self.decisive.has_diverged
 
 
 class Pair(NamedTuple):
-    """States how much more of a quantity an estimator has than another; NaN where that is unknown."""
+    """How much larger a quantity is for one estimator than for another; NaN if unknown."""
 
     first: str
     second: str
@@ -99,16 +99,16 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """Holds what a result knows of all its estimators.
+    """Everything that a result knows about its estimators.
 
     Attributes:
         tables: its metrics by case.
         rows: a row per estimator, case and run, with quantities; may be empty.
-        runs: how many runs there were.
-        labels: the estimators in their order, bounds left out.
-        bounds: labels of bounds, which nobody can take.
-        stress: what changes do that should not matter, by estimator; nothing where nobody asked.
-        pairs: what a study measured of two estimators together.
+        runs: the number of runs.
+        labels: the estimators in order, without bounds.
+        bounds: labels of bounds, which cannot be chosen.
+        stress: the effect of changes that should not matter, by estimator; empty if not tested.
+        pairs: what a study measured for two estimators together.
     """
 
     tables: list[MetricTable]
@@ -121,18 +121,18 @@ class Findings:
 
     @cached_property
     def main(self) -> str:
-        """Return the quantity by which estimators are compared; empty where there is none."""
+        """Return the quantity by which estimators are compared; empty if there is none."""
         there = [key for table in self.tables for key in table.quantities if is_error(key)]
         return next((key for key in (*PREFERRED, *there) if key in there), "")
 
     @property
     def error_name(self) -> str:
-        """Return what sentences call that quantity, such as "position error"."""
+        """Return the name of that quantity in sentences, such as "position error"."""
         return quantity(self.main).name.removesuffix(", RMS")
 
     @property
     def about_intervals(self) -> str:
-        """Say what the table's intervals are, or why it has none."""
+        """Explain the table's intervals, or why it has none."""
         few = self.runs < FEWEST_RUNS
         return f"No 95 % intervals: {too_few(self.runs)}." if few else "Small: 95 % over other runs."
 
@@ -143,7 +143,7 @@ class Findings:
 
     @cached_property
     def cases(self) -> list[dict[str, Measured]]:
-        """Return of each case in which estimators are compared their errors, by label."""
+        """Return the errors by label, for each case in which estimators are compared."""
         return [each.quantities[self.main] for each in self.tables if self.main in each.quantities]
 
     @property
@@ -152,7 +152,7 @@ class Findings:
         return [label for label in self.labels if self.of[label].error is not None]
 
     def least_in(self) -> Counter[str]:
-        """Count the cases in which each estimator errs least, of those with an error in every case."""
+        """Count the cases in which each of the compared estimators has the smallest error."""
         found: Counter[str] = Counter()
         for case in self.cases:
             of = {label: case[label].value for label in self.compared}
@@ -162,7 +162,7 @@ class Findings:
         return found
 
     def by_run(self, label: str, key: str) -> "pd.Series[float]":
-        """Return a quantity of every run: the root mean square of errors over cases, else the mean."""
+        """Return a quantity of every run, combined over cases: as RMS for errors, else as the mean."""
         if key not in self.rows:
             return pd.Series(dtype=float)
         own = self.rows[self.rows["estimator"] == label]
@@ -172,7 +172,7 @@ class Findings:
         return np.sqrt(squared).dropna()
 
     def difference(self, first: str, second: str, key: str, target: Target = None) -> Difference | None:
-        """Return what the second has more of a quantity, by the runs of both; see `fuselog compare`."""
+        """Compute how much a quantity of the second exceeds that of the first, over the runs of both."""
         both = pd.concat([self.by_run(first, key), self.by_run(second, key)], axis=1).dropna()
         if both.empty:
             return None
@@ -180,7 +180,7 @@ class Findings:
         return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
 
     def stressed(self, *labels: str) -> float:
-        """Return how far changes that should not matter move the main error, of any of these at most."""
+        """Return the largest effect of irrelevant changes on the main error of these estimators."""
         own = [self.stress[label].moved.get(self.main, 0.0) for label in labels if label in self.stress]
         return max(own, default=0.0)
 
@@ -191,7 +191,7 @@ class Findings:
         return [float(each) for each in numbers if isinstance(each, int | float)]
 
     def has_any(self, label: str, *stems: str) -> bool:
-        """Tell whether an estimator has a quantity with one of these in its name."""
+        """Test whether an estimator has a quantity with one of these strings in its name."""
         return any(
             stem in key and label in of
             for table in self.tables
@@ -219,7 +219,7 @@ class Findings:
         )
 
     def _error(self, label: str) -> Interval | None:
-        """Return the error over all cases; an estimator that lacks one of them is not compared."""
+        """Combine the error over all cases; None if the estimator lacks one of them."""
         values = self.values(label, self.main)
         if not values or len(values) < len(self.cases):
             return None
@@ -229,7 +229,7 @@ class Findings:
         return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
     def _squares(self, label: str, key: str, name: str) -> Squares | None:
-        """Return the mean over the cases, judged by the interval of one of them; None without any."""
+        """Average squares over the cases, with the widest of their intervals; None without any."""
         measured = [
             each
             for table in self.tables
@@ -247,7 +247,7 @@ class Findings:
         return Squares(name, over_cases, aim, usual)
 
     def size_of(self, usual: tuple[float, float]) -> float:
-        """Return of how many components NEES is: of as many as have this chi-square interval."""
+        """Find the number of components whose NEES has this chi-square interval."""
         from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
         sizes = range(1, 100)
@@ -256,9 +256,9 @@ class Findings:
 
 
 def relation(found: Findings, first: str, second: str) -> Comparison | None:
-    """Compare a second estimator's error with a first's by the runs; None if there are too few.
+    """Compare the error of the second estimator with that of the first by the runs; None with too few.
 
-    Of few runs, two within the margin tie.
+    With few runs, two errors within the margin count as a tie.
     """
     difference = found.difference(first, second, found.main, "low")
     verdict: Comparison | None
@@ -274,12 +274,12 @@ def relation(found: Findings, first: str, second: str) -> Comparison | None:
 
 
 def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:
-    """Tell whether changes that should not matter move one of two farther than they differ."""
+    """Test whether irrelevant changes move one of two errors by more than their difference."""
     return abs(difference) < found.stressed(first, second)
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
-    """Return what a result knows of its estimators; `tables` are those of its folder, by name."""
+    """Collect what a result knows about its estimators; `tables` are those of its folder, by name."""
     rows = tables.get("runs", pd.DataFrame())
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()
@@ -297,7 +297,7 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
 
 
 def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
-    """Pair the metrics of two estimators: quantities whose cases begin with another one's label."""
+    """Collect metrics of two estimators: their cases begin with the label of the second one."""
     labels = {split_metric(key)[0] for key in metrics}
     found: dict[str, list[Pair | None]] = {}
     for key, value in metrics.items():
@@ -306,7 +306,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
         if not others:
             found.setdefault(quantity, []).append(None)
             continue
-        second = max(others, key=len)  # of labels that begin alike
+        second = max(others, key=len)  # labels may be prefixes of each other
         low, high = (math.nan if end is None else end for end in result.intervals.get(key, (None, None)))
         more = Interval(float(value), low, high)
         rest = case.removeprefix(second).removeprefix("-")
@@ -315,7 +315,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
 
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:
-    """Count how many runs a result is of: as many as its tables have, else as its settings say."""
+    """Count the runs of a result, from its tables or else from its settings."""
     if result.made_by == "compare" and len(tables["differences"]):
         return int(tables["differences"]["runs"].max())
     logs = result.settings.get("logs")

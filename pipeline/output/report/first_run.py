@@ -1,4 +1,4 @@
-"""Reads the first run of a result, and shows its timeline."""
+"""The first run of a result, and a picture of its timeline."""
 
 import io
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from fuselog.replay.judging.judge import Judge
 Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
 PICTURE_PX = (1280, 800)
-# The innovations of so many runs are read: their mean over time is no surer of more.
+# Innovations are read from at most this many runs; more would hardly change their mean over time.
 RUNS = "estimates/run-*.mcap"
 MOST_RUNS = 20
 GAP_LIMIT_S = 0.2
@@ -28,12 +28,12 @@ GAP_LIMIT_S = 0.2
 
 @dataclass(frozen=True)
 class Followed:
-    """Holds what an estimator said of a place over time, beside the truth.
+    """The errors of an estimator's position over time, next to the truth.
 
     Attributes:
-        time_s: (n,) since the first.
-        truth, error: (n, 2) over the plane; the estimate is their sum.
-        covariance: (n, 2, 2) as the estimator claims.
+        time_s: (n,) time since the first estimate.
+        truth, error: (n, 2) in the plane; the estimate is their sum.
+        covariance: (n, 2, 2) as claimed by the estimator.
     """
 
     time_s: Floats
@@ -43,12 +43,12 @@ class Followed:
 
     @property
     def estimate(self) -> Floats:
-        """Return where the estimator says that it is, (n, 2)."""
+        """Return the estimated positions, (n, 2)."""
         return self.truth + self.error
 
     @property
     def squared(self) -> Floats:
-        """Return the squared error over what is claimed, (n,); NaN where the covariance is none."""
+        """Return the normalised squared errors, (n,); NaN if a covariance is singular."""
         found = np.full(len(self.error), np.nan)
         sound = np.linalg.det(self.covariance) > 0.0
         solved = np.linalg.solve(self.covariance[sound], self.error[sound, :, None])[..., 0]
@@ -58,7 +58,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class FirstRun:
-    """Holds the first run of a result: its log, what was estimated, and of the first case how well."""
+    """The first run of a result: its log, its estimates, and the errors in its first case."""
 
     source: Source
     output: Source
@@ -67,10 +67,10 @@ class FirstRun:
 
 
 def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None:
-    """Return the first run whose log has a truth over the plane and estimates of it; else None.
+    """Find the first run whose log has a truth in the plane and estimates of it; None if there is none.
 
-    Of several things that are estimated, such as robots, it is of the first. Raises BadInput where a log
-    is damaged.
+    If several objects, such as robots, are estimated, the first is used. Raises BadInput if a log is
+    damaged.
     """
     for log in sorted(folder.rglob("logs/run-0000.mcap")):
         estimates = log.parent.parent / "estimates" / log.name
@@ -82,7 +82,7 @@ def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None
 
 
 def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> FirstRun | None:
-    """Return a run by its log and estimates; None without truth and estimates over the plane."""
+    """Read a run from its log and estimates; None without truth and estimates in the plane."""
     found = _followed(source, output, gap_limit_s)
     if not found:
         return None
@@ -92,7 +92,7 @@ def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> First
 
 
 def _followed(source: Source, output: Source, gap_limit_s: float) -> dict[tuple[str, str], Followed]:
-    """Return by estimator and case what has errors over the plane."""
+    """Compute errors in the plane by estimator and case."""
     topics = {
         topic: each.metadata.get("truth", "")
         for topic, each in ((topic, output.empty(topic)) for topic in output.topics)
@@ -134,7 +134,7 @@ def _joined(parts: list[Followed]) -> Followed:
 
 
 def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats, Innovations]]]:
-    """Return by estimator and case the innovations of runs that are kept, with their times in s."""
+    """Read the innovations of the kept runs by estimator and case, with their times in s."""
     found: dict[tuple[str, str], list[tuple[Floats, Innovations]]] = {}
     for path in sorted(folder.glob(RUNS))[:MOST_RUNS]:
         output = LogSource(open_log(path))
@@ -150,9 +150,9 @@ def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats
 
 
 def picture_of_timeline(timeline: Path) -> bytes:
-    """Return the viewer's picture of a timeline, as WebP.
+    """Take a picture of a timeline in the viewer, as WebP.
 
-    Raises BadInput where there is no timeline, or no Vulkan driver to draw it with.
+    Raises BadInput if there is no timeline, or no Vulkan driver to draw it with.
     """
     from fuselog.replay.timeline.viewer import screenshot
 

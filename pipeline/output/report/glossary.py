@@ -1,4 +1,4 @@
-"""Explains words at a page's end: two sentences each, and where to read on."""
+"""Glossary at the end of a page: two sentences per word, and a link for further reading."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from fuselog.replay.judging.intervals import FEWEST_RUNS
 
 
 class Term(NamedTuple):
-    """Explains a word: what it means, and a page about it."""
+    """A word, its meaning, and a page about it."""
 
     name: str
     meaning: str
@@ -79,7 +79,7 @@ _TERMS = {
 
 
 def glossary(keys: set[str], *, draws: bool) -> list[Term]:
-    """Return the entries that a page with these quantities needs; with `draws` what a tie is."""
+    """Select the entries for a page with these quantities; `draws` adds the entry on ties."""
     needed = {
         "rmse": any("rmse" in key for key in keys),
         "nees": any("nees" in key for key in keys),

@@ -1,6 +1,6 @@
-"""Opens a page by the kind of its result: experiment, comparison, sweep, tuning, diagnosis.
+"""Openings of pages by kind of result: experiment, comparison, sweep, tuning, diagnosis.
 
-Begin with `opening`. Each kind has its own first sentences; cards and differences are `story`'s.
+Begin with `opening`. Each kind writes its own first sentences; `story` writes cards and differences.
 """
 
 import math
@@ -39,7 +39,7 @@ from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.verdicts import DIFFER, MATERIAL, Claimed, Comparison
 
 Tables = Mapping[str, pd.DataFrame]
-# More estimators than these are counted, and more claims that are refuted stand in the table alone.
+# More estimators are counted instead of named; more refuted claims are only in the table.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
 OF_CLAIMS: Mapping[Claimed, str] = {
@@ -50,21 +50,21 @@ OF_CLAIMS: Mapping[Claimed, str] = {
     Claimed.NO_VERDICT: "does not judge {}",
 }
 MOST_PAIRS = 3
-# The tables that sentences are made of.
+# The tables from which the sentences are written.
 TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
 
 @dataclass(frozen=True)
 class Opening:
-    """Holds what a page begins with.
+    """The beginning of a page.
 
     Attributes:
-        tried: what was tried, in a sentence.
-        story: what came of it.
-        found: what is known of the estimators.
+        tried: one sentence on what was tried.
+        story: the outcome.
+        found: what is known about the estimators.
         also: further sentences, in a list below the cards.
-        chart: a picture of this kind of result alone.
-        numbers_of: what the table of numbers is of, where that is not all that was run.
+        chart: a picture specific to this kind of result.
+        numbers_of: what the table of numbers covers, if not everything that was run.
     """
 
     tried: str
@@ -76,7 +76,7 @@ class Opening:
 
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
-    """Write how a result's page begins; `timings` are what its estimators cost, if that was kept."""
+    """Write the beginning of a result's page; `timings` are the run times of its estimators, if kept."""
     if result.made_by == "compare":
         return _of_comparison(result, tables)
     if result.made_by == "sweep":
@@ -97,14 +97,14 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
 
 
 def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
-    """Return what was tried, and what came of it, as a terminal has them; `folder` is the result's."""
+    """Write what was tried, and the outcome, for the terminal; `folder` is the result's folder."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(begun.story.verdict) or "No errors against a truth, and no claims."
 
 
 def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
-    """Return the estimators, the runs, how long each was, and where they come from."""
+    """Describe the estimators, the runs, their duration, and their source."""
     settings = result.settings
     estimators = list(settings.get("estimators") or [*found.labels, *found.bounds])
     named = listed(estimators)
@@ -121,7 +121,7 @@ def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
 
 
 def _length(tables: Tables) -> str:
-    """Say how long a run is, where a table has the time."""
+    """Describe the duration of a run, if a table has the time."""
     for name, column in (("times", "until_s"), ("steps", "elapsed_s")):
         if name in tables and column in tables[name] and len(tables[name]):
             seconds = float(tables[name][column].max())
@@ -130,9 +130,9 @@ def _length(tables: Tables) -> str:
 
 
 def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Story:
-    """Tell the story of an experiment's estimators, whatever its study measures; of no single one.
+    """Write the story of an experiment's estimators, unless they cannot be compared.
 
-    What only one of several has is no error by which to choose.
+    A quantity that only one of several estimators has is not an error by which to choose.
     """
     stated = result.settings.get("estimators") or {}
     own = replace(found, labels=[label for label in found.labels if label in stated] or found.labels)
@@ -142,7 +142,7 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
 
 
 def _with_claims(base: Story, result: Result) -> Story:
-    """Tell a story, then how many claims hold, with a card of those that do not."""
+    """Add to a story how many claims hold, and a card with those that do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     refuted = [claim.claim for claim in result.claims if claim.verdict == Claimed.REFUTED]
     notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
@@ -160,7 +160,7 @@ def _with_claims(base: Story, result: Result) -> Story:
 
 
 def claims_sentences(result: Result) -> list[str]:
-    """Say how many claims hold, and how many do not."""
+    """Summarise how many claims hold, and how many do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
     if counts[Claimed.CONFIRMED] == len(result.claims):
@@ -173,7 +173,7 @@ def claims_sentences(result: Result) -> list[str]:
 
 
 def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
-    """Tell what is wrong first; that an estimator is inconsistent is on its card."""
+    """Begin the story with what is wrong; the card says that the estimator is inconsistent."""
     first = notes[0].removeprefix("1. ") if notes else ""
     what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
@@ -182,7 +182,7 @@ def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
 
 
 def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
-    """Tell the values that were found, then whether they change what the estimator is worth."""
+    """Begin the story with the values found, followed by their effect on the estimator."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
         low, high = row["low"], row["high"]
@@ -231,7 +231,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
-    """Return the sides of a comparison as estimators: their means over the runs that both have."""
+    """Represent the sides of a comparison as estimators, with means over their common runs."""
     quantities: dict[str, dict[str, dict[str, Measured]]] = {}
     for row in tables["differences"].to_dict("records"):
         if row["case"] == "all":
@@ -240,7 +240,7 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
         aim = pd.to_numeric(row["aim"], errors="coerce")
         if row["quantity"] in ("nees", "position_nees") and math.isfinite(aim):
             bounds = chi_square_interval(int(aim), int(row["runs"]))
-        if row["quantity"] == "nis_per_component":  # of how many innovations is not kept
+        if row["quantity"] == "nis_per_component":  # the number of innovations is not stored
             bounds = (1.0 - MATERIAL, 1.0 + MATERIAL)
         of = quantities.setdefault(str(row["case"]), {}).setdefault(str(row["quantity"]), {})
         for side in ("first", "second"):
@@ -252,7 +252,7 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
 
 
 def how_many_differ(rows: pd.DataFrame) -> str:
-    """Say in how many metrics each pair differs; of many pairs together."""
+    """Summarise in how many metrics each pair differs; many pairs are counted together."""
     pairs = rows.groupby(["first", "second"], sort=False)
     if len(pairs) > MOST_PAIRS:
         number_of = int(rows["verdict"].isin(DIFFER).sum())
@@ -265,7 +265,7 @@ def how_many_differ(rows: pd.DataFrame) -> str:
 
 
 def _difference_sentence(row: Mapping[Any, Any]) -> str:
-    """Say in words what differs."""
+    """Describe one difference in words."""
     words = quantity(str(row["quantity"]))
     first, second = (_number(row[f"{side}_mean"]) for side in ("first", "second"))
     own = scale(words.unit, first, second)
@@ -285,7 +285,7 @@ def _number(value: object) -> float:
 
 
 def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
-    """Draw every metric's difference in percent, with its interval and the margin."""
+    """Draw the differences of metrics in percent, with their intervals and the margin."""
     shown = rows[(rows["margin"] > 0) & rows["low"].notna()]
     shown = shown[[key in FOREST or is_error(key) for key in shown["quantity"]]][:12]
     if shown.empty or not margin:

@@ -1,7 +1,7 @@
-"""Names the report's sections, and gives the names of estimators the colours of their curves.
+"""Names of the report's sections, and text colours for the names of estimators.
 
-A section is named by its experiment and by what is different in its settings; a colour is made dark or
-light enough to be read.
+A section is named by its experiment and the settings that differ; a curve's colour is made dark or light
+enough for text.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,15 +14,15 @@ from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.terminal import format_value
 from fuselog.pipeline.output.words import count, listed
 
-# The grounds of the page on which names stand; the first of each is the page's own.
+# Background colours behind names; the first of each is that of the page.
 LIGHT, DARK = ("#ffffff", "#fdf1f5"), ("#14171a", "#2a1a20")
 READABLE = 4.6  # WCAG 2.2, 1.4.3 asks for 4.5 to 1
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
-    """Name each result by its experiment, and of several of one by the settings that differ.
+    """Name each result by its experiment, plus settings that differ from others of the experiment.
 
-    Results of one experiment with the same settings are told apart by their folders.
+    Results with the same experiment and settings are distinguished by their folders.
     """
     names = [
         _name(result, [each for each in results if each.experiment == result.experiment])
@@ -37,7 +37,7 @@ def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[s
 def _name(result: Result, alike: Sequence[Result]) -> str:
     settings = [dict(_flat(each.settings)) for each in alike]
     own = dict(_flat(result.settings))
-    # what an estimator is given stands among the parameters that it has as well
+    # the settings of an estimator are among its parameters as well
     given = {key[1:] for each in settings for key in each if key[0] == "estimators"}
     keys = dict.fromkeys(
         key
@@ -58,7 +58,7 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
 def _flat(
     values: Mapping[str, Any], path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield all settings by the names that lead to them."""
+    """Yield all settings with the path of names that leads to each."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _flat(value, (*path, name))
@@ -67,7 +67,7 @@ def _flat(
 
 
 def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
-    """Write a heading for a person: the experiment's title, or what was done with whose logs."""
+    """Write the heading: the experiment's title, or what was done with which logs."""
     settings = result.settings
     title = str(settings.get("title") or result.experiment)
     if result.made_by == "compare":
@@ -85,13 +85,13 @@ def luminance(colour: str) -> float:
 
 
 def contrast(one: str, other: str) -> float:
-    """Compute the contrast of two colours, from 1 to 21."""
+    """Compute the contrast ratio of two colours, from 1 to 21."""
     dark, light = sorted((luminance(one), luminance(other)))
     return (light + 0.05) / (dark + 0.05)
 
 
 def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
-    """Mix the colour with black (0) or white (255) until it is read on all grounds."""
+    """Mix the colour with black (0) or white (255) until it is readable on all backgrounds."""
     channels = [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
     for share in range(0, 101, 2):
         mixed = [round(each + (towards - each) * share / 100) for each in channels]
@@ -103,5 +103,5 @@ def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
 
 @cache
 def text_colours() -> list[tuple[str, str]]:
-    """Return for each curve's colour what is read on the light page and on the dark one."""
+    """Return, for each curve colour, text colours for the light and the dark page."""
     return [(readable(each, LIGHT, 0), readable(each, DARK, 255)) for each in COLOURS]

@@ -1,4 +1,4 @@
-"""Draws the first run from above, a lens on a second that is typical of it, and NIS over time."""
+"""Charts of the first run from above, of a magnified typical second, and of NIS over time."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,15 +23,15 @@ from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.evaluation import chi_square_band, split_topic
 
 Floats = NDArray[np.float64]
-# Particles are drawn at so many times, and of each cloud so many of equal weight.
+# Number of times at which particles are drawn, and of equally weighted particles per cloud.
 CLOUDS, CLOUD_POINTS = 6, 150
 ELLIPSES, CORNERS = 6, 48
-INSIDE = float(chi2.ppf(0.95, 2))  # of a squared error over its covariance, in the plane
-# A lens is for what the scene does not show: ellipses below this share of it.
+INSIDE = float(chi2.ppf(0.95, 2))  # 95 % quantile of a normalised squared error in the plane
+# A lens shows ellipses smaller than this share of the scene.
 SMALL = 0.04
 MOST_LENSES = 3
 LENS_S, DOTS = 1.0, 6
-# A lens is at most so many times as wide as it is high, or as high as it is wide.
+# Largest ratio of width to height of a lens, and of height to width.
 WIDEST, HIGHEST = 3.6, 0.8
 MOST_COLUMNS = 3
 BINS = 60
@@ -39,7 +39,7 @@ MOST_FIXES = 600
 
 
 def plan(run: FirstRun) -> Chart:
-    """Draw the scene: truth under the estimates, landmarks, fixes, ellipses to be seen, particles."""
+    """Draw the scene: truth, estimates, landmarks, fixes, ellipses if large enough, particles."""
     longest = max(run.followed.values(), key=lambda each: len(each.time_s))
     series: list[Series] = []
     clouds = _clouds(run)
@@ -61,10 +61,11 @@ def plan(run: FirstRun) -> Chart:
 
 
 def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
-    """Draw a second of the run at one scale for estimators whose ellipses the scene is too large for.
+    """Draw one second of the run for estimators whose ellipses are too small for the scene.
 
-    It is the second whose share of truths outside the ellipses is nearest the whole run's, over all
-    estimators that are shown; of several the one nearest the middle. None where the scene shows all.
+    It is the second whose share of truths outside the ellipses is closest to that of the whole run,
+    over all estimators shown; among equals, the one closest to the middle. None if the scene shows
+    everything.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
@@ -110,7 +111,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
-    """Find when that second begins, and its length: more where estimates are rare; (0, 0) for none."""
+    """Find the start and length of that second, longer if estimates are rare; else (0, 0)."""
     if not followed or min(len(each.time_s) for each in followed) < DOTS:
         return 0.0, 0.0
     step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)
@@ -133,7 +134,7 @@ def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
 
 
 def _rows_within(each: Followed, begin_s: float, length_s: float) -> NDArray[np.int64]:
-    """Find the estimates nearest to a few times of the second, evenly spread."""
+    """Find the estimates nearest to a few evenly spaced times of the second."""
     times = np.linspace(begin_s, begin_s + length_s, DOTS)
     return np.unique(np.abs(each.time_s[:, None] - times).argmin(axis=0))
 
@@ -143,12 +144,12 @@ def _extent(points: Floats) -> float:
 
 
 def _half_axis(each: Followed) -> float:
-    """Compute the longer half axis of the ellipses, as a rule."""
+    """Compute the median longer half axis of the ellipses."""
     return float(np.sqrt(INSIDE * np.nanmedian(np.linalg.eigvalsh(each.covariance)[:, 1].clip(0.0))))
 
 
 def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
-    """Draw 95 % of the plane as an estimator claims it, at some of its estimates."""
+    """Draw the 95 % regions that an estimator claims, at some of its estimates."""
     points = _shapes(each, rows)
     return Series(
         label=label,
@@ -159,7 +160,7 @@ def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
 
 
 def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
-    """Compute the borders of ellipses, one after the other, NaN between them."""
+    """Compute the borders of ellipses, joined with NaN between them."""
     turn = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     circle = np.stack([np.cos(turn), np.sin(turn)])
     values, axes = np.linalg.eigh(each.covariance[rows])
@@ -176,7 +177,7 @@ def _landmarks(run: FirstRun) -> list[Series]:
 
 
 def _fixes(run: FirstRun) -> list[Series]:
-    """Draw measured positions of what is estimated."""
+    """Draw measured positions of the estimated object."""
     topics = [
         topic
         for topic in topics_of(run.source.topics, schemas.POSITION_FIX)
@@ -192,7 +193,7 @@ def _fixes(run: FirstRun) -> list[Series]:
 def _clouds(run: FirstRun) -> list[Series]:
     """Draw particles of densities at a few times spread over the run.
 
-    They are drawn systematically, so that a particle's chance to be shown is its weight.
+    They are sampled systematically, so that a particle's chance of being drawn is its weight.
     """
     found = []
     for topic in topics_of(run.output.topics, schemas.DENSITY_ESTIMATE):
@@ -227,16 +228,16 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
 def tracked(
     folder: Path, labels: Sequence[str], errors: Mapping[str, float], of_what: str
 ) -> Chart | None:
-    """Draw the first run of trackers from above, a panel for each of the first: tracks, true ways.
+    """Draw the first run of trackers from above, with tracks and true paths, one panel each.
 
-    Of several cases it is that of the median error. None where no run has both ways and tracks. Raises
-    BadInput where a log is damaged.
+    Of several cases, the one with the median error is drawn. None if no run has both truths and
+    tracks. Raises BadInput if a log is damaged.
 
     Args:
-        folder: the result's.
-        labels: of the trackers, in their order.
-        errors: of one of them by case.
-        of_what: what these are errors in, and of which tracker.
+        folder: the result's folder.
+        labels: the trackers in order.
+        errors: the errors of one of them by case.
+        of_what: the name of the error and of that tracker.
     """
     for case, log in _median_first(folder, errors).items():
         source = LogSource(open_log(log))
@@ -266,19 +267,19 @@ def tracked(
 
 
 def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
-    """Find the first log with estimates of each case: that of the median error, then by name."""
+    """Find the first log with estimates of each case, beginning with the case of the median error."""
     logs = {
         "/".join(log.parent.parent.relative_to(folder).parts): log
         for log in sorted(folder.rglob("logs/run-0000.mcap"))
         if (log.parent.parent / "estimates" / log.name).is_file()
     }
     by_error = sorted((case for case in logs if case in errors), key=errors.__getitem__)
-    middle = (len(by_error) - 1) // 2  # of two the one with less
+    middle = (len(by_error) - 1) // 2  # of two, the smaller
     return {case: logs[case] for case in dict.fromkeys([*by_error[middle : middle + 1], *logs])}
 
 
 def _detections(source: LogSource) -> list[Series]:
-    """Draw what the sensors of a log detected as a series of dots; bearings have no place."""
+    """Draw the detections of a log's sensors as dots; bearings alone have no position."""
     found = []
     for topic, each in source.topics.items():
         name = f"{topic.rpartition('/')[0]}/detection"
@@ -295,12 +296,12 @@ def _detections(source: LogSource) -> list[Series]:
 
 
 def _dots(label: str, points: Floats) -> Series:
-    """Draw measured places (n, 2), as many as a picture holds."""
+    """Draw measured positions (n, 2), thinned to what a picture can show."""
     return path(label, points[thinned(len(points), MOST_FIXES)], "dots", reference=True)
 
 
 def _ways(source: LogSource) -> list[Floats]:
-    """Return the true ways of the targets of a log, each (n, 2)."""
+    """Return the true paths of a log's targets, each (n, 2)."""
     topics = topics_of(source.topics, schemas.TRUTH_STATE)
     truths = [each for each in source.read(topics).values() if set(PLANE) <= {*each.components}]
     return [
@@ -311,7 +312,7 @@ def _ways(source: LogSource) -> list[Floats]:
 
 
 def _tracks(output: LogSource, label: str) -> list[Floats]:
-    """Return the tracks that an estimator gave, each (n, 2)."""
+    """Return the tracks of an estimator, each (n, 2)."""
     topic = f"/estimates/{label}/track"
     if topic not in output.topics or not set(PLANE) <= {*output.empty(topic).components}:
         return []
@@ -321,13 +322,13 @@ def _tracks(output: LogSource, label: str) -> list[Floats]:
 
 
 def _parted(ways: Sequence[Floats]) -> Floats:
-    """Join ways one after the other, NaN between them."""
+    """Join paths with NaN between them."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for way in ways for part in (way, gap)])
 
 
 def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
-    """Draw NIS over time, of runs whose estimates are kept, and where 95 % of it lies."""
+    """Draw NIS over time for runs whose estimates are kept, with its 95 % band."""
     found = innovations_of_runs(folder)
     cases = list(dict.fromkeys(case for _, case in found))
     drawn = []
@@ -368,7 +369,7 @@ def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
 def _binned(
     time_s: Floats, squared: Floats, degrees: NDArray[np.int64]
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Mean squares per component in spans of time, and where each lies with 95 %."""
+    """Average squares per component in bins of time, and compute the 95 % band of each bin."""
     width = max(float(np.ptp(time_s)) / BINS, 1e-9)
     place = np.minimum(((time_s - time_s.min()) / width).astype(int), BINS - 1)
     counts = np.bincount(place, degrees, BINS)

@@ -1,4 +1,4 @@
-"""Makes the table of metrics: estimators as columns, a dozen rows, the rest below."""
+"""The table of metrics: estimators as columns, a dozen rows, the rest folded below."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
 
 
 class Cell(NamedTuple):
-    """Holds a number of a table, what stands small beside it, and if it is the best or out of bounds."""
+    """A number of a table, its small print, and whether it is the best or out of bounds."""
 
     text: str
     small: str = ""
@@ -43,7 +43,7 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """Holds a quantity of all estimators; `key` is what the result calls it."""
+    """One quantity for all estimators; `key` is its name in the result."""
 
     key: str
     name: str
@@ -55,7 +55,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Sheet:
-    """Holds a table: its groups of rows, and those that stand folded below."""
+    """A table: groups of rows, and further rows that are folded below."""
 
     title: str
     columns: list[str]
@@ -64,15 +64,16 @@ class Sheet:
 
     @property
     def has_missing(self) -> bool:
-        """Tell whether a cell has no value."""
+        """Test whether a cell has no value."""
         rows = [row for of in (*self.groups.values(), self.more) for row in of]
         return any(cell.text == MISSING for row in rows for cell in row.cells)
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """Return the table of a result, and of several cases one each; None without numbers.
+    """Make the table of a result, and one for each of several cases; None without numbers.
 
-    Whom to take stands in the first column, which is seen first where the table is wider than the page.
+    The recommended estimator is in the first column, which is visible even if the table is wider
+    than the page.
     """
     take, _ = choice_of(found)
     columns = list(dict.fromkeys([*filter(None, [take]), *found.labels, *found.bounds]))
@@ -88,7 +89,7 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
 
 
 def table_of_pairs(found: Findings) -> pd.DataFrame:
-    """Tabulate what one estimator has more than another: a row by pair and quantity, a case a column."""
+    """Tabulate differences between two estimators: a row per pair and quantity, a column per case."""
     rows: dict[tuple[str, str, str], dict[str, str]] = {}
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
@@ -177,7 +178,7 @@ def _row(
 
 
 def _is_out(found: Findings, key: str, each: Measured) -> bool:
-    """Tell whether a number of NEES or NIS with bounds is not that of a consistent estimator."""
+    """Test whether a NEES or NIS with bounds is outside those of a consistent estimator."""
     if each.bounds is None or not isinstance(each.value, int | float):
         return False
     aim = 1.0 if key == "nis_per_component" else found.size_of(each.bounds)
@@ -186,7 +187,7 @@ def _is_out(found: Findings, key: str, each: Measured) -> bool:
 
 
 def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
-    """Say where a value lies with 95 % over other runs, where one case has a table of runs."""
+    """Write the 95 % interval of a value over runs, if the result has a table of runs."""
     stem = key.replace("_rmse", "")
     column = key if key in found.rows else f"rmse_{stem}"
     if quantity(key).group not in (ACCURACY, CONSISTENCY) or column not in found.rows:
@@ -197,14 +198,14 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
 
 
 def _aim(found: Findings, key: str) -> str:
-    """Say how large NEES should be, where all estimators have as many components."""
+    """Write the right NEES, if all estimators have the same number of components."""
     squares = [by for each in found.of.values() for by in each.squares]
     sizes = {number(by.aim) for by in squares if by.name == "NEES"}
     return next(iter(sizes)) if key == "nees" and len(sizes) == 1 else ""
 
 
 def _best(key: str, numbers: Mapping[str, float], aim: str) -> set[str]:
-    """Find who has the best value, and who is as good but for the margin."""
+    """Find the estimators whose value is the best, or within the margin of the best."""
     target = target_of(key) or ("low" if quantity(key).group == ACCURACY else None)
     finite = {label: value for label, value in numbers.items() if math.isfinite(value)}
     if target not in ("low", "high") or len(finite) < 2 or len({*finite.values()}) == 1 or aim:

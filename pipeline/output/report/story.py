@@ -1,6 +1,6 @@
-"""Tells the story of a result: what was tried, what to do, a card per estimator, what differs.
+"""The story of a result: what was tried, what to do, a card per estimator, what differs.
 
-It is data: sentences and numbers. The template only sets it.
+It is data (sentences and numbers); the template only lays it out.
 """
 
 import math
@@ -34,14 +34,14 @@ from fuselog.replay.judging.diagnostics import LEAST_SHARE
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
 
-CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
-TIMED_S = 0.02  # if it was measured for so long
+CHEAPER = 0.9  # a run time below this share of another's is mentioned,
+TIMED_S = 0.02  # if it was measured over at least this time
 
 NONE_SOUND = "Believe none of them as they are set."
 NONE_SOUND_AT_BEST = "Where each errs least, none of them can be believed."
 MOST_CARDS = 4
-MOST_NAMED = 4  # more estimators are counted
-# What the checks of a replay found, of the estimators that they found it of.
+MOST_NAMED = 4  # more estimators are counted instead of named
+# Findings of the checks of a replay, phrased for the estimators concerned.
 _OF_COVARIANCES = {"innovations": "innovations", "errors": "errors"}
 _CHECKS: dict[str, Callable[[str], str]] = {
     "uninformed": lambda whose: (
@@ -60,20 +60,20 @@ _CHECKS: dict[str, Callable[[str], str]] = {
     "unused": lambda whose: f"{whose}, as measurements came to nothing",
     "gates": lambda _: "likelihoods: the gates differ, so that they are of different measurements",
 }
-# It goes from a third of the aim to ten times the aim, evenly in the logarithm.
+# The scale is logarithmic, from a third of the aim to ten times the aim.
 GAUGE_ENDS = (1 / 3, 10.0)
 Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
 class Gauge(NamedTuple):
-    """Shows where a mean of squares lies, in percent of a scale from conservative to overconfident.
+    """The position of a mean of squares on a scale from conservative to overconfident, in percent.
 
     Attributes:
-        usual: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
-        aim, value: the right value, and the one that was found.
-        spread: where the latter lies with 95 %; both ends at it where that is not known.
-        is_beyond: whether the value lies beyond the scale's end.
-        words: the same for who cannot see it.
+        usual: the range that counts as consistent: the 95 % range, or small deviations.
+        aim, value: the right value, and the one found.
+        spread: the 95 % interval of the value; both ends are the value if it is unknown.
+        is_beyond: whether the value is beyond the end of the scale.
+        words: a description for screen readers.
     """
 
     usual: tuple[float, float]
@@ -86,9 +86,9 @@ class Gauge(NamedTuple):
 
 @dataclass(frozen=True)
 class Card:
-    """What is said of one estimator: how good it is, if it can be believed, why not, what it costs.
+    """The card of one estimator: its accuracy, whether it can be trusted, why not, and its cost.
 
-    The look `claims` is of the card that says how many of a result's claims hold.
+    The card with the look `claims` states how many of a result's claims hold.
     """
 
     estimator: str
@@ -109,13 +109,13 @@ class Card:
 
 @dataclass(frozen=True)
 class Story:
-    """Says what a page says of a result, first of all.
+    """What a page says about a result, first of all.
 
     Attributes:
         verdict: what to do, the most important sentence first.
-        cards: of the estimators, whom to take first, then who cannot be believed.
-        draws: sentences on pairs that cannot be told apart, differences: on those that can.
-        left_out: estimators that have no card.
+        cards: of the estimators: the recommended one, then those that cannot be trusted.
+        draws: sentences on pairs that cannot be distinguished; `differences` on those that can.
+        left_out: estimators without a card.
         doubts: what is doubtful, in a few words each, the worst first.
     """
 
@@ -135,9 +135,9 @@ def story(
     *,
     at_best: bool = False,
 ) -> Story:
-    """Return the story of estimators that were judged; `at_best`, each at the point where it errs least.
+    """Write the story of judged estimators; with `at_best`, each at its point of smallest error.
 
-    Causes, what each cost, and alarms are told where they are known.
+    Causes, run times and warnings are included if they are given.
     """
     known = [each for each in found.of.values() if each.error is not None]
     broken = broken_of(found)
@@ -166,7 +166,7 @@ def _verdict(
     timings: Timings,
     none_sound: str,
 ) -> list[str]:
-    """Say what to do, then who cannot be believed, and why."""
+    """Write what to do, then which estimators cannot be trusted, and why."""
     if not found.labels:
         return []
     if len(found.labels) == 1:
@@ -190,7 +190,7 @@ def _advice(
     own: Scale,
     timings: Timings,
 ) -> str:
-    """Say whom to take; or that who errs least is not to be believed."""
+    """Recommend an estimator, or write that the one with the smallest error cannot be trusted."""
     error = found.of[take].error
     main = found.error_name
     better = [
@@ -232,7 +232,7 @@ def _advice(
 
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
-    """Say who of equally good estimators needs the least time, where that is known and matters."""
+    """Name the fastest of equally good estimators, if the difference matters."""
     of = sorted((timings.get(label, {}).get("seconds", 0.0), label) for label in labels)[:2]
     if len(of) < 2 or not TIMED_S < of[0][0] < CHEAPER * of[1][0]:
         return ""
@@ -241,7 +241,7 @@ def _cheapest(labels: list[str], timings: Timings) -> str:
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
-    """Say what there is of the only estimator."""
+    """Write what is known about the only estimator."""
     error = f"{found.error_name} of {_value(only.error, own)} RMS"
     errs = f"{only.estimator} has a {error}" if only.error else ""
     if only.is_broken:
@@ -253,7 +253,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 
 
 def _of_innovations(found: Findings) -> str:
-    """Say what is known without a truth."""
+    """Write what is known without a truth."""
     right = [each.estimator for each in found.of.values() if each.verdict == Consistency.CONSISTENT]
     without = "Without a truth nobody's error is known"
     if not right:
@@ -267,7 +267,7 @@ def _value(error: Interval | None, own: Scale) -> str:
 
 
 def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
-    """Say in a sentence why an estimator is not to be believed."""
+    """Explain in a sentence why an estimator cannot be trusted."""
     if each.decisive is None or each.decisive.verdict != Consistency.OVERCONFIDENT:
         return f"{each.estimator} fails in every run."
     how = "is overconfident" if each.decisive.is_far else "is slightly overconfident"
@@ -282,7 +282,7 @@ def _times(factor: float) -> str:
 
 
 def _claim(each: Evidence, runs: int) -> str:
-    """Say in a few words what errors are to what is claimed of them."""
+    """Compare errors with the claimed covariance in a few words."""
     by = each.decisive
     if by is None:
         return "its covariance was not judged"
@@ -326,7 +326,7 @@ def _card(
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
-    """Return how a card looks, its sign, and its word."""
+    """Return a card's look, its mark, and its label."""
     verdict = each.verdict
     if each.has_failed:
         return "broken", "✕", "Fails in every run"
@@ -350,7 +350,7 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
 
 
 def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list[str]:
-    """Say what else is worth a sentence."""
+    """Collect remarks for a card."""
     notes = _of_tracks(found, each.estimator)
     best = found.of[take].error if take else None
     if each.estimator == take and len(found.labels) > 1 and not equal:
@@ -371,7 +371,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
 
 
 def _of_tracks(found: Findings, label: str) -> list[str]:
-    """Say what a tracker misses, invents and mixes up, on average."""
+    """Summarise a tracker's missed targets, false targets and identity switches."""
     counts = []
     for key, words in (("missed_targets", "missed"), ("false_targets", "false")):
         values = found.values(label, key)
@@ -385,7 +385,7 @@ def _of_tracks(found: Findings, label: str) -> list[str]:
 
 
 def _in_how_many(found: Findings, take: str) -> list[str]:
-    """Say in how many cases the best is the best, or in how many runs of the only one."""
+    """Count the cases, or the runs of the only case, in which the best estimator is the best."""
     import pandas as pd
 
     if len(found.cases) > 1:
@@ -401,7 +401,7 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
 
 
 def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
-    """Say what it cost, also beside the one to take, and how often it failed."""
+    """Write the run time, also relative to the recommended estimator, and the number of failures."""
     foot = []
     own, best = (timings.get(label, {}) for label in (each.estimator, take))
     seconds, messages = own.get("seconds", 0.0), own.get("messages", 0.0)
@@ -417,14 +417,14 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
 
 
 def _beside(factor: float, take: str) -> str:
-    """Say how much time an estimator needs, beside the one to take."""
+    """Compare an estimator's run time with that of the recommended one."""
     if CHEAPER <= factor <= 1.0 / CHEAPER:
         return f"; a run takes as long as with {take}"
     return f"; a run takes {number(factor, 2)} times as long as with {take}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
-    """Say which estimators cannot be told apart, and what differences are beyond chance."""
+    """Write which estimators cannot be distinguished, and which differences exceed chance."""
     draws, differences = [], []
     main = found.error_name
     for label in labels if take else ():
@@ -455,11 +455,11 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
     return draws, differences
 
 
-# Whom to take
+# Which estimator to take
 
 
 def broken_of(found: Findings) -> list[Evidence]:
-    """List who cannot be believed: who fails, then who is overconfident, the worst first."""
+    """List the estimators that cannot be trusted: failing ones, then overconfident ones, worst first."""
 
     def badness(each: Evidence) -> float:
         return math.inf if each.has_failed else each.decisive.factor if each.decisive else 0.0
@@ -469,9 +469,9 @@ def broken_of(found: Findings) -> list[Evidence]:
 
 
 def choice_of(found: Findings) -> tuple[str, list[str]]:
-    """Choose whom to take, empty where there is none, and who draws with it, of the believable.
+    """Choose the trusted estimator to take (empty if there is none), and those that tie with it.
 
-    Of those that draw, whose covariances are too large comes last.
+    Among ties, conservative estimators come last.
     """
     sound = [each for each in found.of.values() if each.error is not None and not each.is_broken]
     if not sound:
@@ -484,7 +484,7 @@ def choice_of(found: Findings) -> tuple[str, list[str]]:
 
 
 def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """Order estimators: whom to take, who cannot be believed, worst first, the others by error."""
+    """Order estimators: the recommended ones, the untrusted ones (worst first), the others by error."""
     rest = sorted(
         found.labels,
         key=lambda label: error.value if (error := found.of[label].error) else math.inf,
@@ -494,7 +494,7 @@ def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str
 
 
 def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
-    """Choose whom to take of estimators that err alike, and these: conservative ones only if all are."""
+    """Recommend one of the tied estimators; conservative ones are candidates only if all are."""
     careful = [label for label in tied if found.of[label].verdict == Consistency.CONSERVATIVE]
     left = [label for label in tied if label not in careful] or tied
     whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"
@@ -507,11 +507,11 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
     return f"take {whom}", left
 
 
-# What is doubtful
+# Doubts
 
 
 def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequence[str]) -> list[str]:
-    """Return what is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
+    """List what is doubtful: `take` is the recommended estimator, `equal` are those as good."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),
@@ -524,7 +524,7 @@ def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequ
 
 
 def named(labels: Sequence[str], among: int = 0) -> str:
-    """Name estimators where they are few; `among` is how many there are."""
+    """Name estimators, or count them if they are many; `among` is the number of all."""
     if len(labels) == among > 1:
         return "both" if among == 2 else f"all {among}"
     if len(labels) > MOST_NAMED:
@@ -533,7 +533,7 @@ def named(labels: Sequence[str], among: int = 0) -> str:
 
 
 def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
-    """Say whose covariances are not right, by what."""
+    """List the estimators whose covariances are wrong, and how."""
     verdicts = {label: each.verdict for label, each in found.of.items()}
     sentences = []
     diverged = [label for label in found.labels if found.of[label].has_diverged]
@@ -557,7 +557,7 @@ def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
 
 
 def _of_checks(alarms: Sequence[Finding]) -> list[str]:
-    """Say what else the checks of a replay found."""
+    """List what else the checks of a replay found."""
     whose: dict[str, list[str]] = {}
     for each in alarms:
         if each.kind in _CHECKS:
@@ -574,7 +574,7 @@ def _of_failures(found: Findings) -> list[str]:
 
 
 def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
-    """Say in how many cases another one errs less than the one to take."""
+    """Count the cases in which another estimator has a smaller error than the recommended one."""
     best = found.least_in()
     others = {label: number for label, number in best.items() if label not in (take, *equal)}
     if not take or len(found.cases) < 2 or not others:
@@ -587,7 +587,7 @@ def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
 
 
 def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Sequence[str]) -> list[str]:
-    """Say what so few runs leave open."""
+    """List what the number of runs leaves open."""
     runs = count(found.runs, "run")
     if compared and found.runs < FEWEST_RUNS:
         do = "does" if found.runs == 1 else "do"
@@ -604,7 +604,7 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
 
 
 def _of_what_is_not_known(found: Findings) -> list[str]:
-    """Say who was not judged, or not compared."""
+    """List the estimators that were not judged, or not compared."""
     unknown = []
     unjudged = [
         label
@@ -622,11 +622,11 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
     return unknown
 
 
-# The gauge of a card
+# Gauge
 
 
 def numbers_of(by: Squares) -> str:
-    """Return the mean of squares with its interval, and what is right."""
+    """Write the mean of squares with its interval, and the right value."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
@@ -635,7 +635,7 @@ def numbers_of(by: Squares) -> str:
 
 
 def gauge(by: Squares) -> Gauge:
-    """Return where a mean of squares lies on its scale."""
+    """Place a mean of squares on the scale of a gauge."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)

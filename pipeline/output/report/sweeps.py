@@ -1,7 +1,7 @@
-"""Opens the page of a sweep: whom to take at which point, and what chance leaves open.
+"""Openings of the pages of sweeps: which estimator to take at which point, and what chance leaves open.
 
-Of each estimator the point at which it errs least is told as an experiment of its own: `story` tells
-whom of these to take. Points at which it is overconfident count only where it is so at all of them.
+Each estimator is represented by the point with its smallest error, and `story` recommends one as in an
+experiment. Points at which it is overconfident count only if it is overconfident at all points.
 """
 
 import math
@@ -25,20 +25,20 @@ from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.judging.verdicts import Comparison, Consistency, Squares
 
-MOST_POINTS = 4  # more are counted
+MOST_POINTS = 4  # more points are counted instead of named
 RUNS_TABLE = "sweep-runs"  # errors of every run at every point
 Tables = Mapping[str, pd.DataFrame]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Holds a sweep's result, and what the sentences are made of.
+    """A sweep's result, and the data for its sentences.
 
     Attributes:
-        result: what was swept.
+        result: the result of the sweep.
         table: a row per point, estimator, quantity and case.
-        rows: errors of every run at every point; empty where the result does not keep them.
-        runs: how many there are at each point.
+        rows: errors of every run at every point; empty if the result does not have them.
+        runs: the number of runs at each point.
     """
 
     result: Result
@@ -53,11 +53,11 @@ class Sweep:
 
     @cached_property
     def main(self) -> str:
-        """Return the error by which points are compared; empty where there is none."""
+        """Return the error by which points are compared; empty if there is none."""
         return next((key for key in self.table["quantity"].unique() if is_error(key)), "")
 
     def errors(self, label: str) -> "pd.Series[float]":
-        """Return an estimator's error at each point, over all cases."""
+        """Compute an estimator's error at each point, over all cases."""
         table = self.table
         is_own = (table["estimator"] == label) & (table["quantity"] == self.main)
         own = table[is_own].dropna(subset=["value"])
@@ -67,7 +67,7 @@ class Sweep:
         return own.groupby("point")["value"].mean()
 
     def consistency(self, label: str, point: int) -> Squares | None:
-        """Return NEES at a point, where the sweep kept its interval: of the first case."""
+        """Return NEES of the first case at a point, if the sweep stored its interval."""
         table = self.table
         if "bound_low" not in table:
             return None
@@ -80,12 +80,12 @@ class Sweep:
         return Squares("NEES", Interval(float(row["value"])), float(row["aim"]), ends)
 
     def is_overconfident(self, label: str, point: int) -> bool:
-        """Tell whether an estimator is overconfident at a point."""
+        """Test whether an estimator is overconfident at a point."""
         by = self.consistency(label, point)
         return by is not None and by.verdict == Consistency.OVERCONFIDENT
 
     def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
-        """Return estimators at one point each, as if these were an experiment: by name and point."""
+        """Collect findings for estimators at one point each, as if for an experiment."""
         metrics, bounds, rows = {}, {}, []
         for name, (label, point) in places.items():
             own = self.table[(self.table["estimator"] == label) & (self.table["point"] == point)]
@@ -102,7 +102,7 @@ class Sweep:
 
     @property
     def of_world(self) -> bool:
-        """Tell whether the scenario is swept too: then points are not better or worse, but other."""
+        """Test whether the scenario is swept too, so that no point is better than another."""
         estimators: Mapping[str, Any] = self.result.settings.get("estimators") or {}
         of_all = {key for values in estimators.values() for key in values}
         return any(
@@ -110,7 +110,7 @@ class Sweep:
         )
 
     def everywhere(self) -> Findings:
-        """Return estimators at all points, as if each of these were a case of an experiment."""
+        """Collect findings over all points, as if each point were a case of an experiment."""
         metrics, bounds = {}, {}
         for row in self.table.to_dict("records"):
             case = ", ".join(filter(None, (self.where(int(row["point"]), brief=True), row["case"])))
@@ -122,7 +122,7 @@ class Sweep:
         return findings(here, {"runs": self.rows})
 
     def where(self, point: int, *, brief: bool = False) -> str:
-        """Return the values at a point in words: with what they are of, or `brief`."""
+        """Write the values at a point in words: with their names, or without if `brief`."""
         parts = []
         for key, value in self.points[point].items():
             text = f"{_value(value)} {written(unit_of(key)) if _is_number(value) else ''}".rstrip()
@@ -130,16 +130,17 @@ class Sweep:
         return f"({', '.join(parts)})" if brief and len(parts) > 1 else ", ".join(parts)
 
     def name(self, key: str, *, with_key: bool = False) -> str:
-        """Return what a parameter is: what it means, where that is known."""
+        """Return the name of a parameter: its meaning, if known."""
         meaning = str(self.result.settings.get("meanings", {}).get(key, ""))
         name = meaning or quantity(key.rpartition(".")[2]).name
         return f"{name} ({key})" if with_key else name
 
 
 def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings]:
-    """Return what was tried, whom to take at which point, and the findings that this follows from.
+    """Write what was tried, which estimator to take at which point, and the findings behind it.
 
-    Where the scenario is swept, nobody chooses the point: estimators are told over all of them.
+    If the scenario is swept, a user cannot choose the point, so estimators are judged over all
+    points.
     """
     table = tables["sweep"]
     sweep = Sweep(result, table, tables.get(RUNS_TABLE, pd.DataFrame()), runs_of(result, tables))
@@ -164,7 +165,7 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
 
 
 def _tried(sweep: Sweep, labels: list[str]) -> str:
-    """Say over which values, with how many runs, of whom."""
+    """Describe the values, the number of runs, and the estimators of a sweep."""
     over = []
     for key in sweep.points[0]:
         unit = written(unit_of(key))
@@ -178,7 +179,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
-    """Find where an estimator errs least, if possible of the points where it is not overconfident."""
+    """Find the point with an estimator's smallest error, where it is not overconfident if possible."""
     sure = [point for point in own.index if sweep.is_overconfident(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])
@@ -195,7 +196,7 @@ def _with_points(
     best: Mapping[str, int],
     still: list[str],
 ) -> Story:
-    """Tell the story of estimators at their best points, with these points."""
+    """Add the best points to the story of estimators at these points."""
     moved = [label for label in errors if label not in still]
     sentences = []
     for point in dict.fromkeys(best[label] for label in moved):
@@ -223,7 +224,7 @@ def _with_points(
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
-    """Find the other points at which it errs as little, but for chance or less than the margin."""
+    """Find the other points with the same error, within chance or the margin."""
     found = sweep.at({str(point): (label, int(point)) for point in own.index})
     return [
         int(point)
@@ -245,7 +246,7 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
 
 
 def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
-    """Say what is doubtful of a best point."""
+    """List what is doubtful about a best point."""
     parts = []
     sure = [int(point) for point in own.index if sweep.is_overconfident(label, int(point))]
     if sure and best not in sure:
