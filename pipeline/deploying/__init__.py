@@ -1,5 +1,5 @@
-"""Writes a filter as C99 for a robot: `fuselog deploy`.
+"""Filters written as C99 for a robot: `fuselog deploy`.
 
 Begin reading in `deploying`, which chooses and writes. `c_source` writes the filter itself; `c_replay`
-lets fuselog replay it, and `c_test` makes a recorded log its test.
+lets fuselog replay it, and `c_test` turns a recorded log into its test.
 """

@@ -1,4 +1,4 @@
-"""Lets fuselog replay a filter in C: writes `fuselog_filter.h`, over the filter's own functions."""
+"""The interface by which fuselog replays a filter in C: an implementation of `fuselog_filter.h`."""
 
 import json
 from typing import Any
@@ -12,7 +12,7 @@ from fuselog.replay.inference.model.model import Map, Sensor
 
 
 def why_no_replay(made: CFilter) -> str:
-    """Explain why fuselog cannot replay the C; empty where it can."""
+    """Explain why fuselog cannot replay the C; "" if it can."""
     stage, found = made.filtering.stage, made.filtering.found
     if made.is_interpolated:
         return "its control is interpolated, so that messages wait for the next one of it"
@@ -29,7 +29,7 @@ def why_no_replay(made: CFilter) -> str:
 
 
 def _maps(made: CFilter) -> list[Map]:
-    """List the maps that sensors refer to, each once."""
+    """List the maps that sensors refer to, without repetitions."""
     found = {each.topic: each for _, sensor in made.sensors for each in sensor.maps}
     return list(found.values())
 
@@ -99,7 +99,10 @@ def _description(made: CFilter, reading: Reading) -> str:
 
 
 def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
-    """List the parameters: name, where it stands, value; by part where parts differ in it."""
+    """List the parameters: name, where each is in C, value.
+
+    A parameter whose value differs between parts is listed once per part.
+    """
     places: dict[str, dict[str, float]] = {}
     for part, values in made.values.items():
         for name, value in values.items():
@@ -115,7 +118,7 @@ def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
 
 
 def _role(place: str, reading: Reading) -> Role:
-    """Say what the parameter in this place is to the filter, by what the model's functions read."""
+    """Find the role of a parameter by what the model's functions read."""
     _, _, name = place.partition(".")
     topics = {identifier(field_of(key)): topic for key, topic in reading.noises.items()}
     if name in topics:
@@ -125,13 +128,13 @@ def _role(place: str, reading: Reading) -> Role:
 
 
 def _literal(text: str) -> str:
-    """Write a string of C, in lines."""
+    """Write a string literal of C over several lines."""
     pieces = [text[first : first + 90] for first in range(0, len(text), 90)]
     return "\n".join(f"    {json.dumps(each)}" for each in pieces)
 
 
 def replay_text(made: CFilter, reading: Reading) -> str:
-    """Write NAME_replay.c."""
+    """Write the text of NAME_replay.c."""
     maps = _maps(made)
     parameters = _parameters(made)
     sets = "".join(
@@ -315,7 +318,7 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
-    """Write what is done with a message of a sensor: its numbers, in their order, are handed over."""
+    """Write the code that passes the numbers of a sensor's message to the update, in their order."""
     m = len(sensor.measured)
     ids = list(dict.fromkeys(each.of for each in sensor.maps))
     first = len(ids)

@@ -1,4 +1,4 @@
-"""Runs a filter's test on a Cortex-M4F: QEMU emulates one on Arm's board MPS2, image AN386."""
+"""A filter's test on a Cortex-M4F: QEMU emulates one on Arm's board MPS2, image AN386."""
 
 MACHINE = "mps2-an386"
 TARGET_OPTIONS = (
@@ -52,11 +52,11 @@ unsigned long instructions(void) { return 40UL * (0xFFFFFFUL - REGISTER(0xE000E0
 
 
 def target_lines(name: str, *, argument: str) -> list[str]:
-    """Write the commands that build a filter's test for the target, and run it in QEMU.
+    """Write the commands that build a filter's test for the target and run it in QEMU.
 
     Args:
-        name: the filter's.
-        argument: the test's, how far it may be from fuselog's own filter.
+        name: the filter's name.
+        argument: the test's argument, the allowed difference from fuselog's own filter.
     """
     return [
         f"arm-none-eabi-gcc {TARGET_OPTIONS} cortex_m4f.c test_{name}.c {name}.c -lm -o test_{name}.elf",

@@ -1,4 +1,4 @@
-"""Makes a recorded log a test of a filter in C: what it is handed, and what ours makes of it."""
+"""A recorded log as a test of a filter in C: its inputs, and the results of fuselog's own filter."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,17 +19,17 @@ from fuselog.replay.inference.run.filtering import Filter, FilterState
 from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 
 MOST_EVENTS = 400  # more only until every sensor has a message
-FAR = 1e4  # how far outliers are from what was measured, in units of it and one
+FAR = 1e4  # distance of outliers from the measurement, in units of one plus its size
 
 
 class Vectors(NamedTuple):
-    """Holds a log as a filter takes it, and what the filter makes of it.
+    """A log as a filter takes it, and the filter's results.
 
     Attributes:
         start_ns, mean, covariance: the prior.
         time_ns, source, data: of the events (n,), (n,), (n, width).
-        accepted, nis: of the measurements (n,), -1 and NaN where nothing is measured.
-        judged: (n,) rows of the estimates after events, -1 where there is none.
+        accepted, nis: of the measurements (n,), -1 and NaN if nothing is measured.
+        judged: (n,) rows of the estimates after events, -1 if there is none.
         means, covariances: the estimates.
     """
 
@@ -47,7 +47,7 @@ class Vectors(NamedTuple):
 
 
 def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vectors:
-    """Run a filter over the first messages of a log from its start on, and outliers among them.
+    """Run a filter over the first messages of a log from its start, with outliers among them.
 
     Raises BadInput if the filter does not start in the log, estimates nothing, or accepts nothing.
     """
@@ -88,12 +88,12 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
 
 
 def _handed(source: LogSource, bound: Recursive, filtering: Filter) -> tuple[FilterState, FilterEvents]:
-    """Replay a log: the filter's first state, and the events that it was handed."""
+    """Replay a log and return the filter's first state and all its events."""
     handed: list[FilterEvents] = []
     begun: list[FilterState] = []
 
     class Listening(Filter):
-        """Filters, and keeps what it is handed."""
+        """A filter that records its events."""
 
         def filtered(self, state: Any, events: Any) -> Any:
             handed.append(events)
@@ -121,7 +121,7 @@ def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
 
 
 def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:
-    """Take the first events from the start on, and more until every sensor has a message."""
+    """Select the first events from the start on, and more until every sensor has a message."""
     rows = np.flatnonzero(events.time_ns >= start_ns)
     found = [np.flatnonzero(events.source[rows] == sensor) for sensor in range(sensors)]
     until = max([MOST_EVENTS, *(int(each[0]) + 1 for each in found if len(each))])
@@ -129,7 +129,7 @@ def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEven
 
 
 def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
-    """Add to the last message of every sensor with a gate a copy that is far from what is measured."""
+    """Add a distant copy of the last message of every sensor with a gate, as an outlier."""
     source, data = events.source, events.data
     rows, far = [np.arange(len(source))], [data]
     for number, sensor in enumerate(filtering.stage.sensors):
@@ -147,7 +147,7 @@ def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
 
 
 def vectors_text(made: CFilter, vectors: Vectors) -> str:
-    """Write vectors.h."""
+    """Write the text of vectors.h."""
     upper, width = made.name.upper(), vectors.data.shape[1]
     count, n, t = len(vectors.time_ns), made.states, made.tangent
     rows = [row for row in vectors.judged if row >= 0]
@@ -221,7 +221,7 @@ _SHOWN = """\
 
 
 def test_text(made: CFilter) -> str:
-    """Write test_NAME.c."""
+    """Write the text of test_NAME.c."""
     control = len(made.controls)
     cases = []
     for number, (name, sensor) in enumerate(made.sensors):
@@ -250,7 +250,8 @@ def test_text(made: CFilter) -> str:
     factor = "            double own[NAME_TANGENT][NAME_TANGENT];\n"
     kept = "                    own[row][column] = (double)filter.covariance[row][column];\n"
     definite = "is_definite(own)"
-    if made.is_root:  # whose covariance is a square: it is definite where the factor has all its pivots
+    # its covariance is a square: it is definite if all pivots of the factor are positive
+    if made.is_root:
         factor = (
             "            REAL covariance[NAME_TANGENT][NAME_TANGENT];\n"
             "            int has_pivots = 1;\n"

@@ -1,4 +1,4 @@
-"""Counts what a step of a filter in C costs: operations in its graphs, and memory, by the compiler."""
+"""The cost of a step of a filter in C: operations in its graphs, and memory by the compiler."""
 
 import json
 import math
@@ -19,12 +19,12 @@ OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off")
 
 
 class Memory(NamedTuple):
-    """Holds what a compiler makes of a filter.
+    """A filter's memory, as the compiler reports it.
 
     Attributes:
         compiler: its name, version and target.
         text: bytes of code and constants.
-        stack: bytes that the deepest chain of calls takes, without libm's own.
+        stack: bytes of stack in the deepest chain of calls, without libm's own.
     """
 
     compiler: str
@@ -33,14 +33,14 @@ class Memory(NamedTuple):
 
 
 class Single(NamedTuple):
-    """Holds what single precision costs over the recorded log that is the filter's test.
+    """The effect of single precision over the recorded log that is the filter's test.
 
     Attributes:
-        estimates: how many were compared with those in double precision.
-        furthest: how far means and covariances are from these, in units of the number itself, or of one
-            where that is larger.
-        lost_event, lost_s: from which event on, and how long after the start, the covariance is no
-            longer positive definite where that in double precision is; None where it stays so.
+        estimates: number of estimates compared with those in double precision.
+        furthest: largest difference of means and covariances, relative to the number itself, or to one
+            if that is larger.
+        lost_event, lost_s: the event, and its time after the start, from which the covariance is no
+            longer positive definite, unlike that in double precision; None if it stays so.
     """
 
     estimates: int
@@ -50,14 +50,14 @@ class Single(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """Holds what a filter costs.
+    """The cost of a filter.
 
     Attributes:
-        steps: the cost of the functions of the C, by name.
-        worst: of a prediction and the costliest update after it.
-        dense, sparse: flops of the products F P F', P H' and H P H' of all steps, or of F L and H L of a
-            factor L, with all entries of F and H, and without those that are known to be zero or one.
-        memory: None without a compiler that tells it.
+        steps: the cost of the C functions, by name.
+        worst: the cost of a prediction and the costliest update after it.
+        dense, sparse: flops of the products F P F', P H' and H P H' of all steps (of F L and H L for a
+            factor L), with all entries of F and H, and without those known to be zero or one.
+        memory: None if no compiler reports it.
         single: None in double precision, and without a compiler.
     """
 
@@ -70,11 +70,11 @@ class Certificate(NamedTuple):
 
 
 def certificate_of(made: CFilter, files: Mapping[str, str]) -> Certificate:
-    """Count what a filter costs, and have its C compiled, and tried in single precision.
+    """Count the cost of a filter, compile its C, and test it in single precision.
 
     Args:
         made: the filter.
-        files: its C and its test, by name.
+        files: its C and its test, by file name.
     """
     steps, products = costs_of(made)
     updates = [cost for name, cost in steps.items() if name != "predict"]
@@ -85,7 +85,7 @@ def certificate_of(made: CFilter, files: Mapping[str, str]) -> Certificate:
 
 
 def certificate_text(made: CFilter, certificate: Certificate) -> str:
-    """Write certificate.json."""
+    """Write the text of certificate.json."""
     memory, single = certificate.memory, certificate.single
     text = {
         "filter": made.name,
@@ -102,7 +102,7 @@ def certificate_text(made: CFilter, certificate: Certificate) -> str:
 
 
 def _compiled(made: CFilter, files: Mapping[str, str]) -> tuple[Memory | None, Single | None]:
-    """Compile a filter, and run its test in single precision; None each without a compiler that can."""
+    """Compile a filter and run its test in single precision; None without a suitable compiler."""
     compiler = shutil.which("gcc")
     if compiler is None:
         return None, None
@@ -121,7 +121,7 @@ def _output_of(folder: Path, *command: str | Path, check: bool = True) -> str:
 
 
 def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
-    """Compile a filter; None where GCC, before 10, does not tell what its functions call and need."""
+    """Compile a filter; None if GCC (before 10) does not report calls and stack."""
     try:
         _output_of(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
         version, target = (
@@ -136,7 +136,7 @@ def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
 
 
 def _single(compiler: str, folder: Path, name: str) -> Single | None:
-    """Run a filter's test; None where it cannot be built here."""
+    """Run a filter's test; None if it cannot be built here."""
     program = folder / "tried"
     try:
         _output_of(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)
@@ -154,11 +154,11 @@ def _single(compiler: str, folder: Path, name: str) -> Single | None:
 
 
 def deepest_stack(calls: str) -> int:
-    """Find how many bytes the deepest chain of calls takes.
+    """Compute the bytes of stack in the deepest chain of calls.
 
     Args:
-        calls: a call graph with stack usage, as GCC writes it (`-fcallgraph-info=su`). What is called
-            and not compiled with it, as libm's functions, counts nothing.
+        calls: a call graph with stack usage, as GCC writes it (`-fcallgraph-info=su`). Functions that
+            are not compiled with it, such as libm's, do not count.
     """
     own = {
         name: int(size)

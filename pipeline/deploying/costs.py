@@ -1,4 +1,4 @@
-"""Counts what the steps of a filter in C take: operations of their graphs, and of their loops."""
+"""Operation counts of the steps of a filter in C: those of their graphs, and of their loops."""
 
 import operator
 from collections.abc import Collection
@@ -43,12 +43,12 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """Holds what a step costs at most: both sides of every condition count, and every iterate.
+    """The largest cost of a step: both sides of every condition count, and every iteration.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
         roots: square roots.
-        calls: of libm's other functions, such as sin and fmod.
+        calls: calls of libm's other functions, such as sin and fmod.
     """
 
     flops: int
@@ -66,9 +66,9 @@ def added(*costs: Cost) -> Cost:
 
 
 def costs_of(made: CFilter) -> tuple[dict[str, Cost], list[Products]]:
-    """Count what the functions of a filter cost, by name.
+    """Count the cost of a filter's functions, by name.
 
-    Returns with it, of the motion and every sensor, what products with a Jacobian cost with all its
+    It also returns, for the motion and every sensor, the cost of products with a Jacobian with all its
     entries, and without those that are known to be zero or one.
     """
     t, steps = made.tangent, made.steps
@@ -126,7 +126,7 @@ def _loops(made: CFilter, part: int, size: int) -> Cost:
 
 
 def _entering(step: Step, size: int) -> Cost:
-    """Count what noise costs that enters through a gain."""
+    """Count the cost of noise that enters through a gain."""
     gains = sum(name == "u" for name, _ in step.outputs)
     if not gains:
         return NOTHING
@@ -134,7 +134,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """Count a function at samples, and the mean of its values, in all rounds that may be."""
+    """Count a function at samples, and the mean of its values, with the largest number of iterations."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -149,7 +149,7 @@ def _sampling(sampled: SampledFunction) -> Cost:
 
 
 def _narrowing(sampled: SampledFunction) -> Cost:
-    """Count what it takes to keep angles at samples within half a turn, where one is hardly known."""
+    """Count the operations that keep angles at samples within half a turn if one is hardly known."""
     if not sampled.turns:
         return NOTHING
     count, size = sampled.points.shape
@@ -163,7 +163,7 @@ def _narrowing(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """Count a step for every sample; calls that are always the same stand before the loop."""
+    """Count a step for every sample; operations that are always the same come before the loop."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     inside = [node for node in needed(outputs, same) if node not in same]
@@ -171,7 +171,7 @@ def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:
-    """Count what is made of the values: covariances, or the rows of a factor."""
+    """Count the operations on the values: covariances, or the rows of a factor."""
     count, v = len(sampled.points), sampled.size
     if is_root:
         return Cost(count * v)
@@ -190,13 +190,13 @@ def _orthogonalising(rows: int, columns: int) -> Cost:
 
 
 def _filling_root(size: int) -> Cost:
-    """Count the factor of a noise; the search for a pivot divides at each that is larger."""
+    """Count the factor of a noise; the search for a pivot divides at each larger one."""
     return Cost(size * (1 + 4 * size + size + 2 * size * size), size)
 
 
 @cache
 def _algebra(m: int, t: int, is_robust: bool) -> Cost:
-    """Count the update behind an innovation of m components, for t of the tangent space."""
+    """Count the update after an innovation of m components, for a tangent space of size t."""
 
     def update(v: Any, spread: Any, cross: Any, covariance: Any, factor: Any) -> Any:
         innovation, step = Innovation(v, spread, cross), np.empty(t, object)
@@ -211,7 +211,7 @@ def _algebra(m: int, t: int, is_robust: bool) -> Cost:
 
 
 def _factored_algebra(m: int, t: int) -> Cost:
-    """Count the same of a factor: S, the whitened innovation, the step, and the factor of P."""
+    """Count the same for a factor: S, the whitened innovation, the step, and the factor of P."""
     square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
     return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
 
@@ -225,7 +225,8 @@ def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) ->
         for (name, place), node in step.outputs.items()
         if name == jacobian
     }
-    if is_root:  # J L, of a lower factor L: an entry in column k meets k + 1 of the factor
+    # J L with a lower factor L: an entry in column k is multiplied with k + 1 entries of the factor
+    if is_root:
         return Cost(rows * t * (t + 1)), Cost(sum(2 * (column + 1) for _, column in known))
     patterns = None, pattern_of(known, rows)
     square = Shape((t, t))

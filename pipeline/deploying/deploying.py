@@ -1,4 +1,4 @@
-"""Writes a filter as C99: `deploy`."""
+"""The function `deploy`, which writes a filter as C99."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ from fuselog.replay.inference.run.filtering import Filter
 from fuselog.replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from fuselog.replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-# by what makes a method's steps
+# by the class that makes a method's steps
 KINDS = {
     FILTERS["ekf"].steps: EXTENDED,
     FILTERS["iekf"].steps: ITERATED,
@@ -52,22 +52,23 @@ def deploy(
 ) -> Path:
     """Write a filter as C99 for a robot, with a recorded log as its test.
 
-    The C has the filter's own operations in their order: its estimates are those of `replay`, to the
-    last bit where it is compiled with -ffp-contract=off, in double precision and with the same libm.
+    The C code has the same operations as the filter, in the same order: its estimates are those of
+    `replay`, to the last bit if it is compiled with -ffp-contract=off, in double precision and with the
+    same libm.
 
     Args:
-        log: a log that the filter fits: its sensors are those of the C, its channels state what is not
-            given, and its first messages are the test.
-        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`, what `modelled` makes
-            of a model of your own and one of these, or a table of settings by its label.
-        out: the folder to write, which must not be there or be empty; its name is the filter's in C.
+        log: a log that the filter fits. The C code has its sensors, its channels state parameters that
+            are not given, and its first messages are the test.
+        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; or what `modelled`
+            makes of a model of your own and one of these; or a table of settings by label.
+        out: the folder to write, which must be empty or not exist; its name is the filter's name in C.
         single: use single precision, `float`.
-        parameters: of the estimator, such as `model="robot"`.
+        parameters: parameters of the estimator, such as `model="robot"`.
 
     Returns:
         The folder that was written.
 
-    Raises BadInput where the filter cannot be written so, and where the folder is not empty.
+    Raises BadInput if the filter cannot be written as C, or if the folder is not empty.
 
     >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
@@ -105,15 +106,15 @@ def deploy(
 
 
 def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
-    """Put a program in place of a golden's estimator, for `fuselog.pipeline.checking.checking.check`.
+    """Replace the estimator of a golden by a program, for `fuselog.pipeline.checking.checking.check`.
 
     Args:
-        name: the program, as `lib:./robot_ekf.so`.
-        runs: what the golden is of.
-        golden: as `fuselog.pipeline.checking.stored.read` has it.
+        name: the program, such as `lib:./robot_ekf.so`.
+        runs: the runs of the golden.
+        golden: the golden, as `fuselog.pipeline.checking.stored.read` returns it.
 
-    Returns the program's settings by the golden's label. Raises BadInput where `name` is no program,
-    where the golden has not one estimator, and where the program was deployed from another filter.
+    Returns the program's settings by the golden's label. Raises BadInput if `name` is not a program, if
+    the golden does not have exactly one estimator, and if the program was deployed from another filter.
     """
     _, program = shorthand(name)
     if not program:
@@ -149,7 +150,7 @@ def _made(
 
 
 def _without_clash(made: CFilter, reading: Callable[[], Reading] | None) -> CFilter:
-    """Return the filter under a name that is no other word of its C, such as a variable's."""
+    """Rename a filter whose name is another word of its C code, such as a variable's."""
     alone = made._replace(name="fuselog_filter")
     text = source(alone) + test_text(alone)
     if reading is not None and not why_no_replay(alone):
@@ -164,7 +165,7 @@ def _check_empty(folder: Path) -> None:
 
 
 def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, Filter, str]:
-    """Bind the filter; raises BadInput where it is none that can be written."""
+    """Bind the filter; raises BadInput if it cannot be written as C."""
     configure(label, settings)
     kind = settings.get("kind", label)
     name = kind if isinstance(kind, str) else label

@@ -1,4 +1,4 @@
-"""Writes what stands beside a filter in C: how to build it, and what it is."""
+"""Files next to a filter in C: how to build it, and its description."""
 
 from collections.abc import Mapping
 from textwrap import fill
@@ -15,7 +15,7 @@ from fuselog.replay.inference.kalman.regression import MEANS
 
 
 def cmake_text(made: CFilter) -> str:
-    """Write CMakeLists.txt."""
+    """Write the text of CMakeLists.txt."""
     name = made.name
     lines = [
         "cmake_minimum_required(VERSION 3.13)",
@@ -43,7 +43,7 @@ def cmake_text(made: CFilter) -> str:
 
 
 def _costs(made: CFilter, certificate: Certificate) -> str:
-    """Write what a step costs."""
+    """Write the section on the cost of a step."""
     rows: dict[str, Cost] = {f"`{name}`": cost for name, cost in certificate.steps.items()}
     rows["worst case: `predict` and the costliest update"] = certificate.worst
     table = "\n".join(f"| {name} | {' | '.join(map(str, cost))} |" for name, cost in rows.items())
@@ -74,7 +74,7 @@ At most: both sides of every condition count{iterated}.{saved}
 
 
 def _single(made: CFilter, certificate: Certificate, log: str) -> str:
-    """Write what single precision costs."""
+    """Write the section on single precision."""
     if not made.precision.ending:
         return ""
     single = certificate.single
@@ -98,7 +98,7 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
 
 
 def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
-    """Say from when on single precision has no covariance any more, and what to take."""
+    """Describe from when on single precision loses the covariance, and what to use instead."""
     mend = "" if is_root else "; take the square-root form, sqrt:ekf or sqrt:ukf"
     return (
         f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
@@ -107,7 +107,7 @@ def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
 
 
 def _loop(made: CFilter) -> str:
-    """Write a loop over messages: control, prediction, update, and what becomes of the outcomes."""
+    """Write a loop over messages: control, prediction, update, and the handling of outcomes."""
     name, upper = made.name, made.name.upper()
     driven = [
         f"filter.control[{upper}_CONTROL_{identifier(each).upper()}] = message.{identifier(each)};"
@@ -136,7 +136,7 @@ def _loop(made: CFilter) -> str:
 
 
 def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
-    """Write README.md."""
+    """Write the text of README.md."""
     name, upper = made.name, made.name.upper()
     updates = [
         f"| `{name}_update_{each}` | {sensor.topic} | {', '.join(data_of(sensor))} |"

@@ -1,10 +1,10 @@
-"""Writes the Kalman update in C, operation by operation as `fuselog.replay.inference.kalman.update`.
+"""The Kalman update in C, with the same operations as `fuselog.replay.inference.kalman.update`.
 
-`UPDATE` is the one of all filters but those that iterate, which have `ITERATE`; both call `ALGEBRA`.
-Square-root forms have an update of their own, and of this `COMMON` alone.
+`UPDATE` is the update of all filters except iterated ones, which have `ITERATE`; both call `ALGEBRA`.
+Square-root forms have their own update and use only `COMMON`.
 
-NAME, T and M stand for the filter's name, its tangent space's size, and the most components of a sensor;
-REAL and what ends numbers and functions of libm, _S, for the precision.
+NAME, T and M stand for the filter's name, the size of its tangent space, and the most components of a
+sensor; REAL, and _S at the end of numbers and functions of libm, stand for the precision.
 """
 
 CHOLESKY = """/* A = L L' in place, of the first `size` rows and columns; 0 where A is indefinite. */

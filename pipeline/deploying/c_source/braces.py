@@ -1,4 +1,4 @@
-"""Puts the bodies of C's conditions and loops in braces, so that templates can do without them."""
+"""Braces around the bodies of conditions and loops in C, so that templates can omit them."""
 
 import re
 
@@ -10,11 +10,11 @@ def braced(text: str) -> str:
     """Put every body of an `if`, `else`, `for` and `while` in braces.
 
     Args:
-        text: C whose bodies stand in lines of their own, indented by more than what they belong to.
+        text: C code with bodies on lines of their own, indented more than their heads.
     """
     found: list[str] = []
     opened: list[int] = []  # indents of the heads whose bodies got a brace here
-    balance = head = 0  # parentheses that are open, and the indent of the head that they belong to
+    balance = head = 0  # open parentheses, and the indent of the head that they belong to
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
         if balance == 0 and line.strip() and line[0] != "#":

@@ -1,6 +1,6 @@
-"""Writes square-root forms in C, each operation as in `fuselog.replay.inference.kalman.square_root`.
+"""Square-root forms in C, with the operations of `fuselog.replay.inference.kalman.square_root`.
 
-Names as in `algebra`; ROWS and COLUMNS are how many of both an array to be factorised has at most.
+Names are those of `algebra`; ROWS and COLUMNS are the largest size of an array to be factorised.
 """
 
 FACTORISING = """\

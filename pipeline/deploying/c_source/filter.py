@@ -1,4 +1,4 @@
-"""Writes the source of a filter in C99 from the graphs of its steps."""
+"""The source of a filter in C99, written from the graphs of its steps."""
 
 import math
 import re
@@ -34,11 +34,11 @@ from fuselog.replay.tracing.c_text import Precision, c_lines, helpers_of
 from fuselog.replay.tracing.functions import trace
 from fuselog.replay.tracing.graph import Graph, needed
 
-IN_SINGLE = 5e-7, 3e-11  # for ROUNDING and NOTHING_LEFT: as many roundings, and their square
+IN_SINGLE = 5e-7, 3e-11  # for ROUNDING and NOTHING_LEFT: the same multiple of rounding, and its square
 
 
 def source(made: CFilter) -> str:
-    """Write NAME.c."""
+    """Write the text of NAME.c."""
     every = [node for step in made.steps.all for node in needed([*step.outputs.values()])]
     parts = [
         f"/* {made.origin} Made by fuselog deploy; see {made.name}.h.\n"
@@ -66,7 +66,7 @@ _FUNCTION = re.compile(
 
 
 def _without_unused(text: str) -> str:
-    """Leave out functions that nothing calls, and what these alone call."""
+    """Remove functions that nothing calls, and those that only these call."""
     for found in reversed([*_FUNCTION.finditer(text)]):
         if len(re.findall(rf"\b{found[1]}\(", text)) == 1:
             text = text[: found.start()] + text[found.end() :]
@@ -107,7 +107,7 @@ _COPY = """\
 """
 
 
-# a small processor computes with `float`, and looks at the bits of `double` faster than it adds them
+# a small processor computes in `float`, and tests the bits of a `double` faster than it adds them
 _FINITE = """\
 /* Whether numbers are finite: no exponent has all of its bits set. */
 static int is_finite(const double *numbers, int count)
@@ -150,7 +150,7 @@ static double seconds(int64_t from_ns, int64_t to_ns)
 
 
 def _checks(made: CFilter) -> str:
-    """Write what checks numbers, and times."""
+    """Write the functions that check numbers and compute times."""
     checks = _CHECKS.replace("CARRIED", "factor" if made.is_root else "covariance")
     return "\n".join([_FINITE_IN_SINGLE if made.precision.ending else _FINITE, filled(made, checks)])
 
@@ -161,7 +161,7 @@ def _init(made: CFilter) -> str:
         f"    filter->control[{index}] = {made.precision.number(value)};\n"
         for index, value in enumerate(control)
     )
-    if made.is_interpolated:  # what drives it from the prior on is not known before its first message
+    if made.is_interpolated:  # the control from the prior on is unknown before its first message
         unknown = made.precision.number(math.nan)
         driven = "".join(f"    filter->control[{index}] = {unknown};\n" for index in range(len(control)))
         driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""
@@ -206,14 +206,14 @@ def _products(made: CFilter) -> list[str]:
 
 
 def _moments(made: CFilter) -> list[str]:
-    """Write what is made of samples."""
+    """Write the functions that compute moments of samples."""
     if not any(made.steps.sampled):
         return []
     return [filled(made, SAMPLING if made.is_root else MOMENTS)]
 
 
 def _factorising(made: CFilter) -> str:
-    """Write how rows are factorised, with room for the largest step."""
+    """Write the factorisation of rows, with room for the largest step."""
     t, m, number = made.tangent, made.most if made.sensors else 0, made.precision.number
     counts = [len(each.points) if each is not None else t for each in made.steps.sampled]
     columns = [counts[0] + t, *(count + m for count in counts[1:])]

@@ -1,4 +1,4 @@
-"""Writes the header of a filter in C99: types, names of components, functions."""
+"""The header of a filter in C99: types, names of components, functions."""
 
 from collections.abc import Iterator, Sequence
 
@@ -16,7 +16,7 @@ void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANG
 
 
 def header(made: CFilter) -> str:
-    """Write NAME.h."""
+    """Write the text of NAME.h."""
     model, upper = made.filtering.stage.model, made.name.upper()
     state = [(identifier(name), kind) for name, kind in model.state.items()]
     axes = [identifier(name) for name, _ in tangent_components(list(model.state), model.kinds)]
@@ -116,7 +116,7 @@ def _struct(made: CFilter) -> Iterator[str]:
 
 
 def outcomes(made: CFilter) -> dict[str, str]:
-    """List what the functions of a filter may return, with what each outcome means."""
+    """List what the functions of a filter may return, with the meaning of each outcome."""
     gap = {"NOT_DRIVEN": "the control is silent: the estimate is unknown"} if made.has_gaps else {}
     return {
         "WELL": "the state is finite, and predicted, updated, or kept if a gate rejected the message",
@@ -140,7 +140,7 @@ def _outcomes(made: CFilter) -> Iterator[str]:
 
 
 def predict_signature(made: CFilter) -> str:
-    """Write how a prediction is called."""
+    """Write the signature of a prediction."""
     control = ", const REAL *control" if made.is_interpolated else ""
     return (
         f"NAME_outcome NAME_predict(NAME *filter, int64_t time_ns{control},\n"
@@ -175,7 +175,7 @@ def _between_comment(made: CFilter) -> str:
 
 
 def update_signature(name: str) -> str:
-    """Write how an update by a sensor is called."""
+    """Write the signature of an update by a sensor."""
     return (
         f"NAME_outcome NAME_update_{name}(NAME *filter, const REAL *data,\n"
         "    const NAME_parameters *parameters, NAME_innovation *innovation)"
@@ -183,7 +183,7 @@ def update_signature(name: str) -> str:
 
 
 def data_of(sensor: Sensor) -> list[str]:
-    """Name the numbers of a sensor's message: measured, what it refers to, its own noise."""
+    """List the numbers of a sensor's message: measured components, references, its own noise."""
     names = [*sensor.measured]
     names += reference_names(sensor)
     measured = list(sensor.measured)

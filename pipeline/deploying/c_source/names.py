@@ -1,4 +1,4 @@
-"""Names what is written of a filter in C99: names, sizes and numbers, and the text they fill in."""
+"""Names, sizes and numbers of a filter in C99, and the templates that they fill in."""
 
 import re
 from dataclasses import replace
@@ -25,14 +25,14 @@ stdout tan tanh time trunc y0 y1 yn vectors cortex_m4f"""
 
 
 class CFilter(NamedTuple):
-    """Holds what is written of a filter.
+    """A filter to be written as C.
 
     Attributes:
-        name: what its names in C begin with.
+        name: the prefix of its names in C.
         filtering: the filter, bound to a log.
         steps: its steps.
-        precision: of its numbers.
-        origin: what it was made of, in words.
+        precision: the precision of its numbers.
+        origin: what it was made from, in words.
     """
 
     name: str
@@ -43,40 +43,40 @@ class CFilter(NamedTuple):
 
     @property
     def states(self) -> int:
-        """Count the components of the state."""
+        """Return the number of components of the state."""
         return self.filtering.stage.model.size
 
     @property
     def tangent(self) -> int:
-        """Count those of its tangent space."""
+        """Return the number of components of its tangent space."""
         return self.filtering.stage.model.tangent
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Return the names of what drives it."""
+        """Return the names of its controls."""
         control = self.filtering.stage.model.control
         return control.components if control else ()
 
     @property
     def is_root(self) -> bool:
-        """Tell whether it carries a factor of the covariance, not the covariance itself."""
+        """Test whether it carries a factor of the covariance, not the covariance itself."""
         return self.filtering.form is FACTORS
 
     @property
     def is_interpolated(self) -> bool:
-        """Tell whether the motion gets the mean of the controls at both ends of a step."""
+        """Test whether the motion gets the mean of the controls at both ends of a step."""
         control = self.filtering.stage.model.control
         return control is not None and control.interpolated
 
     @property
     def has_gaps(self) -> bool:
-        """Tell whether its control may be silent for so long that nothing is known meanwhile."""
+        """Test whether its control may be silent for so long that nothing is known meanwhile."""
         control = self.filtering.stage.model.control
         return control is not None and bool(control.gap)
 
     @property
     def sensors(self) -> list[tuple[str, Sensor]]:
-        """List the sensors with their names in C; of several topics of a kind, each has its own name."""
+        """Return the sensors with their names in C; several topics of a kind have separate names."""
         found: dict[str, Sensor] = {}
         topics: dict[str, set[str]] = {}
         for sensor, topic in self.filtering.found.sensors:
@@ -92,17 +92,17 @@ class CFilter(NamedTuple):
 
     @property
     def most(self) -> int:
-        """Count the components of the widest sensor."""
+        """Return the number of components of the widest sensor."""
         return max((len(sensor.measured) for _, sensor in self.sensors), default=1)
 
     @property
     def innovation(self) -> list[str]:
-        """List the components of innovations."""
+        """Return the components of innovations."""
         return list(innovation_components(self.filtering.stage.sensors)) or ["none"]
 
     @property
     def parts(self) -> list[str]:
-        """List the motion and the sensors, as the parameters stand in C."""
+        """Return the motion and the sensors, in the order of the parameters in C."""
         return ["motion", *(name for name, _ in self.sensors)]
 
     @property
@@ -119,7 +119,7 @@ class CFilter(NamedTuple):
         }
 
     def robustness(self, row: int) -> dict[str, float]:
-        """Return the options of the gate and of robust updates, NaN where they are off."""
+        """Return the options of the gate and of robust updates, NaN if they are off."""
         names = number_fields(self.filtering.stage.model.parameters)
         options = ("gate_reopens_s", "inflate_nis", "student_freedom", "switch_nis")
         return {
@@ -129,7 +129,7 @@ class CFilter(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """Return what is the same for the same graphs and numbers."""
+        """Return a digest that is the same for the same graphs and numbers."""
         words = [repr([[*step.outputs] for step in self.steps.all])]
         words += [word for step in self.steps.all for word in described([*step.outputs.values()])]
         words += [
@@ -143,7 +143,7 @@ class CFilter(NamedTuple):
 
 
 def identifier(name: str) -> str:
-    """Make a name that C takes: lower case, without the slashes of topics."""
+    """Convert a name to an identifier of C: lower case, without the slashes of topics."""
     text = re.sub(r"\W+", "_", name.strip("/")).lower()
     return (
         f"{text}_"

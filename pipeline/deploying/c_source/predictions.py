@@ -1,4 +1,4 @@
-"""Writes a C filter's functions that predict: over a step, between two controls, over a gap."""
+"""The predicting functions of a filter in C: over a step, between two controls, over a gap."""
 
 import re
 
@@ -67,7 +67,7 @@ static NAME_outcome pass_gap(NAME *filter, int64_t time_ns, const NAME_parameter
 
 
 def predicting_text(made: CFilter) -> list[str]:
-    """Write the prediction, and what it calls."""
+    """Write the prediction and the functions that it calls."""
     gap = [] if made.steps.gap is None else [_pass_gap(made)]
     if not made.is_interpolated:
         begin = _ONWARD + (_DRIVEN if made.controls else "")
@@ -115,14 +115,14 @@ def _step(made: CFilter) -> str:
 
 
 def _starting(made: CFilter) -> list[str]:
-    """Write how samples are begun with."""
+    """Write the start of sampling."""
     if made.is_root:
         return ["start_samples(filter, &samples);"]
     return ["if (!start_samples(filter, &samples))", "    return NAME_NOT_POSITIVE_DEFINITE;"]
 
 
 def _factorising(made: CFilter, columns: int) -> list[str]:
-    """Write how a prediction's factor is found of so many columns and its noise."""
+    """Write the factorisation of a prediction with this number of columns and its noise."""
     t = made.tangent
     return [
         f"if (!factorise(&found, {t}, {columns}, {t}, &noise[0][0], T))",
@@ -132,7 +132,7 @@ def _factorising(made: CFilter, columns: int) -> list[str]:
 
 
 def _pass_gap(made: CFilter) -> str:
-    """Write the prediction over a gap of the control, after which it goes on."""
+    """Write the prediction over a gap of the control, after which it continues."""
     step, t = made.steps.gap, made.tangent
     assert step is not None
     names, declared = Inputs(made, "motion").names(step, "control")
@@ -145,7 +145,7 @@ def _pass_gap(made: CFilter) -> str:
 
 
 def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
-    """Write a prediction's body: what its lines use is declared before them."""
+    """Write the body of a prediction, with declarations of what its lines use."""
     text = "\n".join([*declared, *lines])
     real, span = made.precision.real, "seconds(filter->time_ns, time_ns)"
     used = {

@@ -1,7 +1,7 @@
-"""Writes products of covariances with Jacobians in C, as loops over entries not known to be zero.
+"""Products of covariances with Jacobians in C, as loops over entries that are not known to be zero.
 
-Sums keep the order of `fuselog.replay.inference.linear_algebra.sparse`. Names as in `algebra`; `columns`
-lists those of a matrix row by row, each row ended by -1.
+Sums keep the order of `fuselog.replay.inference.linear_algebra.sparse`. Names are those of `algebra`;
+`columns` lists the columns of a matrix row by row, and each row ends with -1.
 """
 
 from collections.abc import Mapping
@@ -112,12 +112,12 @@ _TIMES_FACTOR = """\
 
 
 def slope_text(*, is_root: bool) -> str:
-    """Write how the state changes with what bends; of a covariance, or of its factor."""
+    """Write the slope of the state along its curvature, from a covariance or from its factor."""
     return SLOPE.replace("PRODUCT", _TIMES_FACTOR if is_root else _TIMES)
 
 
 def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
-    """Write the sums of noise that enters through at most so many gains, for matrices of these sizes."""
+    """Write the sums of noise that enters through at most `gains` gains, for matrices of these sizes."""
     if not sizes:
         return []
     texts = [ADD_THROUGH.replace("WHAT", what).replace("SIZE", size) for what, size in sizes.items()]
@@ -131,6 +131,6 @@ def columns_text(name: str, columns: list[list[int]], size: str) -> str:
 
 
 def turn_text(factors: str, *, is_root: bool) -> str:
-    """Write how a covariance is turned with an orientation, from both sides; its factor from one."""
+    """Write the rotation of a covariance with an orientation; that of a factor is one-sided."""
     what, sides = ("A factor P = J P", "1") if is_root else ("P = J P J'", "2")
     return TURN.replace("WHAT", what).replace("SIDES", sides).replace("FACTORS\n", factors)

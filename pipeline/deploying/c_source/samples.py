@@ -1,7 +1,7 @@
-"""Writes functions at weighted samples in C, as `fuselog.replay.inference.kalman.regression` has them.
+"""Functions at weighted samples in C, as in `fuselog.replay.inference.kalman.regression`.
 
-Names as in `algebra`; SAMPLES, DRAWN, VALUES and PLACES are how many samples, numbers of one, tangent
-components and components of a function's values there are at most.
+Names are those of `algebra`. SAMPLES, DRAWN, VALUES and PLACES are the largest numbers of samples, of
+numbers in one, and of tangent components and components of a function's values.
 """
 
 import re
@@ -162,7 +162,7 @@ static void find_moments(const drawn_samples *samples, int count, const REAL *we
 
 
 def samples_text(made: CFilter) -> list[str]:
-    """Write tables of samples, and what motion and sensors make of them."""
+    """Write tables of samples, and the functions of motion and sensors at samples."""
     functions = [each for each in made.steps.sampled if each is not None]
     if not functions:
         return []
@@ -230,13 +230,13 @@ static const REAL weights_{size}[{count}] = {{
 
 
 def weighed(sampled: SampledFunction) -> str:
-    """Write the arguments that say how many samples there are, and what they weigh."""
+    """Write the arguments for the number of samples and their weights."""
     count, size = sampled.points.shape
     return f"{count}, weights_{size}"
 
 
 def sampling_call(made: CFilter, number: int) -> str:
-    """Write the call that fills `samples` with what the motion (0) or a sensor makes of them."""
+    """Write the call that fills `samples` with the results of the motion (0) or a sensor."""
     return _sampling(made, number)[1]
 
 
@@ -307,7 +307,7 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
 def _in_loop(
     made: CFilter, named: dict[str, Node], names: dict[Any, str], varying: Collection[int]
 ) -> tuple[list[str], list[str]]:
-    """Write the lines of a loop over samples, and before it those of calls that are always the same.
+    """Write the lines of a loop over samples, and before it those that are the same for all samples.
 
     `varying` are the arguments that differ from sample to sample.
     """
@@ -318,7 +318,7 @@ def _in_loop(
 
 
 def _settling(made: CFilter, number: int) -> list[str]:
-    """Write the rounds in which a centre becomes the mean of values with angles or orientations."""
+    """Write the iteration in which a centre becomes the mean of values with angles or orientations."""
     sampled, name = made.steps.sampled[number], made.parts[number]
     assert sampled is not None
     if sampled.recentre is None:

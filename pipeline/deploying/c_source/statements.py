@@ -1,4 +1,4 @@
-"""Writes the names, declarations and loops that a C filter's functions are put together of."""
+"""The names, declarations and loops from which the functions of a filter in C are made."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from fuselog.replay.tracing.graph import INPUT, Node, needed
 
 
 class Inputs:
-    """Names what a step is given, and declares what it uses."""
+    """The names of a step's inputs, and declarations of those that it uses."""
 
     def __init__(self, made: CFilter, part: str) -> None:
         model = made.filtering.stage.model
@@ -26,7 +26,7 @@ class Inputs:
 
         Args:
             step: the step.
-            arrays: what it is given behind mean and covariance; empty for what is none.
+            arrays: the inputs after mean and covariance; "" for one that is absent.
         """
         names: dict[Any, str] = {}
         lines: dict[str, str] = {}
@@ -58,7 +58,7 @@ class Inputs:
 
 
 def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
-    """Name what a step makes of the mean, and write the assignments."""
+    """Name the components of the mean after a step, and write the assignments."""
     state = [identifier(name) for name in made.filtering.stage.model.state]
     named: dict[str, Node] = {}
     lines: list[str] = []
@@ -71,7 +71,7 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
 
 
 class Loops(NamedTuple):
-    """Holds what is done in loops: declarations, what the graph gives for it, and the calls."""
+    """Loops: declarations, the graph's results that they need, and the calls."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -79,12 +79,12 @@ class Loops(NamedTuple):
 
 
 def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: str, what: str) -> Loops:
-    """Write what is done with a step's Jacobian, and the noise that is added to the product.
+    """Write the products with a step's Jacobian, and the sum with its noise.
 
     Args:
-        step: it gives the Jacobian, G and u, N.
-        jacobian: its name, F or H.
-        rows: how many it has.
+        step: a step that gives the Jacobian, G and u, N.
+        jacobian: the name of the Jacobian, F or H.
+        rows: its number of rows.
         multiply: the call that forms the product.
         into: the matrix that becomes the product.
         what: `states` or `components`, for the size of that matrix.
@@ -100,7 +100,7 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
 
 
 def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
-    """Write what adds a step's noise, given as G and u and as N, to a matrix; see `jacobian_loops`."""
+    """Write the sum of a matrix and a step's noise, given as G and u and as N; see `jacobian_loops`."""
     size = "T" if what == "states" else "M"
     declared: list[str] = []
     named: dict[str, Node] = {}
@@ -121,7 +121,7 @@ def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
 
 
 def entries(step: Step, array: str) -> dict[str, Node]:
-    """Name the entries of an array that a step gives, as C does."""
+    """Name the entries of an array that a step gives, as in C."""
     return {
         array + "".join(f"[{each}]" for each in place): node
         for (name, place), node in step.outputs.items()
@@ -135,18 +135,18 @@ def count_gains(step: Step) -> int:
 
 
 def turned_axes(made: CFilter) -> list[int]:
-    """List where the covariance of an orientation begins that is turned with it."""
+    """List the first axes of orientations with which the covariance is rotated."""
     model = made.filtering.stage.model
     blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
     return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
 
 
 def retriangulates(made: CFilter) -> bool:
-    """Tell whether a correction turns the covariance, so that its factor is none any more."""
+    """Test whether a correction rotates the covariance, so that its factor is no longer triangular."""
     model = made.filtering.stage.model
     return bool(made.sensors) and model.correct is None and not is_flat(model.kinds)
 
 
 def body(lines: Iterable[str]) -> str:
-    """Write the lines of a function."""
+    """Indent the lines of a function."""
     return "".join(f"    {each}\n" for each in lines)

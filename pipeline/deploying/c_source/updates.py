@@ -1,4 +1,4 @@
-"""Writes a C filter's functions that update it: what sensors measure, how the state moves."""
+"""The updating functions of a filter in C: what sensors measure, how the state moves."""
 
 import re
 
@@ -23,7 +23,7 @@ from fuselog.replay.tracing.c_text import c_lines
 
 
 def correcting_text(made: CFilter) -> list[str]:
-    """Write what moves the state, and what finds how it bends."""
+    """Write the functions that move the state and find its curvature."""
     if not made.sensors:
         return []
     step, direction = made.steps.correct, made.steps.direction
@@ -62,7 +62,7 @@ def correcting_text(made: CFilter) -> list[str]:
 
 
 def _bending(made: CFilter, text: str) -> str:
-    """Write what bends, or leave it out where nothing does."""
+    """Write the calls for curvature, or remove them if nothing is curved."""
     if made.steps.direction is not None:
         return text.replace("FIND_SLOPE;", filled(made, "REAL slope[T];\n    bend(filter, slope);"))
     text = re.sub(r"\n *FIND_SLOPE;", "", text)
@@ -138,7 +138,7 @@ def update_text(made: CFilter, number: int) -> str:
 
 
 def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
-    """Write how an innovation is formed: what is declared for it, and the lines."""
+    """Write the innovation of a sensor: its loops with their declarations, and the lines."""
     (name, sensor), step = made.sensors[number], made.steps.innovate[number]
     m, t, sampled = len(sensor.measured), made.tangent, made.steps.sampled[number + 1]
     into = "noise" if made.is_root else "S"
@@ -172,7 +172,7 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
 
 
 def _linearise(made: CFilter, name: str, text: str) -> str:
-    """Write the innovation of a sensor that is linearised at every iterate."""
+    """Write the innovation of a sensor that is linearised in every iteration."""
     head = f"""/* The innovation about the mean, of the sensor linearised at the mean moved by a step. */
 static void linearise_{name}(NAME *filter, const REAL step[T], const REAL slope[T], const REAL *data,
     const NAME_parameters *parameters, REAL v[M], REAL S[M][M], REAL C[T][M])
