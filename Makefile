@@ -1,12 +1,12 @@
-# make demo, make test: each does all of its own set-up in .venv; only Python 3.11 or newer is needed.
-# make docs makes the pages' tables from the stored results, and the site from the pages, in site/;
-# make docs-claims FUSELOG_DATA=FOLDER runs the experiments first, all or those that NAMES="..." lists.
+# make demo and make test set up .venv by themselves; only Python 3.11 or newer is needed.
+# make docs renders the pages' tables from the stored results, and builds the site in site/.
+# make docs-claims FUSELOG_DATA=FOLDER runs the experiments first: all, or those listed in NAMES="...".
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
-# --no-compile: Python compiles the modules that are imported, which are few of them
+# --no-compile: Python compiles modules when they are imported, and most are not imported
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
-# commands are started some hundred times: what they import is compiled once, whatever is usual here
+# commands are started some hundred times: cache the bytecode of their imports, even if the user's settings do not
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-fast all-tests fast-tests coverage lint wheel mutants bench deployed faults docs docs-claims keep-numbers format clean
@@ -21,15 +21,15 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-# all tests and the linters, side by side. A file of tests stays with one process for each core, so that what
-# its fixtures make is made once; kernels are kept on disk, and compiled by whoever comes first
+# all tests and the linters, in parallel. There is one process per core. Each test file stays in one process, so that its
+# fixtures are created once. Kernels are cached on disk, and compiled by the first process that needs them
 test: .venv/with-test
 	$(MAKE) -j2 all-tests lint
 
 test-fast: .venv/with-test
 	$(MAKE) -j2 fast-tests lint
 
-# one thread for each process: with more, the products of NumPy, SciPy and scikit-learn wait for one another
+# one thread per process: with more threads, the matrix products of NumPy, SciPy and scikit-learn block one another
 all-tests fast-tests keep-numbers: export OPENBLAS_NUM_THREADS = 1
 all-tests fast-tests keep-numbers: export OMP_NUM_THREADS = 1
 
@@ -39,7 +39,7 @@ all-tests: .venv/with-test
 fast-tests: .venv/with-test
 	$(BIN)/pytest -n logical --dist loadfile -m "not paper"
 
-# what no test runs, by lines and branches; kernels are machine code, of which no line is seen
+# lines and branches that no test runs; kernels are machine code, so coverage does not see their lines
 coverage: .venv/with-test
 	$(BIN)/pytest --cov --cov-branch --cov-context=test --cov-report=html:build/coverage --cov-report=term $(TESTS)
 
@@ -59,7 +59,7 @@ mutants: .venv/with-mutation
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
 
-# every model by every method that deploys, in C beside its replay
+# every model with every method that deploys: the C code compared with the replay
 deployed: .venv/with-test
 	$(BIN)/python -m tests.deployed
 
@@ -74,7 +74,7 @@ docs-claims: .venv/with-test
 	$(BIN)/python -m tests.claims run $(NAMES)
 	$(BIN)/python -m tests.claims render
 
-# stores the numbers that tests find, and prints what changed: of all tests that hold some, or of TESTS
+# stores the numbers that tests find, and prints the changes: for all tests with stored numbers, or for TESTS
 keep-numbers: .venv/with-test
 	$(BIN)/pytest -n logical --dist loadfile --keep-numbers $(or $(TESTS),tests/recorders tests/pipeline)
 

@@ -1,8 +1,8 @@
-// Serves a filter to fuselog over standard input and output: call `fuselog::serve<Filter>(description, n, t, m)`.
+// A filter served to fuselog over standard input and output: call `fuselog::serve<Filter>(description, n, t, m)`.
 //
 // A Filter has a constructor from (const double *parameters, size_t count, uint64_t seed), and `start`, `take`,
-// `predict`, `state` and `innovation` as fuselog_filter.h has them, without the pointer in front: what these
-// return means the same. n, t and m are the components of state, tangent space and innovation.
+// `predict`, `state` and `innovation` as in fuselog_filter.h, without the first argument; their return values
+// have the same meaning. n, t and m are the components of state, tangent space and innovation.
 #pragma once
 #include <cstdint>
 #include <cstdio>
@@ -64,7 +64,7 @@ template <typename Filter> void serve(const std::string &description, size_t n, 
         const bool tells = status <= 0 && wanted && own->state(state.data(), state.data() + n) == 0;
         const bool measured = status <= 0 && (said == 0 || said == -2);
         const uint8_t flags = tells | measured << 1 | (measured && said == -2) << 2;
-        std::string reply = "R" + frame.substr(1, 4);  // the number of what it answers
+        std::string reply = "R" + frame.substr(1, 4);  // the number of the answered frame
         reply.append(reinterpret_cast<const char *>(&status), sizeof status).append(1, static_cast<char>(flags));
         if (tells)
             reply.append(reinterpret_cast<const char *>(state.data()), state.size() * sizeof(double));

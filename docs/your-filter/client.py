@@ -1,9 +1,10 @@
-"""Serves a filter to fuselog over standard input and output: `serve(DESCRIPTION, Filter)`.
+"""A filter served to fuselog over standard input and output: `serve(DESCRIPTION, Filter)`.
 
-A filter is a class with `__init__(parameters, seed)`, `start(time_ns, mean, covariance)`, None and None
-where the log has no prior, `take(topic, time_ns, fields)`, `predict(time_ns)`, and `state()`, which
-returns mean and covariance, or None. `take` returns None, or the innovation, its covariance and whether
-it was used. A method that raises Failed(n) ends the run with the n-th sentence of `failures`.
+A filter is a class with these methods: `__init__(parameters, seed)`, `start(time_ns, mean, covariance)`
+(None and None if the log has no prior), `take(topic, time_ns, fields)`, `predict(time_ns)`, and
+`state()`, which returns mean and covariance, or None. `take` returns None, or the innovation, its
+covariance and whether it was used. If a method raises Failed(n), the run ends with the n-th sentence of
+`failures`.
 """
 
 import json
@@ -14,11 +15,11 @@ from array import array
 
 
 class Failed(Exception):
-    """A failure of the description, counted from 1."""
+    """A failure: the number of its sentence in `failures`, counted from 1."""
 
 
 def serve(description, make):
-    """Answer until standard input ends; what is printed goes to standard error."""
+    """Answer frames until standard input ends; prints are redirected to standard error."""
     given, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     state = list(description["state"].values())
@@ -29,7 +30,7 @@ def serve(description, make):
         answers.flush()
 
     def numbers(frame, at):
-        return array("d", frame[at:]).tolist()  # of little-endian machines, which nearly all are
+        return array("d", frame[at:]).tolist()  # for little-endian machines, as nearly all are
 
     write(b"D" + json.dumps({**description, "protocol": 2}).encode())
     own = None
@@ -59,5 +60,5 @@ def serve(description, make):
                 told += [*innovation[0], *(x for row in innovation[1] for x in row)]
         except Failed as failed:
             status, flags, told = failed.args[0], 0, []
-        head = b"R" + frame[1:5] + struct.pack("<iB", status, flags)  # the number of what it answers
+        head = b"R" + frame[1:5] + struct.pack("<iB", status, flags)  # the number of the answered frame
         write(head + array("d", map(float, told)).tobytes())

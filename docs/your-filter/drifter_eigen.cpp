@@ -1,4 +1,4 @@
-// The drifter of docs/your-filter.md with Eigen, behind fuselog_filter.h: -e lib:./drifter_eigen.so
+// The drifter of docs/your-filter.md with Eigen and the interface of fuselog_filter.h: -e lib:./drifter_eigen.so
 #include "fuselog_filter.h"
 
 #include <Eigen/Dense>

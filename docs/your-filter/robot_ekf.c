@@ -1,10 +1,10 @@
-/* A robot among landmarks: an extended Kalman filter by hand, behind fuselog_filter.h.
+/* A robot among landmarks: a hand-written extended Kalman filter with the interface of fuselog_filter.h.
  *
  *     cc -std=c99 -O2 -shared -fPIC -I "$(fuselog header)" robot_ekf.c -lm -o robot_ekf.so
  *     fuselog replay run.mcap -e lib:./robot_ekf.so -e ekf
  *
- * The state is x, y in m and the heading in rad; odometry holds until the next one. It gives what fuselog's
- * own `ekf` of the model `robot` gives.
+ * The state is x, y in m and the heading in rad; each odometry message is valid until the next. The estimates
+ * are those of fuselog's own `ekf` of the model `robot`.
  */
 #include "fuselog_filter.h"
 
@@ -26,8 +26,8 @@ typedef struct {
     int64_t time_ns;
     int landmarks;
     double number[MOST_LANDMARKS], place[MOST_LANDMARKS][2];
-    int measured; /* how many components the last message had */
-    int outcome;  /* what became of them */
+    int measured; /* number of components of the last message */
+    int outcome;  /* outcome of its update */
     double innovation[2], spread[2][2];
 } Robot;
 
@@ -119,7 +119,7 @@ int32_t fuselog_filter_predict(void *filter, int64_t time_ns)
     double half = 0.5 * (robot->turn + parameters[TURN_BIAS]) * duration_s;
     double speed = parameters[SCALE] * robot->forward;
     double sinc = half == 0.0 ? 1.0 : sin(half) / half;
-    double slope = fabs(half) < 1e-4 ? -half / 3.0 : (cos(half) - sinc) / half; /* of sinc */
+    double slope = fabs(half) < 1e-4 ? -half / 3.0 : (cos(half) - sinc) / half; /* derivative of sinc */
     double chord = speed * duration_s * sinc, direction = robot->mean[2] + half;
     double c = cos(direction), s = sin(direction);
     double by_half = speed * duration_s * slope, half_by_turn = 0.5 * duration_s;
@@ -156,7 +156,7 @@ int32_t fuselog_filter_predict(void *filter, int64_t time_ns)
     return FUSELOG_FILTER_WELL;
 }
 
-/* x + K v, P - K S K', with the components that were measured: H has one row for each of them */
+/* x + K v, P - K S K' for the measured components: H has one row for each of them */
 static int32_t update(Robot *robot, int size, double rows[2][3], const double *difference,
                       const double *variances)
 {
@@ -188,7 +188,7 @@ static int32_t update(Robot *robot, int size, double rows[2][3], const double *d
     for (int i = 0; i < size; i++)
         for (int j = 0; j < size; j++)
             squared += difference[i] * inverse[i][j] * difference[j];
-    double below = size == 1 ? erf(sqrt(0.5 * squared)) : 1.0 - exp(-0.5 * squared); /* chi-square's */
+    double below = size == 1 ? erf(sqrt(0.5 * squared)) : 1.0 - exp(-0.5 * squared); /* chi-square distribution */
     if (robot->parameters[GATE] < 1.0 && below > robot->parameters[GATE]) {
         robot->outcome = FUSELOG_FILTER_REJECTED;
         return FUSELOG_FILTER_WELL;
@@ -211,7 +211,7 @@ static int32_t update(Robot *robot, int size, double rows[2][3], const double *d
     return FUSELOG_FILTER_WELL;
 }
 
-/* A range or bearing of a landmark, or both; NaN for what the message lacks. */
+/* A range or bearing of a landmark, or both; NaN for a missing one. */
 static int32_t sight(Robot *robot, double number, double range, double bearing)
 {
     const double *parameters = robot->parameters;
@@ -225,7 +225,7 @@ static int32_t sight(Robot *robot, double number, double range, double bearing)
     double squared = dx * dx + dy * dy, distance = sqrt(squared);
     robot->outcome = FUSELOG_FILTER_WELL;
     robot->innovation[0] = robot->innovation[1] = NAN;
-    if (!(distance > 0.0)) { /* no derivative on the very spot */
+    if (!(distance > 0.0)) { /* no derivative at the landmark itself */
         robot->outcome = FUSELOG_FILTER_REJECTED;
         return FUSELOG_FILTER_WELL;
     }
@@ -254,7 +254,7 @@ int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns, const 
 {
     Robot *robot = filter;
     robot->outcome = FUSELOG_FILTER_NOTHING;
-    if (topic == LANDMARKS) { /* before the start */
+    if (topic == LANDMARKS) { /* the map comes before the start */
         if (robot->landmarks == MOST_LANDMARKS)
             return TOO_MANY_LANDMARKS;
         robot->number[robot->landmarks] = fields[0];

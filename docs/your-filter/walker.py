@@ -1,6 +1,6 @@
-"""A walker with position fixes, by FilterPy's KalmanFilter as a program: `-e "exec:python walker.py"`.
+"""A walker with position fixes: FilterPy's KalmanFilter as a program, `-e "exec:python walker.py"`.
 
-The state is x, y and their velocities; white acceleration moves it.
+The state is x, y and their velocities, driven by white acceleration.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ DESCRIPTION = {
 
 
 class Walker:
-    """FilterPy's filter, with steps as long as messages are apart."""
+    """FilterPy's filter, with steps of the duration between messages."""
 
     def __init__(self, parameters, seed):
         self.variance = parameters[0] ** 2

@@ -125,8 +125,8 @@ def test_the_page_states_what_messages_were_measured_to_cost() -> None:
     loop, around, apart, *programs = (float(row[1].split()[0]) / 1000 for row in speed)
     page = (DOCS / "your-filter.md").read_text(encoding="utf-8")
     stated = (
-        f"{loop:.2g} µs in the loop of this process, {around:.2g} µs with all around it; "
-        f"{apart:.2g} µs in a process of its own",
+        f"{loop:.2g} µs for the call in this process, {around:.2g} µs with all overhead; "
+        f"{apart:.2g} µs in a separate process",
         f"{min(programs):.2g} to {max(programs):.2g} µs",
     )
     for each in stated:
