@@ -103,7 +103,7 @@ class Squares:
 
     @property
     def is_far(self) -> bool:
-        """Test whether errors exceed the claimed ones so far that the covariance is no guide."""
+        """Test whether errors exceed the claimed ones so far that the covariance cannot be relied on."""
         return self.factor > FAR
 
     @property

@@ -121,7 +121,6 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
 
 
 def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
-    """Return the reasons why topics are not drawn, by topic."""
     shown_elsewhere = NOT_SENSED - {schemas.LINK_EVENT.full_name}
     return {
         stream.topic: "it has no field that can be plotted over time"

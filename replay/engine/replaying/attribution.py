@@ -18,7 +18,7 @@ from fuselog.recorders.log import Clock
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 
 Integers = NDArray[np.int64]
-# The most messages kept for later innovations; a run that has ended gives none for its last ones.
+# The oldest blocks of waiting messages are dropped above this number, as at the end of a run.
 MOST_WAITING = 1 << 18
 
 

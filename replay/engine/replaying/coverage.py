@@ -22,7 +22,7 @@ class Coverage:
 
     BINS = 64
     SECOND = 30  # the bin of intervals about one second long, 2^30 ns
-    GAP = 4  # a gap is more than this many bins above the median: at least 8 to 32 times as long
+    GAP = 4  # gaps are more than this many bins above the median: 16 to 32 times as long or longer
 
     def __init__(self, topic: str, starts_ns: Integers) -> None:
         self.topic = topic
@@ -55,7 +55,6 @@ class Coverage:
         return np.zeros((self.BINS, self._runs))
 
     def _count(self) -> None:
-        """Count the intervals of the last block."""
         if self._last_block:
             _count_intervals(self._runs, *self._last_block, self._counts, self._sums_ns)
             self._last_block = ()

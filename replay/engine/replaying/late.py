@@ -260,7 +260,6 @@ def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
 
 
 def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> Ragged:
-    """Make the stream of messages that are skipped because they are late."""
     by = f"more than {late.back_ns * 1e-9:g} s " if late.back_ns else ""
     reasons = [f"topic {topic}: it is {by}{OLDER}" for topic in arrivals.streams]
     stream = reason_stream(

@@ -238,7 +238,6 @@ def _initialized(
     order: Clock,
     stamps: Clock,
 ) -> Initialized:
-    """Run the initialization of an estimator on the first messages."""
     if not isinstance(bound, Recursive) or bound.initialization is None:
         return Initialized({}, [])
     topics = bound.initialization.topics

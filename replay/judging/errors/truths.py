@@ -51,7 +51,7 @@ class Truths:
         self._reached: dict[tuple[str, str], int] = {}
 
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
-        """Return the messages of a topic around some stamps, so many that later ones have no influence.
+        """Return the messages of a topic that determine the truth at some stamps.
 
         `reader` identifies the caller. Messages before the stamps of all readers are dropped, and read
         again for a new reader that asks for them.

@@ -455,7 +455,6 @@ def extent_of(places: Floats) -> float:
 
 
 def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: float) -> None:
-    """Draw lines at the multiples of the step in x and y."""
     lines = []
     for axis in range(2):
         at = step_m * np.arange(np.ceil(low[axis] / step_m), np.floor(high[axis] / step_m) + 1)
