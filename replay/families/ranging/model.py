@@ -1,7 +1,7 @@
 """Models that locate tags from ranges to anchors with known positions, as with ultra-wideband radios.
 
 `ranging-pose` uses several tags on a body in the plane, and so estimates its heading as well;
-`ranging-position` uses one tag. Velocities are random walks. Radios have more errors than white noise: a
+`ranging-position` uses one tag. Velocities are random walks. In addition to white noise, radios have a
 bias, `bias_range_m`; an error of each anchor, or of each pair of anchor and tag, that lasts for seconds;
 and outliers when the line of sight is blocked. All three are options, see
 `fuselog.replay.inference.model.augmentation` and `fuselog.replay.inference.linear_algebra.inflation`.

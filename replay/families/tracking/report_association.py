@@ -48,7 +48,7 @@ class Tracks(NamedTuple):
         weight: (runs, places, LEVELS).
         interval_s: (runs, places) usual time between reports.
         course_rad, speed_mps: (runs, places) as last reported.
-        held: (runs, places, 2) how often a slow vessel repeated its course, and how often not, from 1.
+        held: (runs, places, 2) how often a slow vessel repeated its course, or did not, from 1.
     """
 
     used: Integers
