@@ -212,7 +212,7 @@ def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -
 
 
 SHOT_SEQUENCE = Simulator(
-    "acoustic sensors hear shots of one moving shooter, with echoes and wrong associations",
+    "shots of one moving shooter heard by acoustic sensors, with echoes and wrong associations",
     ShotSequenceParameters,
     simulate,
 )

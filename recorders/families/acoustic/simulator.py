@@ -159,7 +159,7 @@ def _detections(
 
 
 ACOUSTIC_SHOTS = Simulator(
-    "acoustic sensors hear a supersonic shot: muzzle blast, shockwave, time between them, GPS",
+    "a supersonic shot heard by acoustic sensors: muzzle blast, shockwave, time between them, GPS",
     AcousticParameters,
     simulate,
 )

@@ -95,7 +95,7 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     """
     if not folder.is_dir():
         raise BadInput(
-            f"{folder}: is not a folder; give one that has WAV files and a table of the microphones' "
+            f"{folder}: is not a folder; give a folder with WAV files and a table of the microphones' "
             "positions"
         )
     tables = {path: _table(path) for path in sorted(folder.rglob("*.csv"))}
@@ -122,7 +122,7 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     ]
     if not streams:
         left = "; ".join(f"{what}: {why}" for what, why in notes.items())
-        raise BadInput(f"{folder}: has no sound that can be located ({left or 'none is detected'})")
+        raise BadInput(f"{folder}: has no sound that can be located ({left or 'none detected'})")
     missing = sorted(parameters.truth_m.keys() - {stream.topic.split("/")[1] for stream in streams})
     if missing:
         notes["truth_m"] = f"no sound has the name {', '.join(missing)}"
@@ -136,14 +136,14 @@ def _array(folder: Path, path: Path, table: pd.DataFrame, first_id: int, notes: 
     files = _recordings(folder, places, notes)
     if not files:
         raise BadInput(
-            f"{path}: none of the files that it names can be used; give the folder that their paths "
-            "start from"
+            f"{path}: none of the listed files can be used; give the folder that their paths are "
+            "relative to"
         )
     silent = [name for name, each in files.items() if each.begin_ns is None]
     if silent and len(silent) < len(files):
         raise BadInput(
-            f"{path}: {silent[0]} lacks the comment recording_start_time, which others have; "
-            "give it to all of them or to none"
+            f"{path}: {silent[0]} has no comment recording_start_time, but other files have one; "
+            "add it to all files or to none"
         )
     return Array(path, places, {name: first_id + place for place, name in enumerate(files)}, files)
 
@@ -188,11 +188,11 @@ def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -
         if not path.is_file():
             path = next(iter(sorted(folder.rglob(Path(name).name))), path)
         if not path.is_file():
-            notes[name] = "is not there: left out"
+            notes[name] = "not found, skipped"
             continue
         recorded = _read(path)
         if not np.ptp(recorded.samples):
-            notes[name] = "is silent: left out"
+            notes[name] = "is silent, skipped"
             continue
         other = next(iter(found.items()), None)
         if other and other[1].rate_hz != recorded.rate_hz:
@@ -219,7 +219,7 @@ def _read(path: Path) -> Recorded:
         samples = samples.astype(float) - 128.0
     samples = samples.astype(float)
     if not np.isfinite(samples).all():
-        raise BadInput(f"{path}: has samples that are not finite; export it again without them")
+        raise BadInput(f"{path}: has samples that are not finite; export the file again without them")
     return Recorded(samples, int(rate_hz), _begin_ns(path))
 
 
@@ -236,7 +236,7 @@ def _begin_ns(path: Path) -> int | None:
             "such as 2021-09-24T06:52:00+00:00"
         ) from None
     if begin.tzinfo is None:
-        raise BadInput(f"{path}: recording_start_time has no time zone; write it with one")
+        raise BadInput(f"{path}: recording_start_time has no time zone; add one")
     whole = int(begin.replace(microsecond=0).timestamp())
     return int(to_ns(whole, 10**9, begin.microsecond * 1000, where=str(path)))
 
@@ -258,7 +258,7 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
         has_one = True
         begin, end = (table[name].map(_number) for name in TIMES)
         if not ((begin >= 0.0) & (begin < end)).all():
-            raise BadInput(f"{path}: start_time and end_time must be in s, and the end after the start")
+            raise BadInput(f"{path}: start_time and end_time must be in s, with the end after the start")
         first_ns = file.map({name: span[0] for name, span in spans.items()}).fillna(-1).astype(np.int64)
         firsts = np.asarray(first_ns, np.int64)
         begin_ns, end_ns = (
@@ -312,28 +312,27 @@ def _streams(
     count = int((last_ns - first_ns) * 1e-9 * rate_hz)
     for each in sound.files:
         if each not in covering:
-            notes[f"{name}, {each}"] = "does not last as long as the sound: left out"
+            notes[f"{name}, {each}"] = "does not cover the whole sound, skipped"
             continue
         begin = round((first_ns - spans[each][0]) * 1e-9 * rate_hz)
         samples = array.files[each].samples[begin : begin + count]
         if not np.ptp(samples):
-            notes[f"{name}, {each}"] = "is silent there: left out"
+            notes[f"{name}, {each}"] = "is silent during the sound, skipped"
             continue
         kept[each] = samples
         at_top = float(np.mean(np.abs(samples) == np.abs(samples).max()))
         if at_top > parameters.clipped_share:
-            notes[f"{name}, {each}"] = f"is clipped: {at_top:.1%} of it are at the greatest value"
+            notes[f"{name}, {each}"] = f"is clipped: {at_top:.1%} of its samples have the greatest value"
     places = np.array([array.places[each] for each in kept]).reshape(-1, 3)
     needed = 3 if len(places) and np.ptp(places[:, 2]) == 0.0 else 4
     if len(kept) < needed:
-        notes[name] = f"{len(kept)} microphones heard it, {needed} are needed to locate it: left out"
+        notes[name] = f"{len(kept)} microphones heard it, but {needed} are needed to locate it; skipped"
         return
     low, high = parameters.band_hz or (200.0, 0.45 * rate_hz)
     if not low < high <= 0.5 * rate_hz:
         raise BadInput(
             f"sound {name}: band_hz = [{low:g}, {high:g}] for {rate_hz} samples per second; give a "
-            "lower "
-            f"and a higher frequency in Hz, the higher one at most {0.5 * rate_hz:g}"
+            f"lower and a higher frequency in Hz, the higher one at most {0.5 * rate_hz:g}"
         )
     shortest = min(map(len, kept.values()))
     recordings = np.array([samples[:shortest] for samples in kept.values()])
@@ -352,7 +351,7 @@ def _streams(
 
 
 SOUND_RECORDINGS = Importer(
-    "sounds in synchronised WAV files: differences of their arrivals; a folder with tables",
+    "sounds in synchronized WAV files, as arrival differences; a folder with tables",
     SoundRecordingsParameters,
     read,
 )

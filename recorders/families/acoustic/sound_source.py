@@ -59,9 +59,8 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
     low, high = parameters.band_hz
     if not low < high <= 0.5 * parameters.rate_hz:
         raise BadInput(
-            f"band_hz = [{low:g}, {high:g}]: give a lower and a higher frequency, the higher one at "
-            "most "
-            f"half of rate_hz = {parameters.rate_hz:g}"
+            f"band_hz = [{low:g}, {high:g}]: give a lower and a higher frequency, the higher one "
+            f"at most half of rate_hz = {parameters.rate_hz:g}"
         )
     places = np.array(parameters.microphones_m)
     source = places.mean(axis=0) + parameters.reach_m * rng.uniform(-1.0, 1.0, 3)
@@ -108,7 +107,7 @@ def _recordings(
 
 
 SOUND_SOURCE = Simulator(
-    "microphones record a sound in noise; differences of its arrivals are found by cross-correlation",
+    "a sound in noise recorded by microphones, and its arrival differences by cross-correlation",
     SoundSourceParameters,
     simulate,
 )

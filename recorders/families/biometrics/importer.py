@@ -67,7 +67,7 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     first file, or contradicts the declared sense of its scores.
     """
     if not folder.is_dir():
-        raise BadInput(f"{folder}: not a folder; give the folder that holds a CSV per matcher")
+        raise BadInput(f"{folder}: not a folder; give the folder with one CSV per matcher")
     matchers = parameters.matchers or _described(folder)
     matrices = [_matrix(folder / f"{each.name}.csv") for each in matchers]
     first = matrices[0]
@@ -86,18 +86,18 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     arrival_s = parameters.probe_interval_s * np.arange(len(first.probes))
     arrival_ns = simulation_stamps_ns(arrival_s)
     scores = np.stack([matrix.scores for matrix in matrices], axis=-1)
-    notes = {"times": f"made up: a probe every {parameters.probe_interval_s:g} s"}
+    notes = {"times": f"not in the data: assumed a probe every {parameters.probe_interval_s:g} s"}
     return Recording([score_stream(matchers, scores, arrival_ns)], notes=notes)
 
 
 def _described(folder: Path) -> list[Matcher]:
     path = folder / "matchers.toml"
     if not path.exists():
-        raise BadInput(f"{path}: no such file; list the matchers in it, or in the parameter 'matchers'")
+        raise BadInput(f"{path}: no such file; list the matchers there, or in the parameter 'matchers'")
     matchers = build(Matchers, read_toml(path), str(path)).matchers
     if not matchers:
         raise BadInput(
-            f"{path}: lists no matchers; give a [[matchers]] table with name and modality for each"
+            f"{path}: lists no matchers; add a [[matchers]] table with name and modality for each"
         )
     return matchers
 
@@ -106,7 +106,7 @@ def _matrix(path: Path) -> Matrix:
     try:
         table = pd.read_csv(path, index_col=0, dtype={0: str}, keep_default_na=False)
     except FileNotFoundError:
-        raise BadInput(f"{path}: no such file; every matcher needs its matrix") from None
+        raise BadInput(f"{path}: no such file; every matcher needs a matrix") from None
     except (OSError, ValueError, IndexError) as error:
         raise BadInput(f"{path}: cannot be read as a matrix with ids ({error})") from None
     if table.empty or table.shape[0] != table.shape[1]:
@@ -129,9 +129,7 @@ def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> N
     valid = scores != matcher.failure if matcher.failure is not None else np.ones(scores.shape, bool)
     genuine = np.eye(len(scores), dtype=bool)
     if not valid.any() or np.ptp(scores[valid]) == 0:
-        raise BadInput(
-            f"{path}: all scores are equal, so that they cannot separate users; leave this matcher out"
-        )
+        raise BadInput(f"{path}: all scores are equal and cannot distinguish users; remove this matcher")
     if not (valid & genuine).any() or not (valid & ~genuine).any():
         raise BadInput(f"{path}: needs scores of the same and of different users; give more users")
     ahead = np.median(scores[valid & genuine]) - np.median(scores[valid & ~genuine])
@@ -144,7 +142,7 @@ def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> N
 
 
 SCORE_MATRICES = Importer(
-    "biometric score matrices, as of NIST BSSR1: a folder with a CSV per matcher, with users' ids",
+    "biometric score matrices such as NIST BSSR1: a folder with a CSV per matcher, with users' ids",
     ScoreMatricesParameters,
     read,
 )

@@ -59,7 +59,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
     seen = np.isfinite(data["opt_quat"]).all(axis=1)
     if not sampled.any() or not seen.any():
         missing = "truth" if sampled.any() else "inertial samples"
-        raise BadInput(f"{file}: every value of {missing} is NaN; leave this trial out")
+        raise BadInput(f"{file}: every value of {missing} is NaN; remove this trial")
     truth = require_unit(data["opt_quat"][seen], f"{file}: truth opt_quat", parameters.unit_tolerance)
     moving = data["movement"] != 0
     changes = np.flatnonzero(np.append(True, moving[1:] != moving[:-1]))
@@ -90,7 +90,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
 
 def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
     """Read the datasets of one file, all of the same length, and the sampling rate."""
-    with extra("papers", f"{file}, a file of HDF5"):
+    with extra("papers", f"{file}, an HDF5 file"):
         import h5py  # which takes long to import
 
     try:

@@ -50,7 +50,7 @@ def sample_bingham(
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):
-        raise BadInput("Bingham concentrations must be finite to be sampled; give finite ones")
+        raise BadInput("Bingham concentrations must be finite to draw samples")
     d = concentrations.shape[-1]
     shape = np.broadcast_shapes(axes.shape[:-2], concentrations.shape[:-1])
     z = concentrations - concentrations.max(axis=-1, keepdims=True)
@@ -110,7 +110,7 @@ class DirectionalNoise(Parameters):
     @model_validator(mode="after")
     def _has_its_sign(self) -> Self:
         if len(self.diagonal) not in (2, 4):
-            raise ValueError("give 2 numbers for an axis, 4 for an orientation")
+            raise ValueError("give 2 numbers for an axis or 4 for an orientation")
         if self.distribution == "bingham" and max(self.diagonal) != 0.0:
             raise ValueError(
                 "Bingham concentrations must be 0 for the mode and at most 0 for the others"

@@ -97,12 +97,12 @@ def simulate(
 
 
 AXIS = Simulator(
-    "an axis in the plane, equal to its negative, turns at random; noisy measurements of it",
+    "an axis in the plane, equal to its negative, that rotates at random; noisy measurements of it",
     AxisParameters,
     partial(simulate, schemas.AXIS, AXIS_KINDS),
 )
 ORIENTATION = Simulator(
-    "an orientation in space turns at random; noisy quaternions of it",
+    "an orientation in space that rotates at random; noisy quaternions of it",
     OrientationParameters,
     partial(simulate, schemas.ORIENTATION, ORIENTATION_KINDS),
 )

@@ -90,7 +90,7 @@ def simulate(parameters: HeadingsParameters, rng: np.random.Generator) -> Record
 
 
 TORUS_HEADINGS = Simulator(
-    "two headings that turn with each other; correlated noisy measurements of both",
+    "two coupled headings; correlated noisy measurements of both",
     HeadingsParameters,
     simulate,
 )

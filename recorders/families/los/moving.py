@@ -219,7 +219,7 @@ def _poses(parameters: MovingOpticalParameters, number: int, times_s: Floats) ->
 
 
 MOVING_LOS = Simulator(
-    "optical sensors on aircraft, with clocks and attitudes that are off, see moving targets",
+    "moving targets seen by optical sensors on aircraft with clock and attitude errors",
     MovingOpticalParameters,
     simulate,
 )

@@ -69,7 +69,7 @@ class OpticalParameters(Parameters):
         rows_deg = [(0.0, 0.0, 0.0)] if given_deg is None else given_deg
         if len(rows_deg) not in (1, sensors):
             raise BadInput(
-                f"{name} has {len(rows_deg)} rows for {sensors} sensors; give one for each, or one"
+                f"{name} has {len(rows_deg)} rows for {sensors} sensors; give one each or one for all"
             )
         return np.broadcast_to(np.radians(rows_deg), (sensors, 3))
 
@@ -166,7 +166,7 @@ def _in_view(parameters: OpticalParameters, place: Array, targets: Array) -> NDA
 
 
 OPTICAL_LOS = Simulator(
-    "optical sensors with biased attitudes see targets: azimuth and elevation",
+    "targets seen by optical sensors with biased attitudes: azimuth and elevation",
     OpticalParameters,
     simulate,
 )

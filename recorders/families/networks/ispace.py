@@ -161,14 +161,14 @@ def _check(parameters: IspaceParameters, count: int, links: NDArray[np.int64]) -
     named = [*links.ravel(), *(outage.node for outage in parameters.outages)]
     if named and max(named) > count:
         raise BadInput(
-            f"scenario ispace: a link or outage names node {max(named)}; there are nodes 1 to {count}"
+            f"scenario ispace: a link or outage refers to node {max(named)}; nodes are 1 to {count}"
         )
     if np.any(links[:, 0] == links[:, 1]):
-        raise BadInput("scenario ispace: a link leads from a node to itself; leave it out")
+        raise BadInput("scenario ispace: a link leads from a node to itself; remove it")
     for number, node in enumerate(parameters.nodes, start=1):
         if not set(node.components) <= set(COMPONENTS) or len(node.components) != len(node.sigmas):
             raise BadInput(
-                f"scenario ispace: node {number} needs components out of {', '.join(COMPONENTS)} "
+                f"scenario ispace: node {number} needs components from {', '.join(COMPONENTS)} "
                 "and one sigma for each"
             )
 

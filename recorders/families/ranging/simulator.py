@@ -95,7 +95,7 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
     """Record one run; raise BadInput if there are no anchors or no tags."""
     for name in ("anchors_m", "tags_m"):
         if not getattr(parameters, name):
-            raise BadInput(f"{name} is empty; give one point or more, such as [[0, 0, 2]]")
+            raise BadInput(f"{name} is empty; give at least one point, such as [[0, 0, 2]]")
     start_rng, path_rng, error_rng, blocked_rng, noise_rng = rng.spawn(5)
     times_s = np.arange(int(parameters.duration_s * parameters.rate_hz + 1e-9) + 1) / parameters.rate_hz
     sigma = np.array(
@@ -198,7 +198,7 @@ def _excess(blocked: Blocked, times_s: Floats, anchors: int, rng: np.random.Gene
 
 
 RANGING = Simulator(
-    "a trolley with tags among anchors: ranges with bias, errors that last, and blocked lines of sight",
+    "a trolley with tags among anchors: ranges with bias, slow errors and blocked lines of sight",
     RangingParameters,
     simulate,
 )

@@ -75,7 +75,7 @@ def simulate(parameters: ExtendedTargetParameters, rng: np.random.Generator) -> 
 
 
 EXTENDED_TARGET = Simulator(
-    "a rectangle stands still; noisy points of its surface are measured one at a time",
+    "a static rectangle; noisy points of its surface are measured one at a time",
     ExtendedTargetParameters,
     simulate,
 )

@@ -52,9 +52,8 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
             state[step + 1] = np.array(react(state[step], parameters.step_s)) + noise[step]
     if not np.isfinite(state).all():
         raise BadInput(
-            f"start = {parameters.start}, step_s = {parameters.step_s:g}: the pressures grow without "
-            "bound; "
-            "start at pressures from 0 on, and give shorter or fewer steps"
+            f"start = {parameters.start}, step_s = {parameters.step_s:g}: the pressures "
+            "grow without bound; start at nonnegative pressures, and use shorter or fewer steps"
         )
     (total,) = total_pressure(state[1:].T)
     read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)
@@ -82,5 +81,5 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
 
 
 BATCH_REACTOR = Simulator(
-    "a gas reacts in a closed vessel; its total pressure is read", ReactorParameters, simulate
+    "a gas that reacts in a closed vessel; its total pressure is measured", ReactorParameters, simulate
 )

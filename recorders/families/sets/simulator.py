@@ -71,7 +71,8 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
         error_rad = parameters.error_share * bound_rad
     if np.any(np.all(places == robot, axis=1)):
         raise BadInput(
-            "scenario relative-bearings: the robot is at the position of a landmark; move one of them"
+            "scenario relative-bearings: the robot is at the position of a landmark; move the robot "
+            "or the landmark"
         )
     count = len(first)
     looks = np.repeat(np.arange(parameters.looks), count)
@@ -112,7 +113,7 @@ def _arena(parameters: RelativeBearingsParameters) -> tuple[float, float, float,
 
 
 RELATIVE_BEARINGS = Simulator(
-    "a robot that measures bounded relative bearings to landmarks: the paper's scene, or random ones",
+    "a robot that measures bounded relative bearings to landmarks; the paper's or random scenes",
     RelativeBearingsParameters,
     simulate,
 )

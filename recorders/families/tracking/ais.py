@@ -82,8 +82,8 @@ def read(path: Path, parameters: AisParameters) -> Recording:
     near = up > -SEMI_MAJOR_M
     if not near.any():
         raise BadInput(
-            f"{path}: all positions are on the other half of the earth, seen from {origin}; give an "
-            "origin near them"
+            f"{path}: all positions are on the other half of the earth from the origin {origin}; give "
+            "an origin near them"
         )
     if not near.all():
         notes["beyond the tangent plane's half of the earth"] = f"{(~near).sum()} reports dropped"
@@ -173,15 +173,15 @@ def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Repo
     unknown = (reports.latitude_deg > 90.0) | (reports.longitude_deg > 180.0)
     if unknown.all():
         raise BadInput(
-            f"{path}: no report has a position: all have latitude 91 or longitude 181, which mean not "
-            "available"
+            f"{path}: no report has a position: all have latitude 91 or longitude 181, the codes for "
+            "not available"
         )
     if unknown.any():
         notes["position not available"] = f"{unknown.sum()} reports dropped"
     for what, values in (("course", reports.course_deg), ("speed", reports.speed_mps)):
         count = np.isnan(values[~unknown]).sum()
         if count:
-            notes[f"{what} not available"] = f"{count} reports kept without"
+            notes[f"{what} not available"] = f"{count} reports kept"
     return reports.take(~unknown)
 
 
@@ -219,9 +219,9 @@ def _tell_doubts(
     # a jump there and back is wrong; after a single jump, either side may be wrong
     wrong[1:-1] = leaps[:-1] & leaps[1:]
     fastest = pd.Series(reports.speed_mps).groupby(reports.mmsi).max()
-    notes["vessels"] = f"{len(fastest)}, {(fastest < KNOT_MPS).sum()} of them never at a knot or more"
+    notes["vessels"] = f"{len(fastest)}, {(fastest < KNOT_MPS).sum()} of them always below one knot"
     if wrong.any():
-        limit = f"over {parameters.top_speed_mps:g} m/s away from the vessel's reports before and after"
+        limit = f"over {parameters.top_speed_mps:g} m/s from the vessel's reports before and after"
         rows = ", ".join(str(each) for each in np.unique(mmsi[wrong])[:5])
         notes["wrong positions"] = f"{wrong.sum()} {limit} (MMSI {rows}), kept"
     long = silent_s[silent_s > parameters.gap_s]

@@ -169,8 +169,7 @@ def _file(folder: Path, kind: str) -> Path:
     if len(found) != 1:
         raise BadInput(
             f"{folder}: {len(found) or 'no'} files *_{kind}.json, expected one; give the folder of one "
-            "Autoferry "
-            "scenario, such as scenario2"
+            "Autoferry scenario, such as scenario2"
         )
     return found[0]
 
@@ -240,9 +239,7 @@ def _truths(path: Path) -> dict[int, tuple[Integers, Floats]]:
             north, east, *_ = _numbers(_of(target, "position", where), where, "position", 3)
             stamps = found.setdefault(name, {})
             if stamps.setdefault(_stamp_ns(target, where), (east, north)) != (east, north):
-                raise BadInput(
-                    f"{where}: target {name} has two positions at one time; remove one of the entries"
-                )
+                raise BadInput(f"{where}: target {name} has two positions at one time; remove one entry")
     return {
         target: (np.array(sorted(stamps), np.int64), np.array([stamps[each] for each in sorted(stamps)]))
         for target, stamps in sorted(found.items())
@@ -312,7 +309,7 @@ def _tell(notes: dict[str, str], name: str, rows: Integers, scans: Scans) -> Non
 
 
 AUTOFERRY = Importer(
-    "Autoferry scenarios: lidar, radar and camera scans of vessels from a moving one; a folder of JSON",
+    "Autoferry scenarios: lidar, radar and camera scans from a moving vessel; a folder of JSON files",
     AutoferryParameters,
     read,
 )

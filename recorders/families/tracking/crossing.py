@@ -147,7 +147,7 @@ def _radar(
 
 
 CROSSING = Simulator(
-    "targets that cross, go side by side and turn; a radar's unordered scans with clutter",
+    "targets that cross, move side by side and turn; a radar's unordered scans with clutter",
     CrossingParameters,
     simulate,
 )

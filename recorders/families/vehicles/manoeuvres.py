@@ -123,5 +123,5 @@ def _parts(parameters: ManoeuvresParameters, rng: np.random.Generator) -> list[P
 
 
 MANOEUVRES = Simulator(
-    "a vehicle drives straight on, turns, stops and starts; its fixes", ManoeuvresParameters, simulate
+    "a vehicle that drives straight, turns, stops and starts; its fixes", ManoeuvresParameters, simulate
 )

@@ -364,7 +364,7 @@ def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple
 
 
 VEHICLES = Simulator(
-    "vehicles send fixes to a network; a roadside sensor of unknown pose detects them, unordered",
+    "vehicles that send fixes to a network, and a roadside sensor of unknown pose; both unordered",
     VehiclesParameters,
     simulate,
 )

@@ -48,7 +48,7 @@ def register(places: Floats, detections: Floats, variance_m2: Floats | float) ->
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
         raise BadInput(
-            f"registration would try all permutations of {vehicles} vehicles; give at most {MOST_VEHICLES}"
+            f"registration tries all permutations of {vehicles} vehicles; give at most {MOST_VEHICLES}"
         )
     order = _permutations(vehicles)
     there, seen = _centred(places), _centred(detections)

@@ -52,11 +52,11 @@ def test_a_small_table_row_by_row(tmp_path: Path):
     assert np.isnan(reports["speed_mps"][2])
     assert recording.notes == {
         "position not available": "1 reports dropped",
-        "course not available": "1 reports kept without",
-        "speed not available": "1 reports kept without",
+        "course not available": "1 reports kept",
+        "speed not available": "1 reports kept",
         "repeated rows": "1 dropped",
-        "vessels": "2, 1 of them never at a knot or more",
-        "wrong positions": "1 over 50 m/s away from the vessel's reports before and after "
+        "vessels": "2, 1 of them always below one knot",
+        "wrong positions": "1 over 50 m/s from the vessel's reports before and after "
         "(MMSI 235070762), kept",
         "gaps": "1 over 600 s, the longest 1800 s",
     }

@@ -82,5 +82,5 @@ def test_maximum_likelihood_is_at_least_as_likely_as_moments():
 
 
 def test_too_few_angles_are_refused():
-    with pytest.raises(BadInput, match="19 pairs of angles for 2 components; give at least 10 per component"):
+    with pytest.raises(BadInput, match="19 pairs of angles for 2 components; give at least 10"):
         fit_wrapped_mixture(np.zeros((19, 2)), 2)
