@@ -1,6 +1,6 @@
-"""Keeps the log contract: schemas, columns, and the reading and writing of MCAP files.
+"""The log format: schemas, columns, and the reading and writing of MCAP files.
 
-Begin with `streams`, which is what a topic is in memory, then `reader` and `writer`.
+Begin with `streams`, which holds a topic in memory, then `reader` and `writer`.
 """
 
 from fuselog.recorders.log.companions import Companion

@@ -1,7 +1,7 @@
-"""Writes companions: other makers' messages beside a log's streams, for viewers alone.
+"""Foxglove mirrors: messages in Foxglove's schemas, written next to a log's streams for viewers.
 
-A companion's channel states in its metadata which stream it accompanies, and is none of the log's
-topics. Its messages have no fixed layout; they are written one by one, into chunks of their own.
+The channel of a mirror states in its metadata which stream it accompanies, and is not one of the log's
+topics. Its messages have no fixed layout; they are written one by one, into separate chunks.
 """
 
 import struct
@@ -16,14 +16,14 @@ from mcap.opcode import Opcode
 from fuselog.recorders.log.container.chunks import RECORD_HEAD, Span
 from fuselog.recorders.log.container.packing import INDEX_ENTRY, Chunk
 
-# The key of a channel's metadata that names the stream.
+# The key in a channel's metadata that names the stream.
 COMPANION_OF = "companion_of"
 # Opcode, length of the rest, channel, sequence number, log time, publish time.
 _HEAD = struct.Struct("<BQHIQQ")
 
 
 class Companion(NamedTuple):
-    """Holds a message, its topic, the topic of the stream that it accompanies, and its two clocks."""
+    """A message, its topic, the topic of the stream that it accompanies, and its two clocks."""
 
     topic: str
     of: str
@@ -33,7 +33,7 @@ class Companion(NamedTuple):
 
 
 class Numbered(NamedTuple):
-    """Holds a companion with its channel and its number there."""
+    """A companion with its channel, and its number there."""
 
     channel_id: int
     sequence: int
@@ -41,7 +41,7 @@ class Numbered(NamedTuple):
 
 
 def descriptor_set(message: Message) -> bytes:
-    """Return the serialised FileDescriptorSet of a message with all that it is made of."""
+    """Return the serialised FileDescriptorSet of a message with all of its dependencies."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def add(file: Any) -> None:

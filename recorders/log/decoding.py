@@ -1,8 +1,8 @@
-"""Decodes the bytes of opened regions into the columns of one topic.
+"""Decoding of opened regions into the columns of one topic.
 
-How messages are laid out is believed only after a check. The fast path takes all messages of a region at
-once by our fixed layout, where every constant byte of each agrees (`Layout.parse`); on the slow path the
-protobuf library reads them one by one. A foreign log is read slowly, never wrongly.
+The layout of messages is checked before it is used. The fast path reads all messages of a region
+together by our fixed layout, if every constant byte of each agrees (`Layout.parse`). On the slow path,
+the protobuf library reads them one by one, so that logs of other writers are read slowly but correctly.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,9 @@ _Decoded = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray]]
 
 
 class Decoder:
-    """Decodes one topic of a log, region by region; threads may share it.
+    """A decoder of one topic of a log, region by region, which threads may share.
 
-    Raises BadInput where the topic is unknown, or its messages are not protobuf with numeric fields.
+    Raises BadInput if the topic is unknown, or its messages are not protobuf with numeric fields.
     """
 
     def __init__(self, log: Log, topic: str) -> None:
@@ -49,7 +49,7 @@ class Decoder:
         self._layout: Layout | None = None
 
     def _description(self, log: Log) -> records.Schema:
-        """Return what the file says of the messages; all channels of the topic must say the same."""
+        """Return the file's description of the messages; all channels of the topic must agree."""
         described = []
         for identifier in self._topic.channel_ids:
             channel = log.container.channels[identifier]
@@ -69,7 +69,7 @@ class Decoder:
         return schema
 
     def _check_fields(self) -> None:
-        """Require that a message of one of our names has our fields (but the latest)."""
+        """Require that a message with one of our names has our fields, except newer ones."""
         kinds = {entry.name: entry.kind for entry in self.schema}
         expected = SCHEMAS.get(self.schema.full_name, self.schema)
         wrong = [
@@ -89,9 +89,9 @@ class Decoder:
         return empty_stream(self._topic.name, self.schema, self._topic.metadata)
 
     def decode(self, contents: Contents, rank: int) -> list[Stream]:
-        """Return the topic's messages in the region that is the file's `rank`th, channel by channel.
+        """Decode the topic's messages in a region, the file's `rank`th, by channel.
 
-        Raises BadInput where a message cannot be decoded, or its fields make no columns.
+        Raises BadInput if a message cannot be decoded, or its fields do not form columns.
         """
         return [
             self._stream(contents.data, contents.messages[identifier], rank)
@@ -113,7 +113,7 @@ class Decoder:
         )
 
     def _at_once(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> _Decoded | None:
-        """Read clocks and columns by the fixed layout; None where a message is laid out otherwise."""
+        """Read clocks and columns by the fixed layout; None if a message has another layout."""
         if not self._is_fixed:
             return None
         if self._layout is None:
@@ -124,7 +124,7 @@ class Decoder:
         return None if found is None else (*_clocks(found), columns_of(self.schema, found))
 
     def _one_by_one(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> _Decoded:
-        """Read clocks and columns by the protobuf library, whatever the fields' order and presence."""
+        """Read clocks and columns with the protobuf library, for any order and presence of fields."""
         messages = self._messages(data, offsets)
         columns = {entry.name: self._column(entry, messages) for entry in self.schema}
         return *_clocks(_heads(data, offsets)), columns
@@ -172,7 +172,7 @@ def _heads(data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.vo
 
 
 def _clocks(records: NDArray[np.void]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Copy log times and publish times out of message records or their heads."""
+    """Copy log times and publish times from message records or their heads."""
     return (
         np.ascontiguousarray(records["mcap log_time"]),
         np.ascontiguousarray(records["mcap publish_time"]),

@@ -1,4 +1,4 @@
-"""Finds values that no sensor can give: infinite ones, and ones beyond what their unit can be."""
+"""Detection of values that no sensor can produce: infinite, or beyond the limit of their unit."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,7 +12,7 @@ from fuselog.recorders.log.schemas import BODY_POINT, LANDMARK
 from fuselog.recorders.log.streams import Stream
 from fuselog.recorders.units import unit_of
 
-# By the unit that ends a name: far beyond what is measured, wrongly scaled integers included.
+# By the unit at the end of a name: far beyond what is measured, even as wrongly scaled integers.
 LIMITS = {
     "m": 1e12,
     "m/s": 1e10,
@@ -23,23 +23,23 @@ LIMITS = {
     "s": 1e12,
     "uT": 1e12,
 }
-# Of all others, as covariances and scores: squares of it are still numbers.
+# For all others, such as covariances and scores: their squares do not overflow.
 LIMIT = 1e50
 LEAST = min(LIMITS.values())
-# A gap between stamps that no log has inside.
+# A gap between stamps that does not occur within a log.
 YEAR_NS = 31_556_952 * 10**9
-# What is said once, at whatever stamp.
+# Messages that are sent once, at any stamp.
 TIMELESS = {LANDMARK.full_name, BODY_POINT.full_name}
 
 
 class Impossible(NamedTuple):
-    """Describes impossible values of one component of a field.
+    """Impossible values of one component of a field.
 
     Attributes:
         field, name: the field, and its component in words.
-        rows: (n,) where they are.
-        value: the largest.
-        limit: the largest that would be possible.
+        rows: (n,), messages with such values.
+        value: the largest of these values.
+        limit: the largest possible value.
     """
 
     field: str
@@ -50,7 +50,7 @@ class Impossible(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Say what is wrong with the component."""
+        """Describe what is wrong with the component."""
         if np.isinf(self.value):
             return f"{self.name} is infinite"
         return f"{self.name} is {self.value:.3g}, and can be {self.limit:.0e} at most"
@@ -63,7 +63,7 @@ def impossible(stream: Stream) -> Iterator[Impossible]:
         if column is None or column.dtype.kind != "f" or not column.size:
             continue
         low, high = float(column.min()), float(column.max())
-        if low >= -LEAST and high <= LEAST:  # two quick passes; not so of NaN
+        if low >= -LEAST and high <= LEAST:  # two fast passes; False if there is NaN
             continue
         names = _components(stream, entry.name)
         limits = [limit_of(name) for name in names]
@@ -79,11 +79,11 @@ def impossible(stream: Stream) -> Iterator[Impossible]:
 
 
 def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, Counter[str]]:
-    """Leave out impossible messages, and count them by what is wrong, each once.
+    """Remove impossible messages, and count them by reason, each once.
 
     Args:
         stream: the messages.
-        span_ns: outside of which a stamp is impossible, see `main_span`; None where there is none.
+        span_ns: the span outside which a stamp is impossible, see `main_span`; None if there is none.
     """
     found: Counter[str] = Counter()
     wrong = [(each.words, each.rows) for each in impossible(stream)]
@@ -99,10 +99,10 @@ def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, C
 
 
 def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
-    """Find the first and last stamp of most messages; None where no others are years from them.
+    """Find the first and last stamp of most messages; None unless others are years away from them.
 
     Args:
-        stamps_ns: (n,) in any order, several times.
+        stamps_ns: several arrays (n,) in any order.
     """
     parts = [each for each in stamps_ns if len(each)]
     ends_ns = [int(end) for each in parts for end in (each.min(), each.max())]
@@ -122,21 +122,21 @@ def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
 def main_span_of(
     extent_ns: tuple[int, int], blocks: Callable[[], Iterable[Mapping[str, Stream]]]
 ) -> tuple[int, int] | None:
-    """Find `main_span` of a log; its blocks are read only if its ends are years apart."""
+    """Compute `main_span` of a log; its blocks are read only if its ends are years apart."""
     if extent_ns[1] - extent_ns[0] <= YEAR_NS:
         return None
     return main_span(each.publish_time_ns for block in blocks() for each in block.values())
 
 
 class Rejections(dict[str, Counter[str]]):
-    """Counts messages that are left out, being impossible: by topic, and by what is wrong."""
+    """Counts of impossible messages that are left out, by topic and by reason."""
 
     def note(self, topic: str, found: Counter[str]) -> None:
-        """Note what a read of a topic, whole or in part, left out; it may be read again."""
+        """Record what one read of a topic, or of a part of it, left out; reads may repeat."""
         self[topic] = self.get(topic, Counter()) | found
 
     def sentence(self, topic: str) -> str:
-        """Say what is left out of a topic."""
+        """Describe what is left out of a topic."""
         return "; ".join(
             f"{count} {'message is' if count == 1 else 'messages are'} left out: {why}"
             for why, count in self[topic].items()
@@ -162,7 +162,7 @@ def limit_of(name: str) -> float:
 
 
 def _components(stream: Stream, field: str) -> list[str]:
-    """Name the components of a field: by the channel, else by axis or number."""
+    """Name the components of a field, from the channel or by the field."""
     column = stream.columns[field]
     if column.ndim == 1:
         return [field]

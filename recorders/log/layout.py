@@ -1,8 +1,8 @@
-"""Describes the one byte layout that all messages of a stream share, as a NumPy type.
+"""The byte layout that all messages of a stream share, as a NumPy type.
 
-A message record of MCAP is opcode, length, channel, sequence, two clocks and the payload; the payload
-is protobuf whose fields all have a fixed width. So a structured array is the bytes of a chunk, and the
-bytes of a chunk are columns. Nothing is believed unseen: `parse` compares every constant byte.
+A message record of MCAP is opcode, length, channel, sequence, two clocks and the payload; the payload is
+protobuf, and all its fields have a fixed width. So the bytes of a chunk can be viewed as a structured
+array, and columns can be written as bytes. Nothing is assumed: `parse` compares every constant byte.
 """
 
 from collections.abc import Mapping
@@ -33,9 +33,9 @@ _WIRE_TYPES = {"time_ns": 1, "identifier": 5, "real": 1, "vector": 2}
 
 @dataclass(frozen=True)
 class Layout:
-    """Describes the bytes of one schema with given vector widths, its constant bytes told apart.
+    """The byte layout of one schema with given vector widths, with a mask of its constant bytes.
 
-    An empty vector is absent from the wire, as proto3 has it, and so from `dtype`.
+    An empty vector is absent from the message, as in proto3, and so from `dtype`.
     """
 
     dtype: np.dtype
@@ -43,7 +43,7 @@ class Layout:
     pattern: Pattern
 
     def build(self, stream: Stream, channel_id: int, first_sequence: int) -> NDArray[np.void]:
-        """Return the stream's message records as a structured array (n,)."""
+        """Make the stream's message records, as a structured array (n,)."""
         rows = np.repeat(self.template.view(_opaque(self.dtype.itemsize)), len(stream))
         records = rows.view(self.dtype)
         records["mcap channel_id"] = channel_id
@@ -56,7 +56,7 @@ class Layout:
         return records
 
     def parse(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.void] | None:
-        """Read the message records (n,) at `offsets` of a chunk; None where one is laid out unlike."""
+        """Read the message records (n,) at `offsets` of a chunk; None if one has another layout."""
         if not agree(data, offsets, self.pattern):
             return None
         return windows(data, self.dtype.itemsize)[offsets].view(self.dtype)
@@ -66,11 +66,11 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
     """Copy the schema's columns out of records.
 
     Args:
-        schema: of the records.
-        records: (n,), as of `Layout.parse`.
+        schema: schema of the records.
+        records: (n,), as returned by `Layout.parse`.
 
     Returns:
-        By field, (n,) or (n, width); an empty vector has shape (n, 0).
+        Columns by field, (n,) or (n, width); an empty vector has shape (n, 0).
     """
     return {
         field.name: np.ascontiguousarray(records[field.name])
@@ -81,11 +81,11 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """View every run of some bytes as one opaque item, without a copy, to gather and scatter them.
+    """View every run of `size` bytes as one opaque item, without a copy, to gather and scatter them.
 
     Args:
         data: (n,), the bytes.
-        size: how many make an item.
+        size: number of bytes in an item.
 
     Returns:
         (n - size + 1,), the items that begin at each byte.
@@ -98,7 +98,7 @@ def _opaque(size: int) -> np.dtype:
 
 
 def layout_of(schema: Schema, widths: Mapping[str, int]) -> Layout:
-    """Return the layout of `schema` when its vectors have these widths."""
+    """Return the layout of `schema` for vectors of these widths."""
     return _layout(schema, tuple(widths.get(field.name, 0) for field in schema))
 
 
@@ -125,7 +125,7 @@ def _layout(schema: Schema, widths: tuple[int, ...]) -> Layout:
 
 
 def _prefix(number: int, field: Field, width: int) -> bytes:
-    """Write the tag, and for a vector the length in bytes, that stand before a field's value."""
+    """Encode the tag before a field's value, followed by the length in bytes for a vector."""
     tag = _varint(number << 3 | _WIRE_TYPES[field.kind])
     return tag + _varint(width * field.dtype.itemsize) if field.kind == "vector" else tag
 

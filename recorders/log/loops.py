@@ -1,7 +1,7 @@
-"""Loops over the bytes of a chunk: finds its records, and compares messages with a layout.
+"""Loops over the bytes of a chunk, which find its records and compare messages with a layout.
 
-The loops are kernels (`fuselog.recorders.compiling`), and compiled even if filters are not. They read
-eight bytes at a time as a word, of which LLVM makes one instruction.
+The loops are kernels (`fuselog.recorders.compiling`), and are compiled even if filters are not. They
+read eight bytes at a time as a word, which LLVM turns into one instruction.
 Source: the MCAP specification (mcap.dev/spec), records Message, Schema and Channel.
 """
 
@@ -26,10 +26,11 @@ _CHANNEL = int(Opcode.CHANNEL)
 
 
 class Scan(NamedTuple):
-    """Holds what a walk over a chunk's records finds; offsets in bytes, times in ns.
+    """The result of a walk over a chunk's records; offsets in bytes, times in ns.
 
-    `messages` are channel by channel, each in file order, and `counts` says how many each channel has.
-    `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
+    `messages` are grouped by channel, each group in file order, and `counts` has the number of each
+    channel's messages. `end` is where the walk stopped: the chunk's length, or the first incomplete
+    record.
     """
 
     messages: NDArray[np.int64]
@@ -41,7 +42,7 @@ class Scan(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """Holds the bytes that all records of a layout share: words at `places` within its `size` bytes."""
+    """The bytes that all records of a layout share: words at `places` within its `size` bytes."""
 
     size: int
     places: NDArray[np.int64]
@@ -50,11 +51,11 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
-    """Return the pattern of the bytes that all records of a layout share.
+    """Compute the pattern of the bytes that all records of a layout share.
 
     Args:
-        record: (size,), the bytes of one.
-        is_fixed: (size,), 0xFF where they are the same in all.
+        record: (size,), bytes of one record.
+        is_fixed: (size,), 0xFF for bytes that are the same in all records.
     """
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
@@ -65,7 +66,7 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
 
 
 def scan(data: NDArray[np.uint8]) -> Scan:
-    """Walk the records of a chunk."""
+    """Find the records of a chunk."""
     found = np.empty(len(data) // MESSAGE_HEAD_BYTES, np.int64)
     declarations = np.empty(len(data) // HEAD_BYTES, np.int64)
     highest = np.iinfo(np.uint64).max
@@ -79,12 +80,12 @@ def scan(data: NDArray[np.uint8]) -> Scan:
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
-    """Tell whether records lie inside a chunk and have the pattern's bytes.
+    """Test whether records are inside a chunk and match a pattern.
 
     Args:
         data: the chunk.
-        offsets: (n,), where the records begin, ascending; at least one.
-        pattern: theirs.
+        offsets: (n,), positions of the records, ascending; at least one.
+        pattern: pattern of the records.
     """
     if offsets[-1] + pattern.size > len(data):
         return False
@@ -100,18 +101,18 @@ def load() -> None:
 
 @cache
 def kernel(loop: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Return a loop compiled, even if FUSELOG_UNCOMPILED keeps filters from being so."""
+    """Compile a loop, even if FUSELOG_UNCOMPILED disables the compilation of filters."""
     from fuselog.recorders.compiling.kernels.native import function_of
 
     return function_of(loop)
 
 
 def word(data: NDArray[np.uint8], place: int) -> int:
-    """Return the number that eight bytes from a place on are, the lowest first; in a kernel signed.
+    """Read the little-endian number in eight bytes; in a kernel, it is signed.
 
     Args:
         data: bytes.
-        place: where the number begins.
+        place: position of the number.
     """
     part, number = data[np.uint64(place) :], 0
     for k in (7, 6, 5, 4, 3, 2, 1, 0):
@@ -126,9 +127,9 @@ def _scan(
     times: NDArray[np.uint64],
     sizes: NDArray[np.int64],
 ) -> int:
-    """Fill where messages and declarations begin, and the first and last times of messages.
+    """Fill in the positions of messages and declarations, and the first and last times of messages.
 
-    `sizes` says how many messages and declarations there are, and the number after the last channel's.
+    `sizes` gets the number of messages, of declarations, and one more than the highest channel.
     """
     size, count, declared, channels, position = len(data), 0, 0, 0, 0
     while position + HEAD_BYTES <= size:
@@ -154,7 +155,7 @@ def _scan(
 
 
 def _channel(data: NDArray[np.uint8], position: int) -> int:
-    """Return the channel of the message at a place."""
+    """Return the channel of the message at a position."""
     return word(data, position + 9) & 0xFFFF
 
 
@@ -165,7 +166,7 @@ def _sort(
     counts: NDArray[np.int64],
     places: NDArray[np.int64],
 ) -> None:
-    """Lay out what was found channel by channel, and count each channel's; `places` is to work in."""
+    """Sort the messages found by channel, and count those of each; `places` is working memory."""
     for row in range(len(messages)):
         counts[_channel(data, found[row])] += 1
     for channel in range(len(counts)):
@@ -183,7 +184,7 @@ def _agree(
     expected: NDArray[np.int64],
     mask: NDArray[np.int64],
 ) -> bool:
-    """Tell whether all records have the expected words where the mask is set."""
+    """Test whether all records have the expected words where the mask is set."""
     for row in range(len(offsets)):
         wrong = 0
         for k in range(len(places)):

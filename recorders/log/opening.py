@@ -1,4 +1,4 @@
-"""Opens a log: says what it holds, by topic, and what is missing from it."""
+"""Opened logs: their topics, and what is missing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from fuselog.recorders.log.schemas import Schema
 
 @dataclass(frozen=True)
 class Topic:
-    """Describes one topic, which several channels may share; `metadata` is what they agree on.
+    """One topic, which several channels may share.
 
     Attributes:
-        name, schema_name: of the topic and of its messages.
-        encoding: of the messages.
-        channel_ids: of its channels.
-        metadata: what the channels agree on.
-        messages: how many there are.
+        name, schema_name: names of the topic and of its messages' schema.
+        encoding: encoding of the messages.
+        channel_ids: numbers of its channels.
+        metadata: metadata that all channels share.
+        messages: number of messages.
     """
 
     name: str
@@ -41,25 +41,25 @@ def topics_of(topics: Mapping[str, Topic], schema: Schema) -> list[str]:
 
 @dataclass(frozen=True)
 class Log:
-    """Represents an opened log: what it holds, not the messages themselves."""
+    """An opened log: a description of its contents, without the messages."""
 
     path: Path
     container: Container
 
     @cached_property
     def run(self) -> RunMetadata | None:
-        """Return what the run was, where the log says so."""
+        """Return the metadata of the run, or None if the log has none."""
         record = self.container.metadata.get(RECORD_NAME)
         return None if record is None else RunMetadata.from_record(record, self.path)
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """Return the topics by name, sorted; companions are none of them."""
+        """Return the topics by name, sorted, without companions."""
         return {name: topic for name, topic in self._all.items() if COMPANION_OF not in topic.metadata}
 
     @cached_property
     def companions(self) -> dict[str, Topic]:
-        """Return what is in the log for viewers alone, by name, sorted."""
+        """Return the topics that are only for viewers, by name, sorted."""
         return {name: topic for name, topic in self._all.items() if COMPANION_OF in topic.metadata}
 
     @cached_property
@@ -86,7 +86,7 @@ class Log:
         )
 
     def require(self, topic: str) -> Topic:
-        """Return the topic of this name; raises BadInput that lists what there is."""
+        """Return the topic of this name; raise BadInput with the available names if there is none."""
         if topic not in self.topics:
             raise BadInput(
                 f"{self.path}: no topic {topic}; it has {', '.join(self.topics) or 'no topics'}"
@@ -95,13 +95,13 @@ class Log:
 
     @property
     def loss_statement(self) -> str | None:
-        """Say what is missing from a recovered log, in one sentence; None where nothing is."""
+        """Return a sentence on what is missing from a recovered log; None if it is complete."""
         parts = [self._lost_messages(), _listed(self.container.damages, "damages")]
         stated = ": ".join(filter(None, parts))
         return f"{self.path}: {stated}" if stated else None
 
     def _lost_messages(self) -> str:
-        """Say how many messages are left out of those that a summary states; empty where none are."""
+        """Describe the messages that are missing according to a summary; empty if there are none."""
         stated = {
             topic.name: sum(self.container.stated_counts[key] for key in topic.channel_ids)
             for topic in self._all.values()
@@ -116,9 +116,9 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
     Args:
         path: an MCAP file.
-        recover: read what is whole of a file that was cut off or damaged; its index is not believed.
+        recover: read the intact part of a truncated or damaged file, without using its index.
 
-    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+    Raises BadInput if the file is missing or not MCAP, or is incomplete and `recover` is False.
 
     >>> from fuselog.recorders.log import write_log
     >>> from fuselog.recorders.recording import record_run
@@ -141,6 +141,6 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
 
 def _listed(parts: Sequence[str], what: str) -> str:
-    """Write the first few in one sentence."""
+    """Join the first few entries in one sentence."""
     more = f", and {len(parts) - 3} more {what}" if len(parts) > 3 else ""
     return f"{', '.join(parts[:3])}{more}"

@@ -1,7 +1,7 @@
-"""Reads the planes and frames that positions are in, as channels state them.
+"""The planes and frames of positions, as channels state them.
 
-A plane is east, north, up of an origin. A channel that states no origin is in the plane of its log,
-unless it names a frame of its own.
+A plane is the local tangent plane (east, north, up) at an origin. A channel without an origin is in the
+plane of its log, unless it names its own frame.
 """
 
 import math
@@ -33,7 +33,7 @@ _PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_
 
 
 class Origin(NamedTuple):
-    """States where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
+    """The origin of a local tangent plane: latitude, longitude (deg), height above the ellipsoid (m)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -41,7 +41,7 @@ class Origin(NamedTuple):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Return what the channels of streams in the plane state."""
+        """Return the metadata for channels of streams in the plane."""
         return dict(zip(ORIGIN, map(repr, self), strict=True))
 
     def __str__(self) -> str:
@@ -49,7 +49,7 @@ class Origin(NamedTuple):
 
 
 def origin_of(parts: Sequence[str]) -> Origin | None:
-    """Return the origin that two or three numbers state; None where they state none."""
+    """Parse an origin from two or three numbers; None if they are invalid."""
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
@@ -63,7 +63,7 @@ def origin_of(parts: Sequence[str]) -> Origin | None:
 def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
     """Return the origin that a topic's channel states, by default at height zero; None without one.
 
-    Raises BadInput where what it states is no place on the earth.
+    Raises BadInput if it is not a position on the earth.
     """
     if LATITUDE not in metadata or LONGITUDE not in metadata:
         return None
@@ -77,24 +77,24 @@ def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
 
 
 def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
-    """Tell whether messages have positions or velocities in a plane, or on the earth."""
+    """Test whether messages have positions or velocities in a plane, or on the earth."""
     if schema_name in _STATES:
         return {"x_m", "y_m"} <= set(metadata.get("components", "").split(","))
     return schema_name in _PLANAR
 
 
 def frame_of(metadata: Mapping[str, str]) -> str:
-    """Return the frame of its own that a channel names; empty for the plane of the log."""
+    """Return the frame that a channel names; empty for the plane of the log."""
     return "" if LATITUDE in metadata else metadata.get(FRAME, "")
 
 
 def in_frame(frame: str) -> dict[str, str]:
-    """Return what the channel of positions in a frame states; nothing for the plane of the log."""
+    """Return the metadata for the channel of positions in a frame; empty for the plane of the log."""
     return {FRAME: frame} if frame else {}
 
 
 def body_of(topic: str, metadata: Mapping[str, str]) -> str:
-    """Name the frame whose pose the states of a topic are: as stated, else the topic's namespace.
+    """Name the frame whose pose the states of a topic are: as stated, or the topic's namespace.
 
     >>> body_of("/radar/truth", {})
     'radar'
@@ -104,29 +104,29 @@ def body_of(topic: str, metadata: Mapping[str, str]) -> str:
 
 
 def frame_in_words(frame: str) -> str:
-    """Name a frame as `frame_of` gives it."""
+    """Describe a frame as returned by `frame_of`."""
     return f"frame {frame}" if frame else "the plane of the log"
 
 
 def plane_in_words(metadata: Mapping[str, str]) -> str:
-    """Return the frame that a channel names, else that it is one of its own."""
+    """Describe the frame that a channel names, or an unnamed one."""
     return f"frame {metadata[FRAME]}" if metadata.get(FRAME) else "a frame of its own"
 
 
 def common_origin(channels: Mapping[str, Mapping[str, str]]) -> Origin | None:
-    """Return the origin of a log's plane, that all topics state which state one."""
+    """Return the origin of a log's plane, if all topics that state an origin agree."""
     stated = {origin for topic, each in channels.items() if (origin := stated_in(topic, each))}
     return stated.pop() if len(stated) == 1 else None
 
 
 def in_plane_of_log(streams: Sequence[Stream]) -> list[Stream]:
-    """Let all streams of one log that have no frame state its plane, where some of them do."""
+    """Add the plane of the log to the metadata of streams without a frame, if some streams state it."""
     origin = common_origin({stream.topic: stream.metadata for stream in streams})
     return [in_plane(stream, origin) for stream in streams]
 
 
 def in_plane(stream: Stream, origin: Origin | None) -> Stream:
-    """Let a stream of the log's plane state it, if it states neither plane nor frame."""
+    """Add the log's plane to the metadata of a stream that states neither plane nor frame."""
     own = stream.metadata
     if origin is None or LATITUDE in own or own.get(FRAME):
         return stream

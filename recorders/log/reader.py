@@ -1,4 +1,4 @@
-"""Reads logs as columns, block by block in time order, with memory bounded by the blocks in hand."""
+"""Reader of logs as columns, block by block in time order; memory holds a few blocks."""
 
 import sys
 from collections import Counter
@@ -19,19 +19,19 @@ from fuselog.recorders.log.decoding import Decoder
 from fuselog.recorders.log.opening import Log
 from fuselog.recorders.log.streams import Clock, Stream, check_stream, concatenate
 
-# Beyond every stamp that MCAP can state.
+# Contains every stamp that MCAP can hold.
 _ALWAYS = Span(-1, 1 << 64)
 
 
 class _Window(NamedTuple):
-    """Holds the stamps that are asked for, and of which clock."""
+    """The requested span of stamps, and its clock."""
 
     clock: Clock
     span: Span
 
 
 class _Ranked(NamedTuple):
-    """Holds a region, and its rank in the file."""
+    """A region, and its rank in the file."""
 
     rank: int
     region: Region
@@ -45,7 +45,7 @@ def read_streams(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> dict[str, Stream]:
-    """Read topics whole, each in time order; see `read_blocks`. A topic without messages is empty.
+    """Read whole topics, each in time order; see `read_blocks`. A topic without messages is empty.
 
     >>> from fuselog.recorders.log import make_stream, open_log, schemas, write_log
     >>> seen = make_stream("/range", schemas.RANGE, [20, 0, 10], target_id=[1, 1, 1], range_m=[5, 3, 4])
@@ -63,8 +63,8 @@ def read_streams(
 def read_span(log: Log, clock: Clock) -> tuple[int, int]:
     """Find the first and last stamp of a log in ns by one of its clocks; zeros without messages.
 
-    A file that notes only the log times of its chunks, as those of other writers do, is opened chunk by
-    chunk for its publish times. Raises BadInput where one is damaged.
+    Files of other writers state only the log times of chunks, so their chunks are opened to find publish
+    times. Raises BadInput if a chunk is damaged.
     """
     regions = log.container.regions
     with _reading(log) as file:
@@ -76,7 +76,7 @@ def read_span(log: Log, clock: Clock) -> tuple[int, int]:
 
 
 def read_empty(log: Log, topic: str) -> Stream:
-    """Return a topic without its messages: its schema and metadata."""
+    """Return a topic without messages, with its schema and metadata."""
     return Decoder(log, topic).empty()
 
 
@@ -91,19 +91,20 @@ def read_blocks(
 ) -> Iterator[dict[str, Stream]]:
     """Read topics in blocks that follow one another in time.
 
-    Every block holds all messages of its span, sorted by the clock `order`, equal stamps in file order;
-    no stamp is split between blocks. Topics without messages in a block are absent from it.
+    Every block holds all messages of its span, sorted by the clock `order`, with equal stamps in file
+    order; messages with equal stamps are in one block. Topics without messages in a block are absent
+    from it.
 
     Args:
-        log: from `open_log`.
+        log: log from `open_log`.
         topics: names of topics.
-        order: the clock to sort by.
+        order: clock to sort by.
         start_ns: leave out messages before this stamp of that clock.
         end_ns: leave out messages at or after this stamp of that clock.
-        block_messages: about how many messages a block has.
+        block_messages: approximate number of messages in a block.
 
-    Raises BadInput for an unknown topic, a schema that is not numeric columns, NaN that the schema does
-    not allow, or a damaged file.
+    Raises BadInput for an unknown topic, a schema without numeric columns, NaN that the schema does not
+    allow, or a damaged file.
     """
     decoders = [Decoder(log, topic) for topic in dict.fromkeys(topics)]
     window = _Window(
@@ -148,7 +149,7 @@ def _reading(log: Log) -> Iterator[BinaryIO]:
 
 
 def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) -> list[_Ranked]:
-    """Choose the regions that can hold what is asked for, in the order in which their spans begin."""
+    """Choose the regions that may hold requested messages, in the order of their beginnings in time."""
     wanted = {identifier for topic in topics for identifier in log.topics[topic].channel_ids}
     chosen = []
     for rank, region in enumerate(log.container.regions):
@@ -171,7 +172,7 @@ def _timed(log: Log, file: BinaryIO, region: Region, clock: Clock) -> Region:
 
 
 def _contents(log: Log, region: Region, raw: bytes) -> Contents:
-    """Open the region; raises BadInput where it is damaged, or not what the index says of it."""
+    """Open the region; raise BadInput if it is damaged, or contradicts the index."""
     try:
         contents = open_region(raw, region.offset)
     except Damaged as damage:
@@ -194,7 +195,7 @@ def _contents(log: Log, region: Region, raw: bytes) -> Contents:
 def _decoded(
     log: Log, decoders: Sequence[Decoder], window: _Window, read: tuple[_Ranked, bytes]
 ) -> list[Stream]:
-    """Decode the messages of one region that are asked for."""
+    """Decode the requested messages of one region."""
     (rank, region), raw = read
     contents = _contents(log, region, raw)
     found = [stream for decoder in decoders for stream in decoder.decode(contents, rank)]
@@ -211,7 +212,7 @@ def _within(stream: Stream, window: _Window) -> Stream:
 def _released(
     log: Log, pending: Mapping[str, list[Stream]], clock: Clock, limit_ns: int | None
 ) -> tuple[dict[str, Stream], dict[str, list[Stream]]]:
-    """Split what is pending into sorted streams before `limit_ns`, and the rest."""
+    """Split pending streams into sorted ones before `limit_ns`, and the rest."""
     block: dict[str, Stream] = {}
     rest: dict[str, list[Stream]] = {}
     for topic, parts in pending.items():
@@ -226,7 +227,7 @@ def _released(
 
 
 def _in_order(stream: Stream, clock: Clock) -> Stream:
-    """Put messages in the order of their stamps, equal stamps in file order."""
+    """Sort messages by their stamps, with equal stamps in file order."""
     times, position = stream.times(clock), stream.position
     later = times[1:] > times[:-1]
     tied = (times[1:] == times[:-1]) & (position[1:] > position[:-1])
@@ -234,7 +235,7 @@ def _in_order(stream: Stream, clock: Clock) -> Stream:
 
 
 def _check_counts(log: Log, topics: Sequence[str], counts: Mapping[str, int]) -> None:
-    """Raise BadInput where a whole read found other numbers of messages than the file states."""
+    """Raise BadInput if a complete read found another number of messages than the file states."""
     for topic in topics:
         stated = log.topics[topic].messages
         if counts[topic] != stated:

@@ -1,4 +1,4 @@
-"""Describes a run: enough, in the log itself, to record it again."""
+"""Metadata of a run in its log, sufficient to record the run again."""
 
 import json
 from dataclasses import dataclass, field
@@ -10,21 +10,21 @@ from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parsing import parse_json
 
 RECORD_NAME = "fuselog.run"
-# Raised when a log is written in a way that this reader would misread; a log without it is of the first.
+# Raised if a change would be misread by this reader; a log without a format has the first one.
 FORMAT = 1
 
 
 @dataclass(frozen=True)
 class RunMetadata:
-    """Says how one run was recorded.
+    """How one run was recorded.
 
     Attributes:
-        scenario: the name of the scenario or importer.
-        parameters: of the scenario or importer.
-        seed: of the random numbers; None for imported data.
-        run: its number among those of the seed.
-        epoch_ns: the log's time zero: simulated time plus the epoch gives the stamps.
-        notes: facts that the recorder met (unknown barcodes, say), one short text each.
+        scenario: name of the scenario or importer.
+        parameters: parameters of the scenario or importer.
+        seed: seed of the random numbers; None for imported data.
+        run: number of the run among those with this seed.
+        epoch_ns: time zero of the log: simulated time plus the epoch gives the stamps.
+        notes: facts that the recorder reports (such as unknown barcodes), each with a short text.
     """
 
     scenario: str
@@ -48,9 +48,9 @@ class RunMetadata:
 
     @classmethod
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
-        """Read the MCAP metadata `record` of the file `path` back.
+        """Parse the MCAP metadata `record` of the file `path`.
 
-        Raises BadInput where it is damaged or of another format.
+        Raises BadInput if it is damaged or has another format.
         """
         try:
             written_in = _stated({"format": "1", **record}, "format", int)
@@ -81,7 +81,7 @@ _WANTED = {dict: "an object", int: "a whole number", NoneType: "null"}
 
 
 def _stated(record: dict[str, str], name: str, *kinds: type) -> Any:
-    """Read the JSON under `name`, of one of these types; no number of a run is negative."""
+    """Parse the JSON under `name`, which must have one of these types; numbers must not be negative."""
     value = parse_json(record[name])
     if type(value) not in kinds:
         wanted = " or ".join(_WANTED[kind] for kind in kinds)

@@ -1,9 +1,10 @@
-"""Declares every message of a log, once.
+"""Declarations of all messages of a log.
 
-A schema is a flat protobuf message whose fields are fixed-width and `optional`; a vector is packed
-doubles of one length per stream. So all messages of a stream share one byte layout (see `layout`) and
-any protobuf reader still reads the file. Field numbers follow the order of declaration: new fields go
-to the end. The first field of every message is the sensor's own clock reading.
+A schema is a flat protobuf message whose fields have a fixed width and are `optional`; a vector is a
+packed list of doubles with one length per stream. So all messages of a stream share one byte layout (see
+`layout`), and any protobuf reader can read the file. Field numbers follow the order of declaration, so
+new fields are added at the end. The first field of every message is the reading of the sensor's own
+clock.
 """
 
 from collections.abc import Iterator
@@ -33,14 +34,13 @@ NUMPY_TYPES: dict[Kind, np.dtype] = {
 
 @dataclass(frozen=True)
 class Field:
-    """Describes one field of a message.
+    """One field of a message.
 
     Attributes:
-        name: with its unit.
-        kind: the type of its values.
-        may_be_nan: whether NaN stands for a value that is missing.
-        may_be_absent: whether logs written before there was such a field lack it: who reads them asks
-            whether the column is there.
+        name: name, with its unit.
+        kind: type of the values.
+        may_be_nan: whether NaN stands for a missing value.
+        may_be_absent: whether older logs lack the field, so that readers must test for the column.
         may_be_partial: whether NaN stands for a component of a measurement that was not measured.
     """
 
@@ -52,19 +52,19 @@ class Field:
 
     @property
     def dtype(self) -> np.dtype:
-        """Return the type of one element of this field's column."""
+        """Return the NumPy type of this field's elements."""
         return NUMPY_TYPES[self.kind]
 
 
 @dataclass(frozen=True)
 class Schema:
-    """Describes a message type: its protobuf name without the package, what it says, and its fields.
+    """A message type.
 
     Attributes:
-        name: the name of its protobuf message, without the package.
-        purpose: what a message says.
-        fields: in their order.
-        package: of its protobuf message.
+        name: name of the protobuf message, without the package.
+        purpose: what a message contains.
+        fields: fields in their order.
+        package: package of the protobuf message.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Schema:
 
     @cached_property
     def descriptor_set(self) -> bytes:
-        """Return the serialised FileDescriptorSet that describes this message inside a file."""
+        """Return the serialised FileDescriptorSet that describes this message in a file."""
         file = descriptor_pb2.FileDescriptorProto(
             name=f"{self.package}/{self.name}.proto", package=self.package, syntax="proto3"
         )
@@ -100,7 +100,7 @@ class Schema:
 
     @property
     def message_class(self) -> type[message.Message]:
-        """Return the protobuf class of this message, as any other program would build it from a file."""
+        """Return the protobuf class of this message, as any program would build it from a file."""
         return message_class(self.descriptor_set, self.full_name)
 
 
@@ -108,7 +108,7 @@ class Schema:
 def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message]:
     """Build the class `full_name` from a serialised FileDescriptorSet.
 
-    Raises KeyError, TypeError or a protobuf DecodeError where the set is damaged or lacks the name.
+    Raises KeyError, TypeError or a protobuf DecodeError if the set is damaged or lacks the name.
     """
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(descriptor_set).file:
@@ -117,9 +117,9 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
 
 
 def schema_of(message_type: type[message.Message]) -> Schema:
-    """Return the numeric fields of a message of any origin; fields of other kinds are left out.
+    """Return a schema with the numeric fields of any message; other fields are left out.
 
-    Where the name is one of ours, what may be NaN is what we declare; else everything may.
+    If the name is one of ours, our declaration says what may be NaN; otherwise every field may.
     """
     descriptor = message_type.DESCRIPTOR
     ours = {field.name: field for field in SCHEMAS.get(descriptor.full_name, ())}
@@ -166,7 +166,7 @@ def _vector(name: str, *, may_be_nan: bool = False, may_be_partial: bool = False
     return Field(name, "vector", may_be_nan, may_be_partial=may_be_partial)
 
 
-# What sensors say.
+# Messages of sensors.
 
 BEARING = _declare(
     "Bearing",
@@ -349,7 +349,7 @@ COURSE_FIX = _declare(
     _real("speed_mps", may_be_nan=True),
 )
 
-# What the world is.
+# Messages about the world.
 
 LANDMARK = _declare(
     "Landmark", "A fixed point of the map.", _identifier("landmark_id"), _vector("position_m")
@@ -384,7 +384,7 @@ IDENTITY = _declare(
     _identifier("thing_id"),
 )
 
-# What estimators say; covariances are full, row-major, in the tangent space.
+# Messages of estimators; covariances are full, row-major, in the tangent space.
 
 GAUSSIAN_ESTIMATE = _declare(
     "GaussianEstimate", "Mean and covariance of a state.", _vector("mean"), _vector("covariance")

@@ -1,4 +1,4 @@
-"""Holds one topic of a log in memory, as columns."""
+"""One topic of a log in memory, as columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,16 +20,16 @@ Clock = Literal["publish_time", "log_time"]
 
 @dataclass(frozen=True, repr=False)
 class Stream:
-    """Holds the n messages of one topic: first axis = message.
+    """The n messages of one topic; the first axis of all arrays is the message.
 
     Attributes:
-        topic: its name.
-        schema: of its messages.
+        topic: name of the topic.
+        schema: schema of the messages.
         publish_time_ns, log_time_ns: (n,), when the quantity was measured and when it reached the
             recorder, never negative.
         columns: one array per field of the schema, (n,), or (n, width) for a vector.
-        position: (n,), the place in the file, for a stable order among equal stamps.
-        metadata: what the channel states, as text.
+        position: (n,), position in the file, for a stable order of equal stamps.
+        metadata: metadata of the channel, as text.
 
     >>> from fuselog.recorders.log import make_stream, schemas
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 2, 1], range_m=[5, 3, 4])
@@ -69,7 +69,7 @@ class Stream:
         return self.publish_time_ns if clock == "publish_time" else self.log_time_ns
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
-        """Return the messages of `rows`, in that order."""
+        """Select the messages of `rows`, in that order."""
         stamps_ns = self.publish_time_ns[rows]
         if isinstance(rows, np.ndarray):  # np.take copies rows ten times as fast as indexing does
             places = np.flatnonzero(rows) if rows.dtype == bool else rows.astype(np.intp, copy=False)
@@ -85,23 +85,23 @@ class Stream:
         )
 
     def pandas(self) -> "pd.DataFrame":
-        """Return a row for every message: both stamps in ns, then the fields.
+        """Convert to a data frame with a row for every message: both stamps in ns, then the fields.
 
-        A vector has a column for every entry, such as `mean_x_m`; where its entries have no names they
-        have numbers, such as `covariance_0`.
+        A vector has a column for every entry, such as `mean_x_m`; entries without names have numbers,
+        such as `covariance_0`.
         """
         import pandas as pd
 
         return pd.DataFrame(self._flat())
 
     def arrow(self) -> "pa.Table":
-        """Return the same table for Arrow."""
+        """Convert to an Arrow table with the same columns as `pandas`."""
         import pyarrow as pa
 
         return pa.table(self._flat())
 
     def polars(self) -> "pl.DataFrame":
-        """Return the same table for polars; raises BadInput where that is not installed."""
+        """Convert to a polars data frame like `pandas`; raise BadInput if polars is not installed."""
         try:
             import polars as pl
         except ImportError:
@@ -137,20 +137,20 @@ def make_stream(
     metadata: Mapping[str, str] | None = None,
     **columns: ArrayLike,
 ) -> Stream:
-    """Build a stream; clocks that are not given equal `publish_time_ns`.
+    """Make a stream; clocks that are not given equal `publish_time_ns`.
 
-    A vector that may be absent need not be given. Raises BadInput where another column is missing, or
-    one is unknown, has another length, has the wrong number of axes, holds NaN that its field does not
-    allow or a number that its type cannot keep (a fraction of a nanosecond, say), or a time is negative.
+    A vector that may be absent can be omitted. Raises BadInput if another column is missing, unknown, or
+    has the wrong length or number of axes; if it holds NaN that its field does not allow, or a number
+    that its type cannot represent (such as a fraction of a nanosecond); or if a time is negative.
 
     Args:
-        topic: its name.
-        schema: of its messages.
+        topic: name of the topic.
+        schema: schema of the messages.
         publish_time_ns: (n,), when the quantity was measured.
         log_time_ns: (n,), when it reached the recorder.
-        sensor_time_ns: (n,), the stamp by the clock of the sensor.
-        metadata: what the channel states, as text.
-        columns: by field, (n,), or (n, width) for a vector.
+        sensor_time_ns: (n,), stamp of the sensor's own clock.
+        metadata: metadata of the channel, as text.
+        columns: columns by field, (n,), or (n, width) for a vector.
 
     Returns:
         The stream, with its messages in the order given.
@@ -175,22 +175,22 @@ def stream_of(
     metadata: Mapping[str, str] | None = None,
     allow_nan: bool = False,
 ) -> Stream:
-    """Make a stream as `make_stream` does, of all columns by name.
+    """Make a stream like `make_stream`, from a mapping of columns.
 
     Args:
-        topic: its name.
-        schema: of its messages.
+        topic: name of the topic.
+        schema: schema of the messages.
         publish_time_ns: (n,), when the quantity was measured.
-        given: by field, (n,), or (n, width) for a vector; one that may be absent need not be given.
+        given: columns by field, (n,), or (n, width) for a vector; one that may be absent can be omitted.
         log_time_ns: (n,), when it reached the recorder; by default when it was measured.
-        metadata: what the channel states, as text.
+        metadata: metadata of the channel, as text.
         allow_nan: whether any column may hold NaN.
 
-    Raises BadInput as `make_stream` does.
+    Raises BadInput like `make_stream`.
     """
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
-    # an empty vector is as good as an absent one
+    # an absent vector is stored as an empty one
     absent = {
         entry.name: np.empty((len(published), 0))
         for entry in schema
@@ -210,7 +210,7 @@ def stream_of(
 
 
 def _misfit(schema: Schema, given: Mapping[str, ArrayLike]) -> str:
-    """Say how the fields that are given differ from those of the schema."""
+    """Describe how the given fields differ from those of the schema."""
     name, clock = schema.full_name, "sensor_time_ns"
     own = [entry.name for entry in schema if entry.name != clock]
     if clock not in {entry.name for entry in schema}:
@@ -234,20 +234,20 @@ def computed_stream(
     columns: Mapping[str, NDArray],
     metadata: Mapping[str, str],
 ) -> Stream:
-    """Make a stream of columns that a kernel filled as the schema says, which nobody needs to check.
+    """Make a stream from columns that a kernel filled according to the schema, without checks.
 
     Args:
-        topic: its name.
-        schema: of its messages.
-        time_ns: (n,), both of its clocks.
-        columns: by field, (n,) or (n, width).
-        metadata: what the channel states, as text.
+        topic: name of the topic.
+        schema: schema of the messages.
+        time_ns: (n,), stamps of both clocks.
+        columns: columns by field, (n,) or (n, width).
+        metadata: metadata of the channel, as text.
     """
     return Stream(topic, schema, time_ns, time_ns, columns, np.arange(len(time_ns)), metadata)
 
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:
-    """Make an array of this type, which must be able to keep every one of the values."""
+    """Convert values to an array of this type, which must represent all of them."""
     dtype, axes = NUMPY_TYPES[kind], 1 + (kind == "vector")
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes:
         return values
@@ -274,9 +274,9 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
 
 
 def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) -> None:
-    """Raise BadInput where lengths differ, a time is out of range, or NaN stands where none may.
+    """Raise BadInput if lengths differ, a time is out of range, or NaN is not allowed.
 
-    So it does where the topic's name cannot be printed: it ends up in figures, file names and terminals.
+    The name of the topic must be printable, since it is used in figures, file names and terminals.
     """
     if not stream.topic.isprintable():
         raise BadInput(
@@ -308,7 +308,7 @@ def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) ->
             or not column.size
         ):
             continue
-        if np.isnan(column.min()):  # the least of numbers with NaN among them is NaN: one quick pass
+        if np.isnan(column.min()):  # the minimum is NaN if any number is: a single fast pass
             bad = np.isnan(column).reshape(len(column), -1).any(axis=1)
             raise BadInput(
                 f"{label}: field {entry.name} is NaN in message {int(np.argmax(bad))} "
@@ -318,7 +318,7 @@ def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) ->
 
 
 def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
-    """Join parts of one topic, in the order given; raises BadInput where a vector changes its width."""
+    """Join parts of one topic, in the order given; raise BadInput if a vector changes its width."""
     first = parts[0]
     if len(parts) == 1:
         return first

@@ -1,4 +1,4 @@
-"""Writes streams as a log: whole chunks at a time, and never half a file."""
+"""Writer of streams as a log, in whole chunks; an interrupted log leaves no partial file."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ Companions = Callable[[Stream], Iterable[Companion]]
 
 @dataclass
 class _Topic:
-    """Holds what a topic keeps from its first block to its last, and how many messages it has so far."""
+    """What is kept of a topic from its first block to its last, with its number of messages so far."""
 
     channel_id: int
     schema: Schema
@@ -38,23 +38,23 @@ class _Topic:
 
 @dataclass
 class _Channel:
-    """Holds the channel of a companion, and how many messages it has so far."""
+    """The channel of a companion, and its number of messages so far."""
 
     channel_id: int
     messages: int = 0
 
 
 class LogWriter:
-    """Writes one log; use it as a context manager, and the log appears whole or not at all.
+    """A writer of one log; use it as a context manager, and the log appears completely or not at all.
 
     Args:
-        path: the log to write; an existing file is replaced at the end, in one step.
-        run: what the run was; where that is known at the end alone, see `describe`.
+        path: log to write; an existing file is replaced at the end, in one step.
+        run: metadata of the run; if it is known only at the end, use `describe`.
         compression: "zstd", "lz4" or "none".
-        chunk_bytes: about how large an uncompressed chunk gets.
-        companions: makes the messages for viewers that are written beside each stream.
+        chunk_bytes: approximate size of an uncompressed chunk.
+        companions: function that makes the messages for viewers that are written next to each stream.
 
-    Raises BadInput where the file cannot be written.
+    Raises BadInput if the file cannot be written.
     """
 
     def __init__(
@@ -84,17 +84,17 @@ class LogWriter:
         self._container.__exit__(*raised)
 
     def describe(self, run: RunMetadata) -> None:
-        """Write what the run was, once."""
+        """Write the metadata of the run, once."""
         self._container.add_metadata(RECORD_NAME, run.to_record())
 
     def write(self, streams: Iterable[Stream]) -> None:
         """Write a block of streams, merged in log-time order; ties keep the order given.
 
-        The block is in the file when the call returns, so that memory holds one block and a cut-off file
-        holds the blocks before it.
+        The block is in the file when the call returns, so memory holds one block, and a truncated file
+        holds the earlier blocks.
 
-        Raises BadInput where a stream breaks its schema (see `check_stream`), a topic comes twice, or
-        changes its schema, its vectors' widths or its metadata from one block to the next.
+        Raises BadInput if a stream violates its schema (see `check_stream`), a topic occurs twice, or a
+        topic changes its schema, the widths of its vectors or its metadata between blocks.
         """
         block = list(streams)
         names = [stream.topic for stream in block]
@@ -118,7 +118,7 @@ class LogWriter:
             self.write_companions(each for stream in block for each in self._companions(stream))
 
     def write_companions(self, companions: Iterable[Companion]) -> int:
-        """Write messages that are no streams, in log-time order; says how many they were."""
+        """Write messages for viewers, in log-time order; return their number."""
         numbered = []
         for companion in companions:
             channel = self._channels.get(companion.topic)
@@ -136,7 +136,7 @@ class LogWriter:
         return len(numbered)
 
     def _declare(self, stream: Stream) -> None:
-        """Register the stream's topic, or compare it with what it was."""
+        """Register the stream's topic, or compare it with what is registered."""
         widths = {
             entry.name: stream.columns[entry.name].shape[1]
             for entry in stream.schema
@@ -177,7 +177,7 @@ def write_log(
     compression: str = "zstd",
     companions: Companions | None = None,
 ) -> None:
-    """Write one log from streams that are all at hand; see `LogWriter`.
+    """Write one log from streams in memory; see `LogWriter`.
 
     >>> from fuselog.recorders.log import make_stream, open_log, read_streams, schemas
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10], target_id=[1, 2], range_m=[5, 3])

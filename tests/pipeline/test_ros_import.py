@@ -156,7 +156,7 @@ def test_the_poses_of_another_filter_are_judged(tmp_path: Path) -> None:
     settings = {"estimates": "/odometry/filtered", "truth": "/mocap"}
     streams, notes = imported(path, **settings)
     assert set(streams) == {"/truth", "/estimates/odometry_filtered/pose"}
-    why = "since a filter must not read what is from another filter"
+    why = "since filters must not use data from another filter"
     assert notes[f"/odometry/filtered: odometry_twist left out, {why}"] == "300"
     import_log("ros", path, settings, tmp_path / "log.mcap")
     judged = judge_estimates([tmp_path / "log.mcap"], comparison={}).judge.metrics

@@ -176,9 +176,7 @@ def test_the_truth_of_a_bag_is_no_wheel(tmp_path: Path, truth: str | None) -> No
     assert robots == (["/wheel/odometry"] if truth else ["/ground_truth/odometry", "/wheel/odometry"])
     if truth:
         assert {each for each in source.topics if "ground" in each} == {"/ground_truth/truth"}
-        note = (
-            "/ground_truth/odom: odometry left out, since a filter must not read what is from the truth"
-        )
+        note = "/ground_truth/odom: odometry left out, since filters must not use data from the truth"
         assert source.run.notes[note] == "50"
         done = fl.replay(source, "ekf")
         assert len(done.estimates[0]["/estimates/ekf/wheel/pose"])

@@ -425,8 +425,8 @@ def test_mountings_in_transforms_are_told_with_their_settings(tmp_path: Path, is
     _, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
     told = {key: note for key, note in notes.items() if key.endswith(", mounting")}
     assert set(told) == {"/fix, mounting", "/inertial, mounting", "/arm/fix, mounting"}
-    assert told["/arm/fix, mounting"].startswith("its frame arm moves in base_link, and no lever arm")
-    assert told["/arm/fix, mounting"].endswith('transforms=["base_link:arm"]\' imports how it moves')
+    assert told["/arm/fix, mounting"].startswith("its frame arm moves in base_link, but lever arms")
+    assert told["/arm/fix, mounting"].endswith('transforms=["base_link:arm"]\' imports the motion')
     assert told["/fix, mounting"] == (
         "its frame antenna is 0.5, 0.4, 1.2 m forward, left and up of base_link; used by "
         "--set lever_x_m=0.5 --set lever_y_m=0.4 for the model robot, or "
@@ -504,8 +504,8 @@ def test_rows_of_a_database_that_are_no_messages_are_counted(tmp_path: Path) -> 
     with open_bag(path) as bag:
         assert sum(len(each.log_time_ns) for each in bag.batches(lambda _: True)) == 3
         assert bag.losses == [
-            f"{path}: 1 messages have no topic, and are lost",
-            f"{path}: 2 rows of messages have no whole stamp or no bytes, and are lost",
+            f"{path}: 1 messages have no topic and are lost",
+            f"{path}: 2 rows of messages have no integer stamp or no bytes, and are lost",
         ]
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE topics SET name = CAST(x'2fff' AS TEXT)")
@@ -530,7 +530,7 @@ def test_records_of_a_bag_that_are_no_messages_are_counted(tmp_path: Path) -> No
 
     count, (loss,) = read(whole.replace(b"op=\x02", b"op=\x0c", 3))
     assert count == 7
-    assert loss.endswith("3 records are no messages of its topics, and lost")
+    assert loss.endswith("3 records are not messages of its topics, and are lost")
     count, (loss,) = read(whole[: whole.rindex(b"topic=/1") - 30])
     assert count == 10
     assert "it was cut off" in loss
@@ -617,7 +617,7 @@ def test_a_bag_that_was_cut_off(form: str, tmp_path: Path) -> None:
     assert 500 < len(numbers) < 2500
     assert numbers == list(range(len(numbers)))
     assert any(key.startswith("lost") for key in notes), notes
-    told = re.search(r"its last (\d+) bytes are not a whole message", " ".join(notes.values()))
+    told = re.search(r"its last (\d+) bytes are not a complete message", " ".join(notes.values()))
     assert (told is not None) == (form == "bag")
     assert told is None or 0 < int(told[1]) < 1000  # of a message
 
@@ -717,8 +717,8 @@ def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
         writer.finish()
     streams, notes = imported(path)
     assert streams["/value"]["value"].tolist() == [[0.75]]
-    assert notes["not taken, attachment camera.yaml"] == "2, which is no topic"
-    assert notes["not taken, metadata vendor"] == "1, which is no topic"
+    assert notes["not taken, attachment camera.yaml"] == "2, not a topic"
+    assert notes["not taken, metadata vendor"] == "1, not a topic"
     head = (11).to_bytes(4, "little") + b"camera.yaml"
     path.write_bytes(path.read_bytes().replace(head, b"\xff" * 3 + head[3:], 1))
     _, notes = imported(path)
@@ -761,7 +761,7 @@ def test_noise_densities_are_those_of_stated_covariances(tmp_path: Path) -> None
     assert notes["/a/odometry: forward_noise_density"] == (
         "0.02, of a standard deviation of 0.2 m/s every 0.01 s"
     )
-    absurd_note = "not stated, since a standard deviation of 1e+03 rad/s is no sensor's"
+    absurd_note = "not stated, since a standard deviation of 1e+03 rad/s is implausible for a sensor"
     assert notes["/a/inertial: gyro_noise_density"] == absurd_note
 
 
@@ -783,10 +783,8 @@ def test_frames_and_constants_that_change(tmp_path: Path) -> None:
     assert (len(streams["/position"]), len(streams["/position/odom"])) == (2, 1)
     for frame in ("odom", "gps"):  # longer and as long as the first one's
         assert streams[f"/position/{frame}"].metadata == {"frame_id": frame}
-    key = (
-        "/imu: inertial kept whose turn_rate_covariance_rad2ps2 is not the first one's, which is stated"
-    )
-    assert notes[key] == "2"
+    fact = "kept although turn_rate_covariance_rad2ps2 differs from the first, which is stated"
+    assert notes[f"/imu: inertial {fact}"] == "2"
 
 
 def test_messages_of_ones_own_by_a_mapping(tmp_path: Path) -> None:
@@ -855,7 +853,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     assert refusal(far) == "topic /gps: a latitude is 90.5 deg, beyond 90; check the column and its unit"
     scan = bag("scan", ("/scan", make("sensor_msgs/msg/LaserScan")), ("/pose", make(pose)))
     assert refusal(scan, topics="/scan") == (
-        "topic /scan cannot be taken: it is sensor_msgs/msg/LaserScan; describe it with "
+        "topic /scan cannot be imported: it is sensor_msgs/msg/LaserScan; describe it with "
         "--set mapping=FILE.toml"
     )
     assert refusal(scan, topics="/pos") == "has no topic /pos; did you mean '/pose'?"
@@ -878,12 +876,12 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     hole = bag("hole", ("/tf", make(tf, **sent)), ("/tf", make(tf, **other)))
     assert refusal(hole, transforms="map:base") == (
         "no transforms lead from 'map' to 'base': from 'map' they end at 'map', from 'base' at 'odom'; "
-        "record the transform between, or name another pair"
+        "record the missing transform, or name another pair"
     )
     assert "no transform has the frame 'bas'" in refusal(hole, transforms=["map:bas"])
     assert "expected a pair of frames" in refusal(hole, transforms="map")
     (tmp_path / "empty").mkdir()
-    assert refusal(tmp_path / "empty").startswith("has no bag in it; give a .bag, .db3 or .mcap file")
+    assert refusal(tmp_path / "empty").startswith("contains no bag; give a .bag, .db3 or .mcap file")
     for name in ("a.bag", "a.db3", "a.mcap", "a.txt"):
         (tmp_path / name).write_text("no bag at all" * 10)
         assert refusal(tmp_path / name)

@@ -73,7 +73,9 @@ def test_no_rate_stands_for_times_that_cannot_be_read(tmp_path: Path) -> None:
     table = tmp_path / "own.csv"
     rows = [f"{row};14:03 and {row} s;{row}.5;0.1" for row in range(20)]
     table.write_text("\n".join(["number;when;speed;yaw_rate", *rows, ""]))
-    with pytest.raises(BadInput, match="column when holds times such as '14:03 and 0 s' in an unknown format"):
+    with pytest.raises(
+        BadInput, match="column when holds times such as '14:03 and 0 s' in an unknown format"
+    ):
         guess([table])
 
 

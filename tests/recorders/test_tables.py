@@ -98,7 +98,7 @@ def test_units_stamps_and_columns(imported: Callable[..., Any]) -> None:
     assert_allclose(inertial["turn_rate_radps"], np.radians([[10, 20, 30], [-5, 0, 5]]))
     assert inertial.publish_time_ns.tolist() == [1756402240_961000000, 1756402240_967000700]
     assert notes["table.csv"] == "2 rows as /inertial"
-    assert notes["table.csv: columns not imported"] == "note"
+    assert notes["table.csv: columns not taken"] == "note"
     by_number = INERTIAL.replace('["ax", "ay", "az"]', '["2", "3", "4"]')
     assert_array_equal(
         imported(ROWS, by_number)[0]["/inertial"]["specific_force_mps2"], inertial["specific_force_mps2"]

@@ -278,12 +278,14 @@ def test_a_number_that_two_topics_have_gives_rows_of_the_first_until_then(tmp_pa
     off, notes = read(tmp_path / "twice.ulg", content + foreign)
     assert len(off) == 300
     assert not off.any()
-    assert notes["lost, number of sensor_combined that other has too"] == "1"
+    assert notes["lost, number of sensor_combined that other also has"] == "1"
 
 
 @pytest.mark.parametrize("content", [b"", b"no ULog at all", MAGIC], ids=["empty", "magic", "short"])
 def test_what_is_no_ulog_is_refused_in_a_sentence(tmp_path: Path, content: bytes):
-    with pytest.raises(BadInput, match=r"bad\.ulg: is (empty|no ULog); give a \.ulg file of PX4"):
+    with pytest.raises(
+        BadInput, match=r"bad\.ulg: is (empty|not a ULog file); give a \.ulg file of PX4"
+    ):
         read(tmp_path / "bad.ulg", content)
 
 
@@ -503,7 +505,9 @@ def test_instances_of_a_topic_have_streams_of_their_own(tmp_path: Path):
         }
     )
     told = blocks.notes["vehicle_gps_position, instance 2"]
-    assert told.startswith("another one, as /vehicle/fix_vehicle_gps_position_2, /vehicle/velocity_")
+    assert told.startswith(
+        "another instance, as /vehicle/fix_vehicle_gps_position_2, /vehicle/velocity_"
+    )
 
 
 def test_an_instance_that_is_subscribed_to_again_is_one_stream(tmp_path: Path):

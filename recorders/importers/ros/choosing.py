@@ -58,10 +58,10 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
         if isinstance(reader, Reader):
             found.readers[each] = reader
             continue
-        found.not_taken[each.topic] = f"{each.type_name or 'of no type'}{reader}"
+        found.not_taken[each.topic] = f"{each.type_name or 'without a type'}{reader}"
         if parameters.topics:
             raise BadInput(
-                f"{bag.path}: topic {each.topic} cannot be taken: it is "
+                f"{bag.path}: topic {each.topic} cannot be imported: it is "
                 f"{found.not_taken[each.topic]}; describe it with --set mapping=FILE.toml"
             )
     for option, topic in _poses_of(parameters):
@@ -133,7 +133,9 @@ def _check_poses(bag: Bag, option: str, topic: str, readers: Mapping[Connection,
     """Raise BadInput if a topic that should have poses has none."""
     reader = next((each for of, each in readers.items() if of.topic == topic), None)
     if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
-        raise BadInput(f"{bag.path}: {option} = {topic}: this topic has no poses; name one that has")
+        raise BadInput(
+            f"{bag.path}: {option} = {topic}: this topic has no poses; name a topic with poses"
+        )
 
 
 def _reader(
@@ -144,7 +146,7 @@ def _reader(
     where = f"{parameters.mapping}: the mapping of {name}"
     is_transforms = name in TRANSFORM_TYPES
     if connection.encoding not in ("cdr", "ros1"):
-        return f", in the encoding '{connection.encoding}', which is not one of ROS"
+        return f", in the encoding '{connection.encoding}', which is not an encoding of ROS"
     if mapping is None and not is_transforms and name not in TYPES:
         return ""
     try:

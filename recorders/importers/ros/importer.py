@@ -115,7 +115,7 @@ class _Import:
                 self._streams.add(sent, own, frames)
             else:
                 whose = "the truth" if is_truth else "another filter"
-                fact = f"{part.kind} left out, since a filter must not read what is from {whose}"
+                fact = f"{part.kind} left out, since filters must not use data from {whose}"
                 self._streams.tell(topic, fact, len(messages))
 
     # Transforms.
@@ -220,10 +220,12 @@ class _Import:
             static = chain.static
             if static is not None:
                 place, turn = (in_words(each[0]) for each in (static.position_m, static.quaternion))
-                notes[":".join(chain.pair)] = f"is static, and no stream: {place} m, quaternion {turn}"
+                notes[":".join(chain.pair)] = (
+                    f"is static, so it is not a stream: {place} m, quaternion {turn}"
+                )
             if chain.left_out:
                 notes[":".join(chain.pair)] = (
-                    f"{chain.left_out} stamps left out at which a transform of the chain is not known"
+                    f"{chain.left_out} stamps left out, since a transform of the chain is unknown"
                 )
         notes |= dict(self._mountings.notes(self._streams.described))
         notes |= self._streams.noise
@@ -232,7 +234,7 @@ class _Import:
         for topic, why in sorted(self._not_taken.items()):
             notes[f"not taken, {topic}"] = f"{counts[topic]} {why}"
         for what, count in Counter(self._bag.others).items():
-            notes[f"not taken, {what}"] = f"{count}, which is no topic"
+            notes[f"not taken, {what}"] = f"{count}, not a topic"
         for number, loss in enumerate(self._bag.losses, start=1):
             notes[f"lost ({number})"] = loss.removeprefix(f"{self.path}: ")
         for topic, stated in self._bag.stated.items():

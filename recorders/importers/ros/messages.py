@@ -206,8 +206,7 @@ def _odometry(messages: Messages) -> Iterator[Part]:
         noise={"forward_noise_density": spread[:, 0], "turn_noise_density": spread[:, 35]},
         dropped=_denied(messages, "a twist", "twist.covariance"),
         doubtful={
-            "with a motion sideways, up or down, rolling or pitching, which it leaves out": beside
-            > _PLANAR
+            "with motion sideways, up or down, in roll or pitch, which is ignored": beside > _PLANAR
         },
     )
     yield _twist("odometry_twist", messages, "twist.twist", "twist.covariance")

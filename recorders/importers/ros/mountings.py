@@ -78,9 +78,9 @@ class Mountings:
                 continue
             if links and all(is_forward for _, is_forward in links):
                 return (
-                    f"its frame {frame} moves in {base}, and no lever arm or mounting follows it: its "
-                    f"messages are taken for those of {base}; --set "
-                    f"'transforms=[\"{base}:{frame}\"]' imports how it moves"
+                    f"its frame {frame} moves in {base}, but lever arms and mountings are constant: its "
+                    f"messages are treated as those of {base}; --set "
+                    f"'transforms=[\"{base}:{frame}\"]' imports the motion"
                 )
         return ""
 

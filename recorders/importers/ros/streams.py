@@ -182,12 +182,12 @@ class StreamMaker:
             self._written[name] = _Written(part.schema, metadata, widths, first, noise)
         written = self._written[name]
         if widths != written.widths:
-            self.tell(sent.topic, f"{part.kind} dropped: of another length than the first", len(rows))
+            self.tell(sent.topic, f"{part.kind} dropped: length differs from the first", len(rows))
             return
         for key, value in constants.items():
             known = written.constants[key]
             same = ((value == known) | (np.isnan(value) & np.isnan(known))).all(axis=1)
-            fact = f"{part.kind} kept whose {key} is not the first one's, which is stated"
+            fact = f"{part.kind} kept although {key} differs from the first, which is stated"
             self.tell(sent.topic, fact, int((~same).sum()))
         of = rows if part.rows is None else part.rows[rows]
         log_time_ns = sent.log_time_ns[of]
@@ -209,7 +209,7 @@ class StreamMaker:
                 written.metadata[name] = f"{sigma * step_s**0.5:.6g}"
                 statement = f"{written.metadata[name]}, of {of} every {step_s:.3g} s"
             else:
-                statement = f"not stated, since {of} is no sensor's"
+                statement = f"not stated, since {of} is implausible for a sensor"
             self.noise[f"{topic}: {name}"] = statement
 
     def _stream(self, topic: str, written: _Written) -> Stream:

@@ -238,7 +238,7 @@ def path_between(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
     if common is None:
         raise BadInput(
             f"no transforms lead from '{parent}' to '{child}': from '{parent}' they end at '{up[-1]}', "
-            f"from '{child}' at '{down[-1]}'; record the transform between, or name another pair"
+            f"from '{child}' at '{down[-1]}'; record the missing transform, or name another pair"
         )
     upwards = [((above[frame], frame), False) for frame in up[: up.index(common)]]
     downwards = [((above[frame], frame), True) for frame in down[: down.index(common)]]

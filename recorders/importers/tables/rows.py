@@ -614,7 +614,7 @@ class Rows:
         notes = {name: f"{self.count} rows{files} as {topics}{of}"}
         used = self._texts | self._numbers
         if rest := [each for each in self.table.columns if each not in used]:
-            notes[f"{name}: columns not imported"] = some_of(rest)
+            notes[f"{name}: columns not taken"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, trajectory"] = self.table.mended
         for doubt in sorted(self.table.doubts):

@@ -114,13 +114,13 @@ class UlogFile:
         """Yield the rows of the wanted topics, with a block for some megabytes of the file."""
         ends = sorted({each for each in self._appended if self._begins <= each < self._size})
         if len(ends) < len(self._appended):
-            self.losses["appended section that lies outside of the file"] += 1
+            self.losses["appended section outside the file"] += 1
         try:
             with self.path.open("rb") as file:
                 for begin, end in zip([self._begins, *ends], [*ends, self._size], strict=True):
                     yield from self._section(file, begin, end, is_wanted)
         except OSError as error:
-            raise BadInput(f"{self.path}: cannot be read ({error.strerror}); copy it anew") from error
+            raise BadInput(f"{self.path}: cannot be read ({error.strerror}); copy it again") from error
 
     # Definitions.
 
@@ -128,11 +128,13 @@ class UlogFile:
         """Read everything before the first subscription; return its position."""
         head = file.read(16)
         if head[:7] != MAGIC or len(head) < 16:
-            what = "is empty" if not head else "is no ULog"
+            what = "is empty" if not head else "is not a ULog file"
             raise BadInput(f"{self.path}: {what}; give a .ulg file of PX4")
         self.start_us = int.from_bytes(head[8:], "little")
         if self.start_us >= 1 << 62:
-            raise BadInput(f"{self.path}: its first stamp is no time; its head is damaged: copy it anew")
+            raise BadInput(
+                f"{self.path}: its first stamp is invalid, so its header is damaged; copy the file again"
+            )
         self._last_us = self.start_us
         position = len(head)
         while len(head := file.read(HEAD_BYTES)) == HEAD_BYTES:
@@ -144,8 +146,8 @@ class UlogFile:
                 break
             if not size or not 65 <= kind <= 90:
                 raise BadInput(
-                    f"{self.path}: byte {position} is no message's: the definitions are damaged, and "
-                    "nothing after them can be read; copy it anew"
+                    f"{self.path}: byte {position} begins no message: the definitions are damaged, "
+                    "and nothing after them can be read; copy the file again"
                 )
             try:
                 self._define(chr(kind), body)
@@ -153,7 +155,7 @@ class UlogFile:
                 self.losses[str(why)] += 1
             position += HEAD_BYTES + size
         if not self._formats:
-            raise BadInput(f"{self.path}: ends in its definitions, at byte {position}; copy it anew")
+            raise BadInput(f"{self.path}: ends in its definitions, at byte {position}; copy it again")
         return position
 
     def _define(self, kind: str, body: bytes) -> None:
@@ -209,7 +211,7 @@ class UlogFile:
                     done += 1
                 elif is_last:
                     if done < size and end == self._size:
-                        self.losses["bytes at the end that are no whole message"] += size - done
+                        self.losses["bytes at the end that are not a complete message"] += size - done
                     return
             held[: size - done] = held[done:size]
             size, place = size - done, place + done
@@ -234,7 +236,7 @@ class UlogFile:
         of = sort(data, found.data, place, self._known, times)
         at, end, is_broken = found.data[: len(of.order)], found.end, found.is_broken
         if len(at) < len(found.data):
-            self.losses["rows of a length that is not their format's"] += 1
+            self.losses["rows whose length does not match their format"] += 1
             end, is_broken = int(found.data[len(at)]), True
             others = [each for each in others if each[0] < end]
         time_us = of.stamps if of.is_timed.all() else self._times(at, of.stamps, of.is_timed)
@@ -248,7 +250,7 @@ class UlogFile:
                 has_stamp = of.stamps[which] != 0
                 untimed = int((~has_stamp).sum())
                 which = which[of.is_timed[which] | ~has_stamp]
-                self.losses["rows whose stamp is a month from the log's begin"] += count - len(which)
+                self.losses["rows whose stamp is a month from the log's beginning"] += count - len(which)
             key = (subscription.topic, subscription.instance)
             self.rows[key] += len(which)
             if is_wanted(subscription.topic) and len(which):
@@ -293,7 +295,7 @@ class UlogFile:
         if known is not None:
             if (known.topic, known.instance) != (topic, instance):
                 self._known.until[number] = min(self._known.until[number], position)
-                self.losses[f"number of {known.topic} that {topic} has too"] += 1
+                self.losses[f"number of {known.topic} that {topic} also has"] += 1
             return
         try:
             layout = layout_of(topic, self._formats)
@@ -323,7 +325,7 @@ class UlogFile:
                 name, value = _parameter(body[1:])
                 self.defaults[name] = value
             elif kind not in "AIMSR":
-                raise Damaged("messages of a type that is not known")
+                raise Damaged("messages of an unknown type")
         except Damaged as why:
             self.losses[str(why)] += 1
 

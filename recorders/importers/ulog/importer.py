@@ -96,7 +96,7 @@ class _Import:
             try:
                 parts += [self._named(part, each) for part in SENSORS[each.topic](fields)]
             except (KeyError, ValueError) as error:
-                self._counts[f"{each.topic}: rows whose fields are others ({error})"] += len(each.data)
+                self._counts[f"{each.topic}: rows with unexpected fields ({error})"] += len(each.data)
         parts += self._autopilot.parts([each for each in rows if each.topic in TOPICS])
         return [stream for part in parts if (stream := self._stream(part)) is not None]
 
@@ -204,7 +204,7 @@ class _Import:
         for name, (topic, instance) in self._sources.items():
             if name.endswith(f"_{topic}_{instance}"):
                 others.setdefault(f"{topic}, instance {instance}", []).append(name)
-        notes |= {of: f"another one, as {', '.join(names)}" for of, names in others.items()}
+        notes |= {of: f"another instance, as {', '.join(names)}" for of, names in others.items()}
         rest = Counter({topic: 0 for topic, _ in file.rows if topic not in taken})
         for (topic, _), count in file.rows.items():
             if topic in rest:

@@ -219,7 +219,7 @@ def gnss(fields: Fields) -> Iterator[Part]:
     facts = {
         "left out without a fix": int((~has_fix).sum()),
         f"its height above the ellipsoid is 0, missing or more than {FARTHEST_M:g} m from that above "
-        f"the sea, which is taken instead{higher}": int((is_wrong & has_fix).sum()),
+        f"the sea, which is used instead{higher}": int((is_wrong & has_fix).sum()),
     }
     fix = fields.part(
         name.format("fix"),

@@ -1,4 +1,4 @@
-"""Reads and writes MCAP: chunks, indexes, and a file that appears whole or not at all.
+"""Reading and writing of MCAP: chunks, indexes, and files that appear completely or not at all.
 
 Begin with `reading`.
 """

@@ -1,4 +1,4 @@
-"""Handles regions of an MCAP file as bytes: packs a chunk, opens one, and the small records about.
+"""Regions of an MCAP file as bytes: packing and opening of chunks, and parsing of small records.
 
 A region is a chunk, or a run of records outside chunks, which is laid out like an uncompressed chunk.
 Source: the MCAP specification (mcap.dev/spec).
@@ -24,20 +24,20 @@ from fuselog.recorders.log.streams import Clock
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
-# The span of log time, size and checksum when uncompressed, length of the compression's name.
+# The span of log time, size and checksum of the uncompressed data, length of the compression's name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 
-# zstd -1, for it leaves 69 % of noisy doubles and 25 % of MRCLAM's odometry; lz4 leaves 78 and 39 %, 1.3
-# times as fast, and zstd 3 leaves 66 and 18 %, at half the speed both ways.
+# zstd -1, since it leaves 69 % of noisy doubles and 25 % of MRCLAM's odometry; lz4 leaves 78 and 39 %,
+# and is 1.3 times as fast; zstd 3 leaves 66 and 18 %, at half the speed in both directions.
 _COMPRESS: Mapping[str, Callable[[memoryview], bytes]] = {
     "zstd": lambda data: zstandard.compress(data, -1),
     "lz4": lz4.frame.compress,
     "none": bytes,
 }
 COMPRESSIONS = tuple(_COMPRESS)
-# A byte of lz4 stands for 255 at most, and four of zstd for a block of 128 KiB: a chunk that states more
-# is not given the memory.
+# A byte of lz4 expands to at most 255, and four of zstd to a block of 128 KiB: a chunk that states more
+# does not get the memory.
 _MOST_FROM_A_BYTE = {"zstd": 1 << 15, "lz4": 255, "": 1}
 
 _UNREADABLE = (
@@ -60,28 +60,28 @@ _RECORDS: dict[int, Any] = {
 
 
 class Damaged(ValueError):
-    """Says which part of a file cannot be read, and why."""
+    """An error for a part of a file that cannot be read; the text says which, and why."""
 
 
 class Span(NamedTuple):
-    """Holds spans from the first to the last time, both included."""
+    """A span from the first to the last time, both included."""
 
     first_ns: int
     last_ns: int
 
     def holds(self, other: "Span") -> bool:
-        """Tell whether the other lies inside this one."""
+        """Test whether the other span is inside this one."""
         return self.first_ns <= other.first_ns and other.last_ns <= self.last_ns
 
     def meets(self, other: "Span") -> bool:
-        """Tell whether they have a time in common."""
+        """Test whether the spans overlap."""
         return self.first_ns <= other.last_ns and other.first_ns <= self.last_ns
 
 
 class Contents(NamedTuple):
-    """Holds an opened region: its bytes, where each channel's messages start, what it declares.
+    """An opened region: its bytes, the positions of each channel's messages, and its declarations.
 
-    `spans` is empty where there are no messages.
+    `spans` is empty if there are no messages.
     """
 
     data: NDArray[np.uint8]
@@ -91,7 +91,7 @@ class Contents(NamedTuple):
 
 
 def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[bytes, bytes]:
-    """Return the Chunk record of `data`: all that stands before the compressed bytes, and these."""
+    """Encode the Chunk record of `data`: everything before the compressed bytes, and these bytes."""
     packed = _COMPRESS[compression](data)
     name = b"" if compression == "none" else compression.encode()
     head = _CHUNK_HEAD.pack(*log_time, len(data), zlib.crc32(data), len(name))
@@ -100,7 +100,7 @@ def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[by
 
 
 def open_region(raw: bytes, offset: int) -> Contents:
-    """Open the region that stands at byte `offset` of a file, its checksum compared.
+    """Open the region at byte `offset` of a file, and compare its checksum.
 
     Raises Damaged.
     """
@@ -128,7 +128,7 @@ def open_region(raw: bytes, offset: int) -> Contents:
 
 
 def _uncompressed(chunk: bytes) -> bytes | memoryview:
-    """Uncompress the records inside a Chunk record."""
+    """Decompress the records inside a Chunk record."""
     _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(chunk, HEAD_BYTES)
     place = HEAD_BYTES + _CHUNK_HEAD.size
     compression = str(chunk[place : place + name_length], "utf-8")
@@ -159,16 +159,16 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
 
 
 def _stated_size(region: bytes) -> int:
-    """Return how many bytes a region has when it is open, as it says itself."""
+    """Return the uncompressed size of a region, as it states it."""
     if region[0] != Opcode.CHUNK:
         return len(region)
     return int(_CHUNK_HEAD.unpack_from(region, HEAD_BYTES)[2])
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
-    """Yield the small records in `data`, those of other kinds left out.
+    """Yield the small records in `data`, without those of other kinds.
 
-    Raises Damaged where one is not whole or cannot be understood.
+    Raises Damaged if a record is incomplete or invalid.
     """
     while start < len(data):
         try:
@@ -183,7 +183,7 @@ def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
 
 
 class _Whole(io.BytesIO):
-    """Reads bytes, and raises where mcap's records would let a short read pass."""
+    """A stream of bytes that raises an error on a short read, which mcap's records would ignore."""
 
     def read(self, size: int | None = -1) -> bytes:
         found = super().read(size)

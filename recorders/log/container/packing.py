@@ -1,4 +1,4 @@
-"""Packs streams into the bytes of chunks: merged in log-time order, cut at record borders, indexed."""
+"""Packing of streams into chunks: merged in log-time order, cut between records, and indexed."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
 
 
 class Chunk(NamedTuple):
-    """Holds the records of one chunk, its spans of time, and its message indexes by channel."""
+    """The records of one chunk, its spans of time, and its message indexes by channel."""
 
     data: memoryview
     log_time: Span
@@ -25,9 +25,9 @@ def chunks_of(parts: Sequence[NDArray[np.void]], chunk_bytes: int) -> Iterator[C
     """Merge the message records of several channels into chunks.
 
     Args:
-        parts: one channel's records each, as of `Layout.build`, in log-time order; ties keep the order
-            given.
-        chunk_bytes: about how large a chunk is.
+        parts: records of each channel, as returned by `Layout.build`, in log-time order; ties keep the
+            order given.
+        chunk_bytes: approximate size of a chunk.
     """
     lengths = [len(part) for part in parts]
     log_times = np.concatenate([part["mcap log_time"] for part in parts])
@@ -64,7 +64,7 @@ def chunks_of(parts: Sequence[NDArray[np.void]], chunk_bytes: int) -> Iterator[C
 def _merged(
     parts: Sequence[NDArray[np.void]], offsets: Sequence[NDArray[np.int64]]
 ) -> NDArray[np.uint8]:
-    """Put the parts' bytes together, every record at its offset."""
+    """Combine the bytes of the parts, with every record at its offset."""
     data = np.empty(sum(part.nbytes for part in parts), np.uint8)
     for part, each in zip(parts, offsets, strict=True):
         places = windows(data, part.dtype.itemsize)
@@ -75,7 +75,7 @@ def _merged(
 def _indexes(
     parts: Sequence[NDArray[np.void]], offsets: Sequence[NDArray[np.int64]], borders: NDArray[np.int64]
 ) -> list[dict[int, bytes]]:
-    """Write log time and offset inside its chunk of every message, by chunk and channel."""
+    """Encode the log time and the offset in its chunk of every message, by chunk and channel."""
     found: list[dict[int, bytes]] = [{} for _ in borders[1:]]
     for part, each in zip(parts, offsets, strict=True):
         cuts = np.searchsorted(each, borders)

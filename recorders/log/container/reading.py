@@ -1,9 +1,9 @@
-"""Reads the MCAP container: which regions of a file hold messages, and what else stands in it.
+"""Reader of the MCAP container: the regions of a file with messages, and its other contents.
 
-The data section is walked record by record. A chunk that the summary tells of is stepped over; any other
-is opened on the way, so that a file without an index, or with one that leaves chunks out, is read all
-the same. Messages outside chunks are laid out like an uncompressed chunk, and are read as one. Behind a
-record that is not whole the walk goes on at the next one of which a whole summary says where it is.
+The data section is walked record by record. Chunks listed in the summary are skipped; all others are
+opened, so that files without an index, or with an incomplete one, are read too. Messages outside chunks
+have the layout of an uncompressed chunk, and are read like one. After an incomplete record, the walk
+continues at the next record whose position an intact summary states.
 Source: the MCAP specification (mcap.dev/spec).
 """
 
@@ -35,24 +35,24 @@ from fuselog.recorders.log.container.sealed import unseal
 from fuselog.recorders.log.streams import Clock
 
 _FOOTER = struct.Struct("<BQQQI8s")
-# The part of the footer that the summary's checksum covers.
+# The part of the footer covered by the summary's checksum.
 _FOOTER_CHECKED_BYTES = 25
 _LOOSE = frozenset({Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL})
 _DATA_END_BYTES = RECORD_HEAD.size + 4
-# What stands before an attachment's name: when it was logged and made, and how long the name is.
+# The fields before an attachment's name: when it was logged and made, and the length of the name.
 _ATTACHMENT_HEAD = struct.Struct("<QQI")
-# A run of records outside chunks is cut here, so that memory stays bounded.
+# A run of records outside chunks is split at this size, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
-# No record has this opcode: it stands for bytes that are not a whole record.
+# No record has this opcode: it stands for bytes that are not a complete record.
 _LOST = 0
 
 
 @dataclass(frozen=True)
 class Region:
-    """Describes one chunk, or one run of records outside chunks, without opening it.
+    """One chunk, or one run of records outside chunks, described without opening it.
 
-    The span of publish time is absent where only a foreign index tells of the chunk; `channel_ids` is
-    None where the index does not say which channels it holds.
+    The span of publish times is absent if only the index of another writer describes the chunk;
+    `channel_ids` is None if the index does not list the channels.
     """
 
     offset: int
@@ -62,16 +62,16 @@ class Region:
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Return where it is in the file, for `read_bytes`."""
+        """Return offset and length in the file, for `read_bytes`."""
         return self.offset, self.length
 
 
 @dataclass
 class Container:
-    """Describes what a file holds: channels and schemas by id, metadata by name, regions in file order.
+    """The contents of a file: channels and schemas by id, metadata by name, regions in file order.
 
-    Both counts are by channel: the messages that can be read, and those that a whole summary states.
-    Attachments are known by name alone.
+    Both counts are by channel: the messages that can be read, and those that an intact summary states.
+    Only the names of attachments are known.
     """
 
     channels: dict[int, records.Channel] = field(default_factory=dict)
@@ -85,9 +85,9 @@ class Container:
 
 
 class _Place(NamedTuple):
-    """Holds one record, bytes that are lost, or a run of loose records.
+    """One record, lost bytes, or a run of records outside chunks.
 
-    A run is as if it were one message, or one schema where it has declarations alone.
+    A run has the opcode of a message, or of a schema if it has only declarations.
     """
 
     opcode: int
@@ -96,40 +96,40 @@ class _Place(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Return where the next one starts."""
+        """Return the position after this one."""
         return self.offset + self.length
 
 
 class _Summary(NamedTuple):
-    """Holds the records of the summary, and where it begins; None where that is not known."""
+    """The records of the summary, and its position; None if that is unknown."""
 
     records: Sequence[Any] = ()
     start: int | None = None
 
 
 class _Index(NamedTuple):
-    """Holds what a summary says of the chunks, by their place, and of the messages, by channel."""
+    """The summary's entries on chunks, by position, and numbers of messages, by channel."""
 
     chunks: dict[int, records.ChunkIndex]
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """Return the entry of the chunk that stands there, where an index has it right and not empty."""
+        """Return the entry of the chunk at a position, if it matches and the chunk is not empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None
-        # a chunk without messages states the time 0 as well
+        # a chunk without messages also states the time 0
         return entry if entry.message_end_time else None
 
 
 class NotMcap(BadInput):
-    """Says that a file is of some other kind, which some commands take in another way."""
+    """An error for files of another kind, which some commands accept in another way."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
-    """Find out what `path` holds; without the index every region is opened, and only whole ones kept.
+    """Describe what `path` holds; without the index every region is opened, and intact ones are kept.
 
-    Raises BadInput where the file is missing, unreadable, or no MCAP at all.
+    Raises BadInput if the file is missing, unreadable, or not MCAP.
     """
     try:
         with path.open("rb") as file:
@@ -141,7 +141,7 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
 
 
 def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
-    """Return the `length` bytes of `file` from `offset` on, which were there when it was opened."""
+    """Read `length` bytes of `file` from `offset`; raise OSError if the file has become shorter."""
     file.seek(offset)
     found = file.read(length)
     if len(found) < length:
@@ -183,7 +183,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
 
 
 def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
-    """Say what is left out behind the data section; empty for nothing, or a damaged summary."""
+    """Describe what is ignored after the data section; empty for nothing, or a damaged summary."""
     position = data_end
     while (place := _record_at(file, size, position)) is not None:
         position = place.end
@@ -202,7 +202,7 @@ def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
 
 
 def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
-    """Say what the summary tells of and the data section lacks (`chunks`, metadata), and the reverse."""
+    """Yield what the summary lists but the data section lacks (`chunks`, metadata), and the reverse."""
     for offset in sorted(chunks):
         yield f"there is no chunk at byte {offset}, where its index states one"
     for entry in summary.records:
@@ -215,7 +215,7 @@ def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iter
 
 
 def _summary(file: BinaryIO, size: int) -> _Summary:
-    """Read the summary, without records where the file has none. Raises Damaged."""
+    """Read the summary; it is empty if the file has none. Raises Damaged."""
     file.seek(max(size - _FOOTER.size, 0))
     footer = file.read(_FOOTER.size)
     if len(footer) < _FOOTER.size:
@@ -233,7 +233,7 @@ def _summary(file: BinaryIO, size: int) -> _Summary:
 
 
 def _index(summary: Sequence[Any]) -> _Index:
-    """Read what a summary says; if a part is missing nothing, so that every chunk is opened."""
+    """Read the index from a summary; it is empty if a part is missing, so that every chunk is opened."""
     by_kind: dict[type, list[Any]] = {}
     for record in summary:
         by_kind.setdefault(type(record), []).append(record)
@@ -253,7 +253,7 @@ def _index(summary: Sequence[Any]) -> _Index:
 
 
 def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Place]:
-    """Yield every whole record of the data section, and what is lost between two of them."""
+    """Yield every complete record of the data section, and the bytes lost between records."""
     known = _stated_places(summary)
     run = position = len(MAGIC)
     kind = Opcode.SCHEMA
@@ -275,9 +275,9 @@ def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Pla
 
 
 def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place]) -> _Place | None:
-    """Return the record at `position`, or what is lost until the next known one; None at the end.
+    """Return the record at `position`, or the bytes lost until the next known one; None at the end.
 
-    No record is whole that goes on where another one begins.
+    A record that extends beyond the beginning of another one is not complete.
     """
     place = _record_at(file, size, position)
     end = place.end if place else size
@@ -290,7 +290,7 @@ def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place
 
 
 def _record_at(file: BinaryIO, size: int, position: int) -> _Place | None:
-    """Read the record that stands at `position`; None where there is no whole one."""
+    """Read the record at `position`; None if it is not complete."""
     if position + RECORD_HEAD.size > size:
         return None
     opcode, length = RECORD_HEAD.unpack(read_bytes(file, position, RECORD_HEAD.size))
@@ -299,7 +299,7 @@ def _record_at(file: BinaryIO, size: int, position: int) -> _Place | None:
 
 
 def _stated_places(summary: _Summary) -> list[_Place]:
-    """Find where the records of the data section are of which a summary states the place."""
+    """List the records of the data section whose position a summary states."""
     places = []
     for record in summary.records:
         if isinstance(record, records.ChunkIndex):
@@ -312,7 +312,7 @@ def _stated_places(summary: _Summary) -> list[_Place]:
 
 
 def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> None:
-    """Note what one place of the data section holds. Raises Damaged."""
+    """Add the contents of one record or run of the data section. Raises Damaged."""
     if place.opcode == _LOST:
         raise Damaged(f"its bytes {place.offset} to {place.end} are not a whole record")
     entry = index.chunk(place)
@@ -340,7 +340,7 @@ def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> Non
 
 
 def _attachment_name(file: BinaryIO, place: _Place) -> str:
-    """Read the name of an attachment, whose data, which may be large, are not read. Raises Damaged."""
+    """Read the name of an attachment, without its data, which may be large. Raises Damaged."""
     start = RECORD_HEAD.size + _ATTACHMENT_HEAD.size
     if place.length >= start:
         head = read_bytes(file, place.offset + RECORD_HEAD.size, _ATTACHMENT_HEAD.size)
@@ -351,7 +351,7 @@ def _attachment_name(file: BinaryIO, place: _Place) -> str:
 
 
 def _declare(found: Container, declarations: Iterable[Any]) -> None:
-    """Note schemas and channels. Raises Damaged where one number means two things."""
+    """Add schemas and channels. Raises Damaged if one number has two meanings."""
     known: dict[type, dict] = {records.Schema: found.schemas, records.Channel: found.channels}
     for record in declarations:
         kind = type(record)

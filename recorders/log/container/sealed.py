@@ -1,4 +1,4 @@
-"""Seals our own metadata records with a checksum, since MCAP gives a metadata record none."""
+"""Checksums for our metadata records, which MCAP does not protect."""
 
 import json
 import zlib
@@ -7,20 +7,20 @@ from collections.abc import Mapping
 from fuselog.recorders.log.container.chunks import Damaged, Span
 
 OWN_NAMES = "fuselog."
-# When the messages of each chunk were published: what MCAP's index has of log times only.
+# The publish times of each chunk; MCAP's index only has log times.
 PUBLISH_SPANS = f"{OWN_NAMES}publish_spans"
 _SEAL = "crc32"
 
 
 def seal(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Return the pairs of a record of ours with their checksum beside them."""
+    """Add a checksum to the pairs of one of our records."""
     return {**pairs, _SEAL: _checksum(pairs)}
 
 
 def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
-    """Return the pairs without their checksum, which is compared; a foreign record as it is.
+    """Remove the checksum from the pairs after comparing it; return records of others unchanged.
 
-    Raises Damaged where the checksum is wrong.
+    Raises Damaged if the checksum is wrong.
     """
     if not name.startswith(OWN_NAMES):
         return dict(pairs)
@@ -31,12 +31,12 @@ def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def note_span(offset: int, length: int, span: Span) -> tuple[str, str]:
-    """Return the pair of `PUBLISH_SPANS` that tells of the chunk at these bytes of the file."""
+    """Make the pair of `PUBLISH_SPANS` for the chunk at these bytes of the file."""
     return f"{offset}+{length}", f"{span.first_ns} {span.last_ns}"
 
 
 def noted_span(pairs: Mapping[str, str], offset: int, length: int) -> Span | None:
-    """Return what `note_span` noted; None where it did not, as in a file that another tool rewrote."""
+    """Return the span noted by `note_span`; None if another tool rewrote the file."""
     noted = pairs.get(f"{offset}+{length}")
     return None if noted is None else Span(*map(int, noted.split()))
 

@@ -1,7 +1,7 @@
-"""Writes an MCAP file that appears whole or not at all: its records, indexes and summary.
+"""Writer of an MCAP file with its records, indexes and summary; it appears completely or not at all.
 
-It is renamed when it is whole. The small records are mcap's own; chunks and their indexes come from
-`packing`. Source: the MCAP specification (mcap.dev/spec).
+The file is renamed when it is complete. The small records come from the mcap library; chunks and their
+indexes come from `packing`. Source: the MCAP specification (mcap.dev/spec).
 """
 
 import struct
@@ -29,9 +29,9 @@ _INDEX_HEAD = struct.Struct("<HI")
 
 
 class ContainerWriter:
-    """Writes one MCAP file; use it as a context manager.
+    """A writer of one MCAP file; use it as a context manager.
 
-    Raises BadInput where the disk does not take it, or the compression is unknown.
+    Raises BadInput if the file cannot be written, or the compression is unknown.
     """
 
     def __init__(self, path: Path, compression: str) -> None:
@@ -78,11 +78,11 @@ class ContainerWriter:
             self._finish()
 
     def _close(self) -> None:
-        with suppress(OSError):  # which was told when it was met
+        with suppress(OSError):  # which was reported when it occurred
             self._file.close()
 
     def add_schema(self, name: str, description: bytes) -> int:
-        """Return the number of a protobuf schema; it is written where it is new."""
+        """Return the number of a protobuf schema; write it if it is new."""
         if description not in self._schemas:
             number = len(self._schemas) + 1
             schema = records.Schema(id=number, data=description, encoding="protobuf", name=name)
@@ -91,7 +91,7 @@ class ContainerWriter:
         return self._schemas[description].id
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str]) -> int:
-        """Return the number of a new channel."""
+        """Write a new channel; return its number."""
         channel = records.Channel(
             id=len(self._channels) + 1,
             topic=topic,
@@ -104,7 +104,7 @@ class ContainerWriter:
         return channel.id
 
     def add_metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Write a metadata record of ours."""
+        """Write one of our metadata records."""
         start = self._offset
         self._append_record(records.Metadata(name=name, metadata=seal(pairs)))
         entry = records.MetadataIndex(offset=start, length=self._offset - start, name=name)
@@ -160,7 +160,7 @@ class ContainerWriter:
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Tell an error of the disk as BadInput, at once and whenever the file is touched again."""
+        """Raise errors of the disk as BadInput, immediately and at every later access to the file."""
         if self._failure is not None:
             raise self._failure
         try:
@@ -170,7 +170,7 @@ class ContainerWriter:
             raise self._failure from error
 
     def _finish(self) -> None:
-        """Write what follows the last chunk."""
+        """Write everything after the last chunk."""
         self.add_metadata(PUBLISH_SPANS, self._publish_spans)
         self._append_record(records.DataEnd(data_section_crc=self._checksum))
         self._append(self._summary_section())
@@ -179,7 +179,7 @@ class ContainerWriter:
             self._file.close()
 
     def _summary_section(self) -> bytes:
-        """Write the summary, the offsets of its groups, and the footer."""
+        """Encode the summary, the offsets of its groups, and the footer."""
         groups: dict[Opcode, Sequence[records.McapRecord]] = {
             Opcode.SCHEMA: list(self._schemas.values()),
             Opcode.CHANNEL: self._channels,

@@ -79,7 +79,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         [f"{each}: is missing, although metadata.yaml names it" for each in paths if each not in there],
     )
     if not there:
-        raise BadInput(f"{path}: has no bag in it; {_WANTED}")
+        raise BadInput(f"{path}: contains no bag; {_WANTED}")
     for entry in about.get("topics_with_message_count") or []:
         bag.stated[entry["topic_metadata"]["name"]] += int(entry["message_count"])
     bag.is_packed = str(about.get("compression_mode") or "").lower() == "message"
@@ -87,7 +87,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         for each in there:
             bag.files.append(_open_file(each, scratch))
         if len({type(each) for each in bag.files}) > 1:
-            raise BadInput(f"{path}: has bags of several formats in it; give one of them")
+            raise BadInput(f"{path}: contains bags of several formats; give one of them")
         yield bag
 
 

@@ -94,7 +94,7 @@ class Ros1File:
             record = _record_at(file, position, size)
             if record is None:
                 self.losses.append(
-                    f"{self.path}: it was cut off: its last {size - position} bytes are not a whole "
+                    f"{self.path}: it was cut off: its last {size - position} bytes are not a complete "
                     "record"
                 )
                 break
@@ -112,7 +112,9 @@ class Ros1File:
                     self._counts[number] += count
         if self._chunks and (self.losses or not has_index):  # a truncated index is incomplete
             if not self.losses:
-                self.losses.append(f"{self.path}: was not closed; it has no index, and is read without")
+                self.losses.append(
+                    f"{self.path}: was not closed, so it has no index; it is read without one"
+                )
             self._counts.clear()
             for record in self._chunks:
                 self._search(_read(file, record), record)
@@ -152,13 +154,13 @@ class Ros1File:
                 data, found = opened
                 if found.end < len(data):
                     lost = len(data) - found.end
-                    self.losses.append(f"{place}: its last {lost} bytes are not a whole message")
+                    self.losses.append(f"{place}: its last {lost} bytes are not a complete message")
                 is_known = np.isin(found.connections, list(self._by_id))
                 strange = (found.kinds != _CONNECTION) & ~((found.kinds == _MESSAGE) & is_known)
                 if strange.any():
                     count = int(strange.sum())
                     self.losses.append(
-                        f"{place}: {count} records are no messages of its topics, and lost"
+                        f"{place}: {count} records are not messages of its topics, and are lost"
                     )
                 for number, connection in chosen.items():
                     rows = (found.kinds == _MESSAGE) & (found.connections == number)
@@ -208,7 +210,7 @@ def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] |
     record, raw = read
     compression = record.header.get("compression", b"")
     if compression not in _DECOMPRESS:
-        return f"its compression {compression.decode(errors='replace')} is not one of none, bz2 and lz4"
+        return f"its compression {compression.decode(errors='replace')} is none of: none, bz2, lz4"
     try:
         data = np.frombuffer(_DECOMPRESS[compression](raw), np.uint8)
     except (OSError, EOFError, RuntimeError, ValueError) as error:

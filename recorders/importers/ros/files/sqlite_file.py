@@ -47,12 +47,12 @@ class SqliteFile:
         }
         self.connections = list(self._by_id.values())
         if counts:
-            self._losses["topics"] = f"{counts.total()} messages have no topic, and are lost"
+            self._losses["topics"] = f"{counts.total()} messages have no topic and are lost"
         journal = path.with_name(path.name + "-wal")
         if journal.exists() and journal.stat().st_size:
             self._losses["journal"] = (
-                f"was not closed; the messages in {journal.name} are not read, "
-                "until ros2 bag reindex has put them into it"
+                f"was not closed; the messages in {journal.name} are not read; run ros2 bag reindex to "
+                "add them to it"
             )
 
     @property
@@ -79,7 +79,7 @@ class SqliteFile:
         if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_CORRUPT:
             return ""
         command = f"sqlite3 {quote(str(self.path))} .recover | sqlite3 whole.db3"
-        return f"; `{command}` may get more of it back"
+        return f"; `{command}` may recover more of it"
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
         """Yield the messages of the wanted connections, some thousand rows at a time."""
@@ -103,7 +103,7 @@ class SqliteFile:
                 strange += 1
         if strange:
             self._losses["strange"] = (
-                f"{strange} rows of messages have no whole stamp or no bytes, and are lost"
+                f"{strange} rows of messages have no integer stamp or no bytes, and are lost"
             )
 
     def _rows(
@@ -116,7 +116,9 @@ class SqliteFile:
             for row in database.execute(query, values):
                 yield row
         except sqlite3.Error as error:
-            behind = "all messages are" if row is None else f"what follows the one of time {row[1]} is"
+            behind = (
+                "all messages are" if row is None else f"all messages after the one at time {row[1]} are"
+            )
             self._losses["damage"] = f"is damaged ({error}); {behind} lost{self._mend(error)}"
 
 
