@@ -30,7 +30,7 @@ USUAL_GATE = 0.99  # if it is unknown
 RARE = 0.01  # share of rejected measurements that serves as the unit of excess
 LARGEST = 1e300  # replaces infinity, which JSON does not have
 NIS = "nis_per_component"
-OF_DIVERGENCE = "it diverged, or its covariances are of another unit"
+OF_DIVERGENCE = "it diverged, or its covariances are in another unit"
 REASONS = {
     Consistency.OVERCONFIDENT: "its covariances are too small",
     Consistency.CONSERVATIVE: "its covariances are too large",
@@ -56,7 +56,7 @@ class _Range(NamedTuple):
     @property
     def fact(self) -> str:
         """Return the value and its limits as a phrase."""
-        limits = f"where a consistent filter is within {self.low:.3g} and {self.high:.3g}"
+        limits = f"where a consistent filter is between {self.low:.3g} and {self.high:.3g}"
         return f"is {self.of.found.value:.3g}{' per component' * (self.of.name == NIS)}, {limits}"
 
     @property
@@ -102,10 +102,11 @@ def _of_components(judge: Judge) -> Iterator[Finding]:
     for (estimator, case), names in judge.uninformed.items():
         them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
         words = (
-            f"{_name(estimator, case)}: {', '.join(names)} {keep} start and prior uncertainty: no "
-            f"measurement informs this method of {them}"
+            f"{_name(estimator, case)}: {', '.join(names)} {keep} initial value and prior uncertainty: "
+            f"no "
+            f"measurement informs this method about {them}"
         )
-        other = "take another one that fits the log, by fuselog info LOG"
+        other = "use another method that fits the log; fuselog info LOG lists them"
         yield Finding("uninformed", estimator, case, LARGEST, words, otherwise=other)
 
 
@@ -141,11 +142,11 @@ def _of_innovations(
             share = gated / sums.messages
             excess = max(1.0, gated / max(expected, RARE * sums.messages))
             facts.append(
-                f"the gate keeps out {_percent(share)} of {sums.messages} measurements, where "
+                f"the gate rejects {_percent(share)} of {sums.messages} measurements, where "
                 f"{_percent(1.0 - gate)} {'is' if gate < 1.0 else 'are'} expected"
             )
         if not sums.accepted and sums.messages:
-            facts.append("its log-likelihood is that of no measurement")
+            facts.append("its log-likelihood includes no measurement")
         if own := nis.get((estimator, case)):
             excess = max(excess, own.excess)
             facts.append(f"NIS {own.fact}")
@@ -176,8 +177,9 @@ def _of_errors(
             if (lacking := judge.unestimated.get(what)) and own.of.found.value > own.high:
                 more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
                 words += (
-                    f"; the truth has {lacking[0]}{more}, which it does not estimate; if the model "
-                    "can, the setting estimate adds them to the state"
+                    f"; the truth contains {lacking[0]}{more}, which the estimator does not estimate; "
+                    f"if "
+                    "the model supports it, the setting estimate adds them to the state"
                 )
             has_innovations = any(split_topic(each)[0] == estimator for each in judge.innovations)
             why = _why(estimator) if has_innovations else ""
@@ -201,7 +203,9 @@ def dominating_run(nees: "pd.Series[float]") -> str:
     if place is None:
         return ""
     rest = float(np.delete(values, place).mean())
-    return f"run {nees.index[place]} dominates it with {values[place]:.3g}: without that run {rest:.3g}"
+    return (
+        f"run {nees.index[place]} dominates it with {values[place]:.3g}; the others average {rest:.3g}"
+    )
 
 
 def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
@@ -210,14 +214,16 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
     name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
     words = f"{name}: {_percent(constant.share)} of the squared error is constant, "
     if constant.turns:
-        axes = "ahead, to the left, up" if len(constant.offset_m) > 2 else "ahead, to the left"
+        axes = "forward, left, up" if len(constant.offset_m) > 2 else "forward, left"
         words += (
-            f"({offset}) m {axes}: the truth is of another point of the body (a lever arm), or a sensor "
-            "is off"
+            f"({offset}) m {axes}: the truth may refer to another point of the body (a lever arm), or a "
+            "sensor has an offset"
         )
-        state = "state the one or the other in the model"
+        state = "add the lever arm or the offset to the model"
         return Finding("lever arm", estimator, case, excess, words, otherwise=state)
-    words += f"({offset}) m: truth and estimate may have other origins: fuselog evaluate --align se2"
+    words += (
+        f"({offset}) m: truth and estimate may have different origins: try fuselog evaluate --align se2"
+    )
     return Finding("origin", estimator, case, excess, words)
 
 
@@ -236,10 +242,11 @@ def _of_costs(judge: Judge) -> Iterator[Finding]:
         if cost > high * max(1.0, sums.squared / sums.degrees):  # understated noise raises both
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
-                f"{numbers / judge.runs:.4g} measured numbers leave up to {high:.4g}: a minimum that is "
-                "not the least one"
+                f"{numbers / judge.runs:.4g} measured numbers explain at most {high:.4g}: probably a "
+                f"local "
+                "minimum"
             )
-            starts = "compare other starts, such as --set start=motion"
+            starts = "try other starts, such as --set start=motion"
             yield Finding("minimum", estimator, case, cost / high, words, otherwise=starts)
 
 
@@ -258,11 +265,11 @@ def _of_digits(judge: Judge) -> Iterator[Finding]:
             )
         else:
             words += (
-                f"has lost its digits in {found.lost} of {found.sampled} samples: {when} a pivot of "
+                f"has lost its precision in {found.lost} of {found.sampled} samples: {when} a pivot of "
                 f"its Cholesky factor is {max(found.least, 0.0):.2g} of a variance, where {LOST:g} "
                 "leaves four digits"
             )
-        surer = "give a prior that is surer, or noise to what is known too well, or try sqrt:ekf"
+        surer = "use a tighter prior, add noise to states that are known too well, or try sqrt:ekf"
         share = found.lost / found.sampled
         yield Finding("digits", estimator, case, 1.0 + share / RARE, words, otherwise=surer)
 
@@ -289,8 +296,8 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
     }
     is_closed = any(each.total.accepted < each.total.messages for each in judge.innovations.values())
     if is_closed and len({*gates.values()}) > 1:
-        own = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
-        words = f"gate_probability is {own}: their likelihoods are of different measurements"
+        own = ", ".join(f"{gate:g} for {label}" for label, gate in gates.items())
+        words = f"gate_probability is {own}: their likelihoods are based on different measurements"
         yield Finding("gates", "", "", 1.0, words, otherwise="compare with --set gate_probability=1")
 
 
@@ -303,4 +310,4 @@ def _name(estimator: str, case: str) -> str:
 
 
 def _why(estimator: str) -> str:
-    return f"fuselog diagnose LOG -e {estimator} says why"
+    return f"fuselog diagnose LOG -e {estimator} explains why"

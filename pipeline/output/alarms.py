@@ -55,7 +55,7 @@ class Cause:
 
 
 Verdict = Literal["harmless", "sensitive", "discontinuous or chaotic", "not tried"]
-NOT_TESTED = "not stress-tested: --stress says whether changes that should not matter change a verdict"
+NOT_TESTED = "not stress-tested: --stress tests whether changes that should not matter change a verdict"
 
 
 @dataclass(frozen=True)

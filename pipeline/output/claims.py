@@ -36,7 +36,7 @@ from fuselog.replay.judging.verdicts import Claimed
 
 # Recording name of a claim about all recordings.
 ANY = "any"
-TOO_FEW = f"too few runs for a 95 % interval, which takes {FEWEST_RUNS}"
+TOO_FEW = f"too few runs for a 95 % interval, which needs {FEWEST_RUNS}"
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim)
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
-    return replace(claim, verdict=Claimed.NO_VERDICT, why=f"claimed of {name}, not of these data")
+    return replace(claim, verdict=Claimed.NO_VERDICT, why=f"claimed for {name}, not for these data")
 
 
 def _combinations(
@@ -297,7 +297,7 @@ def _few_runs(claim: StatedClaim, values: Values) -> str:
     stated = _stated(claim)
     if not any(needs_runs(each, stated, values) for each in (claim.holds, claim.reproducible) if each):
         return ""
-    return f"of {runs.value:g} runs; without an interval it is decided from {least} on"
+    return f"only {runs.value:g} runs; without an interval, a verdict needs at least {least}"
 
 
 def _stated(claim: StatedClaim) -> dict[str, str]:

@@ -108,7 +108,7 @@ def recounted(
         try:
             bound += bind(label, sources, settings)
         except BadInput as error:
-            rows.append(Row(label, "all topics", 0, None, None, 0, f"they are not counted: {error}"))
+            rows.append(Row(label, "all topics", 0, None, None, 0, f"not counted: {error}"))
     usages: dict[str, Usage] = {}
     for each, (source, order) in zip(estimates, spans, strict=True):
         for name, usage in _recounted(each, source, order, bound).items():

@@ -65,7 +65,7 @@ def evaluate(expression: str, values: Values) -> Value:
         return value_of(parse(expression), values)
     except (TypeError, AttributeError, ValueError, OverflowError):
         raise BadInput(
-            f"'{expression}' has a number, a list or a comparison where another of these belongs"
+            f"'{expression}' uses a number, a list or a comparison where one of the others is expected"
         ) from None
 
 
@@ -73,7 +73,7 @@ def truth(expression: str, values: Values) -> Truth:
     """Test whether an expression holds, in all entries if it is a list; raises as `evaluate` does."""
     found = evaluate(expression, values)
     if isinstance(found, Interval):
-        raise BadInput(f"'{expression}' is a number, no comparison; compare it with a limit")
+        raise BadInput(f"'{expression}' is a number, not a comparison; compare it with a limit")
     return all_hold(found if isinstance(found, list) else [found])
 
 
@@ -91,7 +91,9 @@ def formatted(template: str, values: Values) -> str:
             try:
                 parts.append(in_words(found, form or ".3g", named=conversion == "n"))
             except ValueError:
-                raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
+                raise BadInput(
+                    f"'{form}' is not a number format; write for example {{value:.2f}}"
+                ) from None
     return "".join(parts)
 
 
@@ -122,12 +124,13 @@ def parse(expression: str) -> ast.expr:
     try:
         tree = ast.parse(quoted.strip(), mode="eval").body
     except (SyntaxError, ValueError):
-        raise BadInput(f"'{expression}' cannot be read; write as nees[ekf, body] < 2") from None
+        raise BadInput(f"'{expression}' cannot be read; write for example nees[ekf, body] < 2") from None
     for node in ast.walk(tree):
         if type(node) not in _KNOWN:
             raise BadInput(
-                f"'{expression}': has more than numbers, names, metrics, + - * / **, comparisons, and, "
-                "or, not and functions; leave it out"
+                f"'{expression}': only numbers, names, metrics, + - * / **, comparisons, and, or, not "
+                f"and "
+                "functions are allowed; remove the rest"
             )
         if isinstance(node, ast.Call):
             called = getattr(node.func, "id", "")
@@ -233,7 +236,7 @@ def value_of(node: ast.expr, values: Values) -> Value:
     """Evaluate a part of an expression."""
     match node:
         case ast.Constant(value=bool()):
-            raise BadInput("true and false are no numbers; compare numbers")
+            raise BadInput("true and false are not numbers; compare numbers")
         case ast.Constant(value=int() | float() as number):
             return exactly(number)
         case ast.Name(id=name):
@@ -268,7 +271,7 @@ def value_of(node: ast.expr, values: Values) -> Value:
             return found[0] if len(found) == 1 else by_entry(lambda *each: all_hold(list(each)), *found)
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return FUNCTIONS[name](*(value_of(each, values) for each in arguments))
-    raise BadInput(f"'{ast.unparse(node)}' is no expression of metrics")
+    raise BadInput(f"'{ast.unparse(node)}' is not an expression of metrics")
 
 
 def metric(quantity: str, of: str, values: Values) -> Value:

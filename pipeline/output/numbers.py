@@ -31,7 +31,7 @@ def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
     if not lengths:
         return function(*arguments)
     if len(lengths) > 1:
-        raise BadInput(f"lists of {' and '.join(map(str, sorted(lengths)))} entries do not go together")
+        raise BadInput(f"lists of {' and '.join(map(str, sorted(lengths)))} entries cannot be combined")
     [length] = lengths
     columns = (each if isinstance(each, list) else [each] * length for each in arguments)
     return [by_entry(function, *each) for each in zip(*columns, strict=True)]
@@ -59,7 +59,7 @@ def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Inter
 
     def found(one: Interval, other: Interval) -> Truth:
         if not (isinstance(one, Interval) and isinstance(other, Interval)):
-            raise BadInput("a comparison is of numbers; join comparisons by and, or")
+            raise BadInput("only numbers can be compared; join comparisons with and, or")
         return compare(one, other) if one.is_known and other.is_known else "missing"
 
     return found

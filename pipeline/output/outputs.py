@@ -44,7 +44,7 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
     for named, kind in outputs:
         path = settled(named)
         if path.suffix.lower() != kind.suffix:
-            raise BadInput(f"{path}: this is to be {kind.what}; give a name that ends in {kind.suffix}")
+            raise BadInput(f"{path}: the output is {kind.what}; give a name that ends in {kind.suffix}")
         _refuse_link(path)
         if _identity(path) in taken:
             raise BadInput(f"{path}: would replace the {taken[_identity(path)]}; give another name")
@@ -122,7 +122,7 @@ def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) ->
     names = [name for name in dict.fromkeys([*old, *new]) if old.get(name) != new.get(name)]
     facts = [f"{name} = {_shown(old, name)}, now {_shown(new, name)}" for name in names[:MOST_SETTINGS]]
     more = f"; and {len(names) - MOST_SETTINGS} more" if len(names) > MOST_SETTINGS else ""
-    return f"{path}: replaced one of other settings: {'; '.join(facts)}{more}" if facts else ""
+    return f"{path}: replaced a log with other settings: {'; '.join(facts)}{more}" if facts else ""
 
 
 def _settings_of(run: RunMetadata) -> dict[str, str]:
@@ -136,7 +136,7 @@ def _settings_of(run: RunMetadata) -> dict[str, str]:
 
 
 def _shown(settings: Mapping[str, str], name: str) -> str:
-    return shorten(settings.get(name, "not there"), 60)
+    return shorten(settings.get(name, "not set"), 60)
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
@@ -230,7 +230,7 @@ def _is_report(path: Path) -> bool:
 MAPPING = Kind(".toml", "a mapping that may be replaced", lambda _: False)
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
-ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)
-TIMELINE = Kind(".rrd", "a timeline of fuselog", _is_timeline)
-PICTURE = Kind(".png", "a picture that fuselog took", _is_picture)
-REPORT = Kind(".html", "a report of fuselog", _is_report)
+ESTIMATES = Kind(".mcap", "an estimates log that fuselog wrote", _holds_estimates)
+TIMELINE = Kind(".rrd", "a timeline that fuselog wrote", _is_timeline)
+PICTURE = Kind(".png", "a screenshot that fuselog took", _is_picture)
+REPORT = Kind(".html", "a report that fuselog wrote", _is_report)

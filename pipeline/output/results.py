@@ -249,8 +249,9 @@ def require_ours(found: Path, place: Path) -> None:
     values = parse_json((found / RESULT_FILE).read_text(encoding="utf-8"))
     if _digest(values) != result.files.get(RESULT_FILE):
         raise BadInput(
-            f"{place / RESULT_FILE}: was changed since fuselog wrote it, or an older version wrote it; "
-            "give another --out"
+            f"{place / RESULT_FILE}: was changed after fuselog wrote it, or was written by an older "
+            f"version; "
+            "give another folder with --out"
         )
     expected = {Path(name): digest for name, digest in result.files.items()}
     parents = {parent for name in expected for parent in name.parents}
@@ -263,7 +264,7 @@ def require_ours(found: Path, place: Path) -> None:
             and name != Path(RESULT_FILE)
             and expected[name] not in (None, hash_of(path))
         ):
-            what = "was changed since fuselog wrote it"
+            what = "was changed after fuselog wrote it"
         else:
             continue
         raise BadInput(f"{place / name}: {what}; move it away, or give another folder with --out")

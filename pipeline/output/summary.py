@@ -121,7 +121,7 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     runs = int(table["runs"].max())
     what = f"{case or 'errors'}, {'1 run' if runs == 1 else f'over all {runs} runs together'}"
     panels = [*rmse, *nees]
-    title = f"{what}; tinted: where 95 % lie if the estimator's covariance is right"
+    title = f"{what}; tinted: 95 % range if the estimator's covariance is right"
     return Chart(title=title, panels=panels, columns=max(1, min(len(rmse), MOST_COLUMNS)), legend=False)
 
 
@@ -190,7 +190,7 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
         curve(str(name), rows["elapsed_s"], rows["effective_share"])
         for name, rows in effective.groupby("estimator", sort=False)
     ]
-    title = f"{case or 'particles'}, share of the particles that is effective"
+    title = f"{case or 'particles'}, effective share of the particles"
     return Chart(title=title, panels=[Panel(x=x, y=y, series=series)])
 
 
@@ -217,9 +217,9 @@ def late_chart(late: pd.DataFrame, case: str) -> Chart:
         ]
         captions = [
             f"{each.messages} {each.became}"
-            + (f", {each.repeated:.0f} used again for them" if each.became == INSERTED else "")
+            + (f", {each.repeated:.0f} reprocessed for them" if each.became == INSERTED else "")
             for each in counts[counts["estimator"] == name].itertuples()
         ]
         x, y = Axis(label="time (s)"), Axis(label="mean delay (s)")
         panels.append(Panel(x=x, y=y, series=series, title=f"{name}: {'; '.join(captions)}"))
-    return Chart(title=f"{case or 'messages'}, messages that came late", panels=panels)
+    return Chart(title=f"{case or 'messages'}, out-of-sequence messages", panels=panels)

@@ -234,7 +234,7 @@ def print_metrics(
     if runs is not None and {"run", "nees"} <= {*runs} and 1 < runs["run"].nunique() < FEWEST_RUNS:
         say(f"nees: no interval of its mean over the runs: {too_few(runs['run'].nunique())}")
     if has_many_cases(metrics):
-        say(f"each of the {_number_of_cases(metrics)} cases by itself: {details}")
+        say(f"each of the {_number_of_cases(metrics)} cases separately: {details}")
 
 
 def tables_of(
@@ -273,7 +273,7 @@ def _over_cases(tables: Sequence[MetricTable]) -> PrintedTable:
         for quantity, of in found.items()
         if of
     ]
-    title = f"{len(tables)} cases: the median of those that have it, and from the least to the greatest"
+    title = f"{len(tables)} cases: median over the cases that have the metric (minimum to maximum)"
     return PrintedTable(title, ["", *estimators], rows)
 
 
@@ -332,7 +332,7 @@ def print_others(alarms: Sequence[Finding]) -> None:
     for alarm in alarms[1:MOST_ALARMS]:
         say(f"also doubtful: {alarm.sentence}")
     if len(alarms) > MOST_ALARMS:
-        say(f"and {len(alarms) - MOST_ALARMS} more, which --json lists")
+        say(f"and {len(alarms) - MOST_ALARMS} more; --json lists them all")
 
 
 def print_claims(claims: Sequence[Claim]) -> None:
@@ -340,8 +340,9 @@ def print_claims(claims: Sequence[Claim]) -> None:
     elsewhere = sum(claim.verdict == Claimed.NO_VERDICT for claim in claims)
     if elsewhere:
         say(
-            f"{elsewhere} of {len(claims)} claims are made of another recording than these data: their "
-            "numbers follow, and no verdict"
+            f"{elsewhere} of {len(claims)} claims are about another recording: their numbers follow, "
+            f"without "
+            "a verdict"
         )
     for claim in claims:
         say(f"{claim.verdict}: {claim.claim}")

@@ -43,74 +43,72 @@ QUANTITIES: dict[str, Quantity] = {
     ),
     "gospa_m": Quantity(
         "GOSPA",
-        "Distances to the targets that were found, and a penalty for missed and false ones.",
+        "Distances to the detected targets, and a penalty for missed and false ones.",
         TRACKING,
         "m",
     ),
-    "hota": Quantity(
-        "HOTA", "How well targets are found and kept apart, together; 1 is best.", TRACKING
-    ),
-    "idf1": Quantity("IDF1", "Share of time with the right identity; 1 is best.", TRACKING),
+    "hota": Quantity("HOTA", "Detection and association accuracy combined; 1 is best.", TRACKING),
+    "idf1": Quantity("IDF1", "Share of detections with the correct identity; 1 is best.", TRACKING),
     "referenced_hota": Quantity(
         "HOTA near known targets",
-        "As HOTA, without tracks that never come near a target with a truth.",
+        "HOTA without tracks that never come near a target with a truth.",
         TRACKING,
     ),
     "referenced_idf1": Quantity(
         "IDF1 near known targets",
-        "As IDF1, without tracks that never come near a target with a truth.",
+        "IDF1 without tracks that never come near a target with a truth.",
         TRACKING,
     ),
     "missed_targets": Quantity(
-        "missed targets at a time", "Targets without a track, mean over time.", TRACKING
+        "missed targets on average", "Number of targets without a track, mean over time.", TRACKING
     ),
     "false_targets": Quantity(
-        "false targets at a time", "Tracks without a target, mean over time.", TRACKING
+        "false targets on average", "Number of tracks without a target, mean over time.", TRACKING
     ),
-    "switches": Quantity("switches of identity a run", "A track goes over to another target.", TRACKING),
-    "breaks": Quantity("breaks of tracks a run", "A target is lost, and found again.", TRACKING),
+    "switches": Quantity("identity switches per run", "A track switches to another target.", TRACKING),
+    "breaks": Quantity("track breaks per run", "A target is lost and found again.", TRACKING),
     "total_error_m": Quantity(
-        "error of all targets, summed", "Distances to the truths, summed.", TRACKING, "m"
+        "summed error of all targets", "Distances to the truths, summed.", TRACKING, "m"
     ),
     "heading_rmse_rad": Quantity(
         "heading error, RMS", f"Angle to the true heading. {_RMS}", ACCURACY, "rad"
     ),
     "nees": Quantity(
-        "NEES", "Squared errors over the variances that the estimator claims.", CONSISTENCY
+        "NEES", "Squared errors, normalised by the covariance that the estimator claims.", CONSISTENCY
     ),
-    "position_nees": Quantity("NEES of the position", "As NEES, of the position alone.", CONSISTENCY),
+    "position_nees": Quantity("NEES of the position", "NEES of the position only.", CONSISTENCY),
     "nees_steps_within_95": Quantity(
         "steps with NEES in its interval",
-        "Share of steps at which the mean over the runs is where 95 % should be.",
+        "Share of steps at which the mean NEES over the runs is in its 95 % interval.",
         CONSISTENCY,
         "share",
         "95 %",
     ),
     "nis_per_component": Quantity(
         "NIS per component",
-        "Squared innovations over the variances that the filter expects.",
+        "Squared innovations, normalised by the covariance that the filter predicts.",
         CONSISTENCY,
         "",
         "1",
     ),
     "log_likelihood": Quantity(
         "log-likelihood per run",
-        "How probable the measurements were to the filter; higher is better.",
+        "How probable the filter predicted the measurements to be; higher is better.",
         CONSISTENCY,
     ),
     "gated_share": Quantity(
-        "measurements gated out", "Share of measurements that a gate kept out.", COST, "share"
+        "measurements gated out", "Share of measurements that a gate rejected.", COST, "share"
     ),
-    "failed_runs": Quantity("failed runs", "Runs that the estimator could not follow to the end.", COST),
+    "failed_runs": Quantity("failed runs", "Runs that the estimator did not complete.", COST),
     "estimated_share": Quantity(
-        "share of the time estimated", "Of the time that a run spans.", COST, "share"
+        "share of the time estimated", "Share of the duration of a run.", COST, "share"
     ),
     "estimates_without_truth": Quantity(
-        "estimates without truth", "At times at which the log has no truth.", COST
+        "estimates without truth", "Estimates at times without truth in the log.", COST
     ),
-    "skipped_measurements": Quantity("measurements skipped", "Measurements that came to nothing.", COST),
+    "skipped_measurements": Quantity("measurements skipped", "Measurements that had no effect.", COST),
     "estimate_age_s": Quantity(
-        "age of an estimate", "From its stamp to when it could be given.", COST, "s"
+        "age of an estimate", "Time from the stamp of an estimate until it was available.", COST, "s"
     ),
 }
 LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "localisation_m2")

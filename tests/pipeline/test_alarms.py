@@ -68,7 +68,7 @@ def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -
         ("uninformed", "lrkf"),
     ]
     assert found[0].sentence.startswith(
-        "ukf: half_x_m, half_y_m keep their start and prior uncertainty: no"
+        "ukf: half_x_m, half_y_m keep their initial value and prior uncertainty: no"
     )
     [biased, *_] = replay(record("moving-los", seed=1, duration_s=10.0), ["ekf"]).alarms
     assert biased.kind == "errors"
@@ -84,7 +84,7 @@ def test_the_worst_is_said_first(
     path, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
     write_log(path, log.streams.values(), log.run)
     wrong = ["--set", "sigma_range_m=1e-4"]
-    words = "doubtful: ekf robot1: the gate keeps out 9"
+    words = "doubtful: ekf robot1: the gate rejects 9"
     commands = {
         "replay": ["replay", path, "-e", "ekf", *wrong, "-o", estimates],
         "evaluate": ["evaluate", estimates],
@@ -103,7 +103,7 @@ def test_the_worst_is_said_first(
         assert worst["excess"] > 1000
     page = tmp_path / "page.html"
     assert fuselog("report", tmp_path / "result", "-o", page).code == 0
-    assert "<li>ekf robot1: the gate keeps out 9" in page.read_text(encoding="utf-8")
+    assert "<li>ekf robot1: the gate rejects 9" in page.read_text(encoding="utf-8")
     assert "<li>ekf robot1: NEES is" in page.read_text(encoding="utf-8")
     done = replay(log, "ekf", set={"sigma_range_m": 1e-4})
     assert done.alarms[0].sentence in repr(done)
@@ -132,7 +132,7 @@ def test_an_aligned_estimate_has_no_other_origin(
     write_log(tmp_path / "run.mcap", moved.streams.values(), moved.run)
     fuselog("replay", tmp_path / "run.mcap", "-e", "ekf", "-o", tmp_path / "est.mcap")
     said = fuselog("evaluate", tmp_path / "est.mcap")
-    assert "other origins: fuselog evaluate --align se2" in said.out.splitlines()[0]
+    assert "different origins: try fuselog evaluate --align se2" in said.out.splitlines()[0]
     assert "doubtful" not in fuselog("evaluate", tmp_path / "est.mcap", "--align", "se2").out
 
 
@@ -150,8 +150,8 @@ def test_measurements_before_a_late_prior_are_counted(log: MemorySource) -> None
 def test_a_likelihood_of_nothing(log: MemorySource) -> None:
     far = replace(log[PRIOR], columns={**log[PRIOR].columns, "mean": log[PRIOR]["mean"] + 100.0})
     worst = replay(_with(log, far), "ekf").alarms[0]
-    assert "the gate keeps out 100 % of" in worst.sentence
-    assert "its log-likelihood is that of no measurement" in worst.sentence
+    assert "the gate rejects 100 % of" in worst.sentence
+    assert "its log-likelihood includes no measurement" in worst.sentence
 
 
 def test_gates_that_differ(log: MemorySource) -> None:
@@ -165,5 +165,5 @@ def test_a_minimum_that_is_not_the_least(log: MemorySource) -> None:
     """By the cost itself, whose residuals leave about half a unit for each measured number."""
     far = replay(log, "smoother:iterated", set={"start": "prior"})
     [alarm] = [each for each in far.alarms if each.kind == "minimum"]
-    assert "compare other starts, such as --set start=motion" in alarm.sentence
+    assert "try other starts, such as --set start=motion" in alarm.sentence
     assert alarm.value > 10.0

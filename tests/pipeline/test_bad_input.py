@@ -299,7 +299,10 @@ TABLE: dict[str, tuple[str, ...]] = {
     "evaluate garbled.toml --truth line.tum": ("garbled.toml", "line 1 is not a pose", "12 numbers"),
     "evaluate line.tum --truth line.tum --truth-format kitti": ("line 1 has 8 columns", "kitti"),
     "evaluate line.tum line.tum --truth line.tum": ("line.tum", "one trajectory", "at a time"),
-    "evaluate line.tum --truth line.tum --log log.mcap": ("--log", "--truth applies to trajectory files"),
+    "evaluate line.tum --truth line.tum --log log.mcap": (
+        "--log",
+        "--truth applies to trajectory files",
+    ),
     "evaluate line.tum --truth line.tum --align se3": (
         "line.tum",
         "not on one line",

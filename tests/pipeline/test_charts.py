@@ -90,7 +90,7 @@ def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
     judged = [(errors("ekf", *plane), ekf), (errors("bound", *plane, is_bound=True), bound)]
     chart = error_chart(judged, "robot1")
     assert chart.title == (
-        "robot1, over all 7 runs together; tinted: where 95 % lie if the estimator's covariance is right"
+        "robot1, over all 7 runs together; tinted: 95 % range if the estimator's covariance is right"
     )
     assert all(panel.y.log for panel in chart.panels)
     rmse = {
@@ -138,7 +138,7 @@ def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:
     chart = effective_chart(shares, "")
     own = {name: [TIMES, each["probability"]] for name, each in shares.groupby("estimator")}
     same(held(chart), {"effective share over time (s)": own})
-    assert chart.title == "particles, share of the particles that is effective"
+    assert chart.title == "particles, effective share of the particles"
     late = pd.DataFrame(
         {
             "estimator": ["ekf", "ekf", "ukf"],
@@ -152,7 +152,7 @@ def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:
     )
     delay = "mean delay (s) over time (s)"
     wanted = {
-        f"ekf: 2 inserted, 10 used again for them; 3 dropped: {delay}": {
+        f"ekf: 2 inserted, 10 reprocessed for them; 3 dropped: {delay}": {
             "inserted": [[1.0], [0.1]],
             "dropped": [[2.0], [0.2]],
         },

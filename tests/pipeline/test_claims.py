@@ -227,7 +227,7 @@ def test_few_runs_decide_by_intervals_or_by_a_stated_number_of_runs(
         return found
 
     assert decided(3).verdict == verdict
-    assert ("of 3 runs; without an interval it is decided from 20 on" in decided(3).why) == (
+    assert ("only 3 runs; without an interval, a verdict needs at least 20" in decided(3).why) == (
         verdict == "inconclusive"
     )
     assert (decided(20).verdict == verdict) == (verdict != "inconclusive")
@@ -241,7 +241,7 @@ def test_few_runs_decide_by_intervals_or_by_a_stated_number_of_runs(
             r"experiment mine.toml: .*claim 's': 'rmse_m\[ekf\] <' cannot be read",
         ),
         ({"holds": "open('x') < 1"}, "no function 'open'"),
-        ({"holds": "runs.__class__ < 1"}, "has more than numbers, names"),
+        ({"holds": "runs.__class__ < 1"}, "only numbers, names"),
         ({"ours": "{rmse_m[ekf]"}, "braces"),
         ({"hold": "1 < 2"}, "no parameter 'claims.0.hold'; did you mean 'holds'"),
     ],
@@ -305,7 +305,7 @@ def test_a_claim_has_no_verdict_on_another_recording() -> None:
     confirmed, none = "confirmed", "no verdict"
     assert [each.verdict for each in found] == [none, none, confirmed, confirmed, none]
     assert {each.ours for each in found} == {"0.5 m"}
-    assert found[0].why == "claimed of first, not of these data"
+    assert found[0].why == "claimed for first, not for these data"
     lost = claim(value="rmse_m[nobody]", holds="value < 1")
     assert decide([lost], METRICS, {}, {}, {"first": False})[0].verdict == none
     require_recordings(stated[:4], {"first", "second"}, "experiment x")

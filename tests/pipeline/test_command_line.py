@@ -944,10 +944,10 @@ def test_a_log_that_is_replaced_by_one_of_other_settings_is_named(
     replay = ("replay", "a.mcap", "--set", "sigma_range_m=0.3", "-e")
     assert fuselog(*record, "1").err == fuselog(*record, "1").err == ""
     assert fuselog(*record, "2").err == (
-        "fuselog: a.mcap: replaced one of other settings: seed = 1, now 2\n"
+        "fuselog: a.mcap: replaced a log with other settings: seed = 1, now 2\n"
     )
     assert "replaced" not in fuselog(*replay, "ekf").err + fuselog(*replay, "ekf").err
     assert (
-        'a.estimates.mcap: replaced one of other settings: estimators = ["ekf"], now ["ekf", "ukf"]; '
-        'ukf = not there, now {"sigma_range_m": 0.3}'
+        'a.estimates.mcap: replaced a log with other settings: estimators = ["ekf"], now ["ekf", "ukf"];'
+        ' ukf = not set, now {"sigma_range_m": 0.3}'
     ) in fuselog(*replay, "ekf", "-e", "ukf").err

@@ -176,8 +176,8 @@ def test_a_page_has_neither_nan_nor_inf_and_says_why_cells_are_empty(tmp_path: P
     for note in empty_cells(table):
         assert note in page
     assert empty_cells(table) == [
-        "2 cells without a value: they have nothing to be computed from.",
-        "1 cell without a value: their value is infinite.",
+        "2 cells without a value: no input data.",
+        "1 cell without a value: the result is infinite.",
     ]
     assert format_value([1.0, math.nan]) == "1 \u2013"
 

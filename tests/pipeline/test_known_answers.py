@@ -234,7 +234,7 @@ def test_charts_have_each_estimators_numbers_on_the_axis_that_names_them(
     panels = chart(result[0], "late-car")["panels"]
     assert [each["title"] for each in panels] == [
         "one: 18 dropped",
-        "two: 12 inserted, 48 used again for them",
+        "two: 12 inserted, 48 reprocessed for them",
     ]
     for panel, delays in zip(panels, known.LATE_S.values(), strict=True):
         assert panel["y"]["label"] == "mean delay (s)"

@@ -218,7 +218,9 @@ def test_a_page_with_notes_stays(here: Path, before: Path) -> None:
     _place_ours(before, "report --out", Path("out.html"))
     page = Path("out.html")
     page.write_text(page.read_text().replace("<main>", "<p>mine</p><main>"))
-    _check_refusal(_run(COMMANDS["report --out"], page), here, _state(here), "a report of fuselog")
+    _check_refusal(
+        _run(COMMANDS["report --out"], page), here, _state(here), "a report that fuselog wrote"
+    )
 
 
 @pytest.mark.parametrize(

@@ -196,7 +196,7 @@ def test_metrics_have_the_order_of_e_and_their_bounds(
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [text for text in page.texts["th"] if text in ("ukf", "dead-reckoning", "ekf")]
     assert names[:3] == ["ekf", "ukf", "dead-reckoning"]  # whom to take comes first
-    told = "a consistent estimator lies from 0.216 to 9.35"
+    told = "for a consistent estimator 0.216 to 9.35"
     assert told in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -235,7 +235,7 @@ def test_what_estimators_of_tracks_are_compared_by_is_told(
     begun: Any = SimpleNamespace(found=SimpleNamespace(main=main, compared=compared))
     told = _legend(begun)
     assert told.startswith(words)
-    assert told.endswith("Less is better.") == bool(told) == bool(words)
+    assert told.endswith("Lower is better.") == bool(told) == bool(words)
 
 
 def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) -> None:
@@ -277,14 +277,16 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
         "Standard deviation of a range (ekf.sigma_range_m) from 0.05 to 0.2 m: 3 points, 2 runs of "
         "landmarks at each"
     )
-    assert re.search(r"ekf errs least with standard deviation of a range = 0\.[\d]+ m\.", came)
+    assert re.search(
+        r"ekf has its smallest error with standard deviation of a range = 0\.[\d]+ m\.", came
+    )
     assert "dead-reckoning and ukf do not depend on it." in came
     write_report([compare, sweep], tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h1"] == ["2 results"]
     titles = [chart["title"] for chart in page.charts]
     forest, scene, lens = titles[:3]  # several logs, and estimates that the folder does not keep
-    assert forest.startswith("Every difference in percent")
+    assert forest.startswith("Differences in percent")
     assert scene.startswith("robot1, first run from above")
     assert lens.startswith("Lens: 1 s of the first run")
     axes = {panel["x"]["label"] for chart in page.charts for panel in chart["panels"]}
@@ -597,7 +599,7 @@ def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figur
         assert apart.max() < 1e-6  # seven digits are in the page
         spread = np.sqrt(pose["covariance"].reshape(-1, 3, 3)[row, 0, 0])
         assert abs(points[:, 0].mean() - pose["mean"][row, 0]) < 0.2 * spread
-    [shares] = [each for each in charts if "that is effective" in each["title"]]
+    [shares] = [each for each in charts if "effective share of" in each["title"]]
     [curve] = shares["panels"][0]["series"]
     np.testing.assert_allclose(curve["y"], effective["effective"] / 50, rtol=1e-6)
 

@@ -80,7 +80,8 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
     assert told.doubts == ["the covariances of c, which are too small"]
     [difference] = told.differences
     assert re.match(
-        r"c errs 0\.98\d m more than [ab] in the mean over runs \(95 % 0\.9\d+ to 1\.0\d m\)\.",
+        r"The error of c is 0\.98\d m larger than that of [ab], in the mean over runs \(95 % 0\.9\d+ "
+        r"to 1\.0\d m\)\.",
         difference,
     )
 
@@ -91,7 +92,7 @@ def test_a_run_that_dominates_the_mean_nees_is_named() -> None:
     bad = {"position_rmse_m": errors, "nees": [2.0, 4.0, 400.0, 2.5, 3.5]}
     told = _told({"bad": bad, "good": {"position_rmse_m": errors, "nees": [3.0] * 5}})
     notes = {card.estimator: " ".join(card.notes) for card in told.cards}
-    assert "Mean NEES: run 2 dominates it with 400: without that run 3." in notes["bad"]
+    assert "Mean NEES: run 2 dominates it with 400; the others average 3." in notes["bad"]
     assert "dominates" not in notes["good"]
     assert [dominating(np.array(each)) for each in ([1.0, 9.0], [9.0, 4.0, 5.0], [9.0, 4.0, 4.9])] == [
         None,
@@ -173,7 +174,7 @@ def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
     assert [card.chip for card in told.cards] == ["As good as a", "As accurate as b, but conservative"]
     runs["b"]["nees"] = runs["a"]["nees"]
     told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
-    advice = "take either, but mend its covariance, which is too large."
+    advice = "take either, but reduce its covariance, which is too large."
     assert told.verdict[0].endswith(f" tie in position error: {advice}")
 
 
@@ -189,8 +190,8 @@ def test_a_comparison_says_of_whom_it_counts_the_metrics_that_differ() -> None:
 @pytest.mark.parametrize(
     ("seconds", "take"),
     [
-        ((0.03, 0.04), "take either; a needs 0.75 times the time of b."),
-        ((0.04, 0.03), "take either; b needs 0.75 times the time of a."),
+        ((0.03, 0.04), "take either; a takes 0.75 times as long as b."),
+        ((0.04, 0.03), "take either; b takes 0.75 times as long as a."),
         ((0.038, 0.04), "take either."),
         ((0.003, 0.004), "take either."),
     ],
@@ -225,12 +226,13 @@ def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure
     }
     bounds = {f"{label}.nees": HONEST for label in "ab"}
     told = _told(runs, bounds)
-    assert told.verdict == ["Take b: it has the least position error, 49.7 cm."]
-    assert told.cards[0].notes == ["Least error in each of the 20 runs."]
+    assert told.verdict == ["Take b: it has the smallest position error, 49.7 cm."]
+    assert told.cards[0].notes == ["Smallest error in each of the 20 runs."]
     runs["b"]["nees"] = list(48.0 + NOISE[2])
     assert _told(runs, bounds).verdict == [
-        "b errs least, 49.7 cm, but mend it before you believe its covariance; of the others a errs "
-        "least, 99.4 cm.",
+        "b has the smallest error, 49.7 cm, but fix its covariance before you rely on it; of the "
+        "others, "
+        "a has the smallest error, 99.4 cm.",
         "b is overconfident: its errors are 4 times what it states.",
     ]
 
@@ -238,7 +240,7 @@ def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure
 def test_the_story_of_one_run_leaves_chance_open() -> None:
     """Neither a winner beyond chance nor an interval; and a few hundredths of NEES are no fault."""
     told = _told({"a": {"position_rmse_m": [1.0]}, "b": {"position_rmse_m": [0.5]}})
-    assert told.verdict[0].endswith("on this run, 0.500 m; whether by chance, 5 runs or more tell.")
+    assert told.verdict[0].endswith("on this run, 0.500 m; to rule out chance, use 5 or more runs.")
     assert not told.draws + told.differences
     many = {"a": {"position_rmse_m": [1.0] * 2000, "nees": [3.15] * 2000}}
     nearly = _told(many, {"a.nees": (2.894, 3.108)})
@@ -315,17 +317,17 @@ def test_trackers_with_claims_are_told_whom_to_take_over_cases_that_are_cases() 
     begun = opening(result, {"runs": _rows(GOSPA)})
     assert [table.case for table in begun.found.tables] == ["clutter-0", "clutter-1", "clutter-2"]
     first, claims = begun.story.verdict
-    assert first == "Take pmbm: it has the least GOSPA, 3 m (mean of 3 cases)."
+    assert first == "Take pmbm: it has the smallest GOSPA, 3 m (mean of 3 cases)."
     assert claims == "1 of 4 claims confirmed; 3 refuted."
     assert [card.estimator for card in begun.story.cards] == ["pmbm", "jpda", "nearest", "Claims"]
     best, *_, last = begun.story.cards
     assert best.notes[:3] == [
-        "Targets at a time: 1.5 missed.",
-        "Switches of identity: 3 a run.",
+        "Targets on average: 1.5 missed.",
+        "Identity switches: 3 per run.",
         "Least in 3 of 3 cases.",
     ]
     assert last.notes == [f"Refuted: {LONG}"] * 2 + ["1 more is refuted; the table has all claims."]
-    assert begun.story.doubts == ["the covariances of all 3, which nothing here judges"]
+    assert begun.story.doubts == ["the covariances of all 3, which were not judged"]
     table = table_of_pairs(begun.found)
     assert list(table) == ["estimator", "has more than", "of", "clutter-0", "clutter-1", "clutter-2"]
     assert table.iloc[0].tolist()[:4] == [
@@ -346,9 +348,11 @@ def test_who_is_best_on_average_alone_is_doubtful() -> None:
     }
     begun = opening(result.model_copy(update={"metrics": metrics}), {})
     assert begun.story.doubts == [
-        "that pmbm is best everywhere, as in 1 of 3 cases another one has the least GOSPA (jpda in 1)",
-        "whether differences are chance, as the result has no table of the GOSPA of single runs",
-        "the covariances of all 3, which nothing here judges",
+        "that pmbm is best everywhere, because in 1 of 3 cases another estimator has the smallest "
+        "GOSPA (jpda in 1)",
+        "whether differences are due to chance, because the result has no table of the GOSPA of "
+        "individual runs",
+        "the covariances of all 3, which were not judged",
     ]
 
 
@@ -386,7 +390,7 @@ def test_of_a_study_nobody_is_taken_for_an_error_that_others_have_not() -> None:
     told = opening(both, {}).story
     assert told.verdict[0].startswith("Take a: ")
     assert [card.estimator for card in told.cards] == ["a", "b", "Claims"]
-    assert "the covariances of a, which nothing here judges" in told.doubts
+    assert "the covariances of a, which were not judged" in told.doubts
 
 
 def test_what_the_checks_of_a_replay_find_is_doubtful_in_words() -> None:
@@ -398,10 +402,10 @@ def test_what_the_checks_of_a_replay_find_is_doubtful_in_words() -> None:
         Finding("unused", "b", "", 2.0, "..."),
     ]
     assert _told(rows, alarms=alarms).doubts == [
-        "the error of a, most of which is constant: truth and estimate may have other origins",
-        "b, as measurements came to nothing",
-        "who is better, as 2 runs do not tell differences from chance",
-        "the covariances of both, which nothing here judges",
+        "the error of a, which is mostly constant: truth and estimate may have different origins",
+        "b, because measurements were not used",
+        "which one is better, because 2 runs do not distinguish differences from chance",
+        "the covariances of both, which were not judged",
     ]
 
 
@@ -440,8 +444,9 @@ def test_headings_say_what_a_parameter_means() -> None:
     row = {"parameter": "sigma_range_m", "start": 1.0, "value": 0.1, "low": 0.09, "high": 0.11}
     [sentence] = opening(tuned, {"parameters": pd.DataFrame([row])}).story.verdict
     assert sentence == (
-        "The standard deviation of a range (sigma_range_m) is likeliest 0.100 m (95 % 0.0900 to 0.110), "
-        "where the search began at 1."
+        "The standard deviation of a range (sigma_range_m) is estimated at 0.100 m (95 % 0.0900 to "
+        "0.110); "
+        "the search started at 1."
     )
 
 
@@ -487,8 +492,10 @@ def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -
         "Standard deviation of a range (ekf.sigma_range_m) from 0.05 to 0.4 m: 4 points, 20 runs"
     )
     first, where, still = begun.story.verdict
-    assert re.fullmatch(r"Take ekf: it has the least position error, [\d.]+ cm\.", first)
-    assert re.fullmatch(r"ekf errs least with standard deviation of a range = 0\.[12] m\.", where)
+    assert re.fullmatch(r"Take ekf: it has the smallest position error, [\d.]+ cm\.", first)
+    assert re.fullmatch(
+        r"ekf has its smallest error with standard deviation of a range = 0\.[12] m\.", where
+    )
     assert still == "ukf does not depend on it."
     ekf, ukf = begun.story.cards
     assert (ekf.chip, ukf.chip) == ("Take this one", "Consistent, less accurate")
@@ -504,10 +511,13 @@ def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -
 def test_a_sweep_takes_no_point_at_which_the_estimator_is_overconfident() -> None:
     """It errs least at the first point, and states a third of that error; the best left is the last."""
     begun = opening(*_swept([0.3, 0.9, 0.8, 0.5], nees=(27.0, 3.0, 3.0, 3.0)))
-    assert begun.story.verdict[1] == "ekf errs least with standard deviation of a range = 0.4 m."
+    assert (
+        begun.story.verdict[1]
+        == "ekf has its smallest error with standard deviation of a range = 0.4 m."
+    )
     assert begun.story.doubts == [
         "ekf at 0.05 m, where it is overconfident",
-        "whether ekf errs less beyond 0.4 m, where the range ends",
+        "whether the error of ekf is smaller beyond 0.4 m, where the range ends",
     ]
 
 
@@ -517,7 +527,9 @@ def test_a_sweep_of_estimators_that_are_all_too_sure_says_where_none_is_believed
     table = tables["sweep"]
     table.loc[table["quantity"] == "nees", "value"] = 27.0
     verdict = opening(result, tables).story.verdict
-    assert verdict[0] == "Where each errs least, none of them can be believed."
+    assert (
+        verdict[0] == "Even at the point with its smallest error, none of the estimators can be trusted."
+    )
     assert title_of(result, ["ekf", "ukf"], 20) == "x, swept"
     of_logs = result.model_copy(update={"settings": {**result.settings, "logs": {"files": []}}})
     assert title_of(of_logs, ["ekf", "ukf"], 20) == "x: ekf and ukf, swept"
@@ -527,12 +539,13 @@ def test_where_the_scenario_is_swept_no_point_is_advised() -> None:
     """Nobody chooses how many robots there are: the points are cases."""
     begun = opening(*_swept([0.5, 0.5, 0.5, 1.9], key="robots"))
     assert begun.story.verdict == [
-        "Take ukf: it has the least position error, 0.997 m (RMS of 4 cases)."
+        "Take ukf: it has the smallest position error, 0.997 m (RMS of 4 cases)."
     ]
     assert begun.story.cards[0].estimator == "ukf"
     assert begun.story.cards[0].notes[0] == "Least in 1 of 4 cases."
     assert begun.story.doubts == [
-        "that ukf is best everywhere, as in 3 of 4 cases another one has the least position error "
+        "that ukf is best everywhere, because in 3 of 4 cases another estimator has the smallest "
+        "position error "
         "(ekf in 3)"
     ]
 

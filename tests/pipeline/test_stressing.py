@@ -520,7 +520,7 @@ def test_pages_withhold_what_stress_moves_further() -> None:
         said.append(opening(result, {"runs": runs}).story)
         assert "stress" in result.model_dump()
         assert "stress" not in result.model_copy(update={"stress": []}).model_dump()
-    assert said[0].verdict == said[1].verdict == ["Take a: it has the least position error, 1.03 m."]
+    assert said[0].verdict == said[1].verdict == ["Take a: it has the smallest position error, 1.03 m."]
     assert said[2].verdict[0].startswith("No verdict between a and b: changes that should not matter")
     assert "is withheld" in said[2].draws[0]
     assert said[1].differences

@@ -169,8 +169,8 @@ def empty_cells(table: pd.DataFrame) -> list[str]:
     cells = [value for row in table.itertuples(index=False) for value in row if not is_value(value)]
     infinite = sum(isinstance(value, float) and math.isinf(value) for value in cells)
     counts = {
-        "they have nothing to be computed from": len(cells) - infinite,
-        "their value is infinite": infinite,
+        "no input data": len(cells) - infinite,
+        "the result is infinite": infinite,
     }
     return [f"{count(of, 'cell')} without a value: {why}." for why, of in counts.items() if of]
 
@@ -239,7 +239,9 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         if len(table) <= LONGEST_TABLE and key not in ("summary", "runs", RUNS_TABLE)
     }
     if begun.found.pairs:
-        short["differences of pairs, 95 % over the runs"] = table_of_pairs(begun.found)
+        short["differences between pairs, with 95 % intervals over the runs"] = table_of_pairs(
+            begun.found
+        )
     keys = {split_metric(key)[1] for key in result.metrics} | {
         row.key for rows in (sheet.groups.values() if sheet else ()) for row in rows
     }
@@ -264,7 +266,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
 def _legend(begun: Opening) -> str:
     """Explain the quantity by which estimators are compared, if it is not a plain error."""
     by = quantity(begun.found.main) if begun.found.compared else None
-    return f"{by.name}: {by.meaning} Less is better." if by and by.group == TRACKING else ""
+    return f"{by.name}: {by.meaning} Lower is better." if by and by.group == TRACKING else ""
 
 
 def _timings(folder: Path, result: Result) -> Timings:
@@ -314,7 +316,7 @@ def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: b
     """Show the first run in space: as in the viewer, or from above with a magnified detail."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
-        return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
+        return [Shown("", "first run in the viewer", "The first run in the viewer", picture=address)]
     run = first_run(folder)
     if run is None:
         first = next((label for label in order if label in found.compared), "")

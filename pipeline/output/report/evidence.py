@@ -134,7 +134,11 @@ class Findings:
     def about_intervals(self) -> str:
         """Explain the table's intervals, or why it has none."""
         few = self.runs < FEWEST_RUNS
-        return f"No 95 % intervals: {too_few(self.runs)}." if few else "Small: 95 % over other runs."
+        return (
+            f"No 95 % intervals: {too_few(self.runs)}."
+            if few
+            else "Small print: 95 % intervals over runs."
+        )
 
     @cached_property
     def of(self) -> Mapping[str, Evidence]:

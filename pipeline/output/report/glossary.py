@@ -17,62 +17,66 @@ _WIKI = "https://en.wikipedia.org/wiki"
 _TERMS = {
     "rmse": Term(
         "RMS error",
-        "Root mean square: the typical distance from the truth. Large errors weigh more than small.",
+        "Root mean square: the typical distance from the truth. Large errors count more than small "
+        "ones.",
         f"{_WIKI}/Root_mean_square_deviation",
     ),
     "nees": Term(
         "NEES",
-        "Normalised estimation error squared: the true error over the one that the estimator claims, "
-        "squared and summed over the state's components. Their number is right; above, the estimator is "
-        "overconfident, below conservative.",
+        "Normalised estimation error squared: the squared error, normalised by the covariance that the "
+        "estimator claims. Its expected value is the number of components of the state; a larger value "
+        "means overconfident, a smaller one conservative.",
         f"{_WIKI}/Mahalanobis_distance",
     ),
     "nis": Term(
         "NIS",
-        "Normalised innovation squared: how far measurements lie from what the filter expected, over "
-        "what it allowed for. It needs no truth; 1 per component is right.",
+        "Normalised innovation squared: the squared difference between measured and predicted values, "
+        "normalised by the covariance that the filter predicts. It needs no truth; 1 per component is "
+        "right.",
         f"{_WIKI}/Innovation_(signal_processing)",
     ),
     "interval": Term(
         "95 % from ... to ...",
-        "Where the value lies with 95 % if other runs were made. A run is the unit: errors within one "
-        f"hang together. Fewer than {FEWEST_RUNS} runs have no interval.",
+        "The range that contains the true value with 95 % confidence. The unit is a run, because errors "
+        f"within a run are correlated. Fewer than {FEWEST_RUNS} runs give no interval.",
         f"{_WIKI}/Bootstrapping_(statistics)",
     ),
     "tie": Term(
         "Tie",
-        "Two estimators that cannot be told apart on these runs: chance explains the difference, or it "
-        "is less than 2 %. Take the simpler one, or make more runs.",
+        "Two estimators that cannot be distinguished with these runs: chance explains the difference, "
+        "or "
+        "it is less than 2 %. Take the simpler one, or make more runs.",
         f"{_WIKI}/Paired_difference_test",
     ),
     "likelihood": Term(
         "Log-likelihood",
-        "How probable the measurements were to the filter before it saw them. Higher is better; zero "
-        "means nothing.",
+        "The logarithm of the probability density that the filter assigned to the measurements before "
+        "using them. Higher is better; its absolute value has no meaning.",
         f"{_WIKI}/Likelihood_function",
     ),
     "gospa": Term(
         "GOSPA",
-        "Generalised optimal sub-pattern assignment: distances to the targets that were found, and a "
-        "penalty for each that was missed or is false. Less is better.",
+        "Generalised optimal sub-pattern assignment: the distances to the detected targets, plus a "
+        "penalty for each missed or false one. Lower is better.",
         "https://arxiv.org/abs/1601.05585",
     ),
     "hota": Term(
         "HOTA",
-        "Higher order tracking accuracy: how well targets are found, and how long each keeps its "
-        "identity, in one number. 1 is best.",
+        "Higher order tracking accuracy: combines how well targets are detected and how long each keeps "
+        "its identity. 1 is best.",
         "https://arxiv.org/abs/2009.07736",
     ),
     "idf1": Term(
         "IDF1",
-        "The share of detections that bear the right identity, missed and false ones counted; 1 is "
-        "best.",
+        "The share of detections with the correct identity, where missed and false ones count as "
+        "errors; 1 "
+        "is best.",
         "https://arxiv.org/abs/1609.01775",
     ),
     "gate": Term(
         "Gate",
-        "A filter leaves out a measurement that is too unlikely for it. Few are expected; many say that "
-        "its noise is stated too small, or the measurement is wrong.",
+        "A filter rejects measurements that are too unlikely. A few rejections are expected; many mean "
+        "that the measurement noise is understated or the measurements are wrong.",
         "https://stonesoup.readthedocs.io/en/latest/stonesoup.gater.html",
     ),
 }

@@ -45,7 +45,7 @@ MOST_CLAIMS = 2
 OF_CLAIMS: Mapping[Claimed, str] = {
     Claimed.CONFIRMED: "confirms {}",
     Claimed.REFUTED: "refutes {}",
-    Claimed.INCONCLUSIVE: "leaves {} to chance",
+    Claimed.INCONCLUSIVE: "leaves {} inconclusive",
     Claimed.NOT_REPRODUCIBLE: "cannot reproduce {}",
     Claimed.NO_VERDICT: "does not judge {}",
 }
@@ -80,7 +80,10 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     if result.made_by == "compare":
         return _of_comparison(result, tables)
     if result.made_by == "sweep":
-        return Opening(*story_of_sweep(result, tables), numbers_of="Each estimator where it errs least.")
+        return Opening(
+            *story_of_sweep(result, tables),
+            numbers_of="Each estimator at the point with its smallest error.",
+        )
     found = findings(result, tables)
     base = story(found, result.causes, timings, result.alarms)
     notes = [str(each) for each in result.settings.get("notes", [])]
@@ -100,7 +103,9 @@ def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
     """Write what was tried, and the outcome, for the terminal; `folder` is the result's folder."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
-    return begun.tried, " ".join(begun.story.verdict) or "No errors against a truth, and no claims."
+    return begun.tried, " ".join(
+        begun.story.verdict
+    ) or "There are no errors against a truth, and no claims."
 
 
 def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
@@ -151,7 +156,7 @@ def _with_claims(base: Story, result: Result) -> Story:
         are = "is" if more == 1 else "are"
         notes.append(f"{more} more {are} refuted; the table has all claims.")
     does = [text.format(counts[verdict]) for verdict, text in OF_CLAIMS.items() if counts[verdict]]
-    text = f"The experiment states {count(len(result.claims), 'sentence')}; this result {listed(does)}."
+    text = f"The experiment states {count(len(result.claims), 'claim')}; this result {listed(does)}."
     card = Card("Claims", "claims", "", "", consistency=text, notes=notes)
     cards = base.cards[: MOST_CARDS - 1]
     left_out = [each.estimator for each in base.cards[MOST_CARDS - 1 :]] + base.left_out
@@ -168,7 +173,7 @@ def claims_sentences(result: Result) -> list[str]:
     others = (Claimed.REFUTED, Claimed.INCONCLUSIVE, Claimed.NOT_REPRODUCIBLE)
     counted = [f"{counts[each]} {each}" for each in others if counts[each]]
     if counts[Claimed.NO_VERDICT]:
-        counted.append(f"{counts[Claimed.NO_VERDICT]} of another recording, without a verdict")
+        counted.append(f"{counts[Claimed.NO_VERDICT]} about another recording, without a verdict")
     return [f"{counts[Claimed.CONFIRMED]} of {of_all} confirmed; {listed(counted)}."]
 
 
@@ -188,13 +193,11 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
         low, high = row["low"], row["high"]
         known = math.isfinite(low) and math.isfinite(high)
         ends = f" (95 % {number(low)} to {number(high)})" if known else ", without an interval"
-        begun = (
-            "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
-        )
+        begun = "" if row["start"] == row["value"] else f"; the search started at {number(row['start'])}"
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
         unit = f" {sign}" if (sign := written(unit_of(row["parameter"]))) else ""
-        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{ends}{begun}.")
+        sentences.append(f"{what} is estimated at {number(row['value'])}{unit}{ends}{begun}.")
     return replace(base, verdict=[*sentences, *base.verdict])
 
 
@@ -212,9 +215,9 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():
-        summary = f"{runs} give no interval: whether the differences are chance is open."
+        summary = f"{runs} give no interval: the differences may be due to chance."
     else:
-        open_in = f"; in {unclear['quantity'].nunique()} they do not decide" if len(unclear) else ""
+        open_in = f"; {unclear['quantity'].nunique()} are inconclusive" if len(unclear) else ""
         summary = f"Over {runs} {how_many_differ(rows)} by more than chance and {margin}"
         summary += f"{open_in if differ.empty else ''}."
     also = [_difference_sentence(row) for row in differ.to_dict("records")]
@@ -225,7 +228,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     for (first, second), of in unclear.groupby(["first", "second"], sort=False):
         keys = dict.fromkeys(map(str, of["quantity"]))
         names = listed([quantity(key).name.removesuffix(", RMS") for key in keys])
-        doubts.append(f"whether {first} or {second} is better in {names}, which {runs} do not tell")
+        doubts.append(f"whether {first} or {second} is better in {names}, which {runs} do not decide")
     base = replace(base, verdict=[*base.verdict[:2], summary], doubts=[*base.doubts, *doubts])
     return Opening(tried, base, found, [*also, *notes], chart)
 
@@ -310,7 +313,7 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         least, most = min(*low, -100.0 * margin), max(*high, 100.0 * margin)
         room = 0.05 * float(most - least)
         x = Axis(
-            label=f"{second} less {first} (%)",
+            label=f"{second} minus {first} (%)",
             limits=(float(least) - room, float(most) + room),
         )
         edges = [
@@ -329,8 +332,8 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
             Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
         )
     title = (
-        "Every difference in percent of the first or of the aim, with 95 %; "
-        "between the dashed lines it does not matter"
+        "Differences in percent of the first estimator's value or of the aim, with 95 % intervals; "
+        "differences between the dashed lines do not matter"
     )
     return Chart(title=title, panels=panels, legend=False)
 

@@ -74,7 +74,7 @@ def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
         return f"{listed(list(labels))}, compared"
     if isinstance(settings.get("logs"), Mapping):
         title = f"{title}: {listed(list(labels)) or count(runs, 'run')}"
-    return f"{title}, swept" if result.made_by == "sweep" else title
+    return f"{title}, parameter sweep" if result.made_by == "sweep" else title
 
 
 def luminance(colour: str) -> float:
@@ -98,7 +98,7 @@ def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
         text = "#" + "".join(f"{each:02x}" for each in mixed)
         if all(contrast(text, ground) >= READABLE for ground in grounds):
             return text
-    raise AssertionError("black or white is read on any ground")
+    raise AssertionError("black or white is readable on any background")
 
 
 @cache

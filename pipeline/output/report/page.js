@@ -1,6 +1,6 @@
 "use strict";
 
-// A click on a column's head sorts the rows by it, a second one the other way round.
+// A click on a column header sorts the rows by that column; a second click reverses the order.
 for (const button of document.querySelectorAll("th button")) {
   button.addEventListener("click", () => sortBy(button.parentElement));
 }
@@ -15,7 +15,7 @@ function sortBy(head) {
   body.append(...rows);
 }
 
-// Numbers by value and before texts, texts by the alphabet.
+// Numbers are ordered by value and come before texts; texts are ordered alphabetically.
 function compare(a, b) {
   const [x, y] = [a, b].map((cell) => Number(cell.dataset.value ?? NaN));
   if (!isNaN(x) && !isNaN(y)) return x - y;
@@ -23,7 +23,7 @@ function compare(a, b) {
   return isNaN(x) ? 1 : -1;
 }
 
-// A chart is drawn when it comes near to the window, and again when the window or its colours change.
+// A chart is drawn when it comes close to the window, and redrawn when the window's size or colours change.
 const NARROWEST_PANEL = 260;
 const LETTER_PX = 7;
 const TICK_PX = 42;
@@ -61,7 +61,7 @@ function draw(place) {
     named.add(trace.legendgroup);
   }
   place.style.height = `${height}px`;
-  // tools stand where a mouse can ask for them, and only while it does
+  // the toolbar appears only while a mouse hovers over the chart
   const hovers = matchMedia("(hover: hover)").matches && !matchMedia("print").matches;
   const options = { displaylogo: false, showTips: false, displayModeBar: hovers ? "hover" : false, scrollZoom: false, modeBarButtonsToRemove: ["select2d", "lasso2d"] };
   Plotly.react(place, [...bands, ...lines], layout, options);
@@ -76,13 +76,13 @@ function axesOf(index) {
   return { xaxis: `x${number}`, yaxis: `y${number}` };
 }
 
-// What has one label is named once in the legend and hidden together.
+// Traces with the same label have one legend entry and are hidden together.
 const MODES = { "line+markers": "lines+markers", markers: "markers", dots: "markers", triangles: "markers", outside: "markers" };
 const MARKERS = {
   dots: { size: 2, opacity: 0.5 }, triangles: { size: 9, symbol: "triangle-up-open" }, outside: { size: 5, symbol: "square" },
 };
 
-// Of paths that coincide the lower ones are wider: `place` counts from the uppermost.
+// Lower paths are wider, so that coinciding paths stay visible: `place` counts from the top.
 function lineTrace(series, colour, index, place) {
   const isPath = series.style === "line" && !series.reference;
   const isOut = series.style === "outside";
@@ -132,7 +132,7 @@ function layoutOf(place) {
   };
   const gap = { x: 0, y: (62 + second + deep) / inner };
   const panelHeight = inner * (1 - gap.y * (rows - 1)) / rows;
-  // between columns ticks and an axis label have room, of two lines where it is longer than its axis
+  // the gap between columns fits ticks and an axis label, of two lines if it is longer than its axis
   const isLong = chart.panels.some((panel) => fitted(panel.y.label, panelHeight).includes("\n"));
   if (columns > 1) gap.x = Math.max(0.25 / columns, (isLong ? 84 : 66) / (place.clientWidth - 70));
   chart.panels.forEach((panel, index) => {
@@ -154,13 +154,13 @@ function layoutOf(place) {
   return { layout, height };
 }
 
-// A lens is as high as its limits ask for, within reason.
+// The height of a lens follows from its limits, within bounds.
 function lensHeight(panel, width) {
   const [wide, high] = [panel.x.limits, panel.y.limits].map(([low, top]) => top - low);
   return Math.min(300, Math.max(130, width * high / wide)) + 40;
 }
 
-// What stands at the left of a panel beyond the margin: names, where its ticks are such.
+// Width of tick names at the left of a panel, beyond the margin.
 function namesWidth(panel) {
   const longest = Math.max(0, ...Object.values(panel.y.ticks).map((text) => text.length));
   return Math.max(0, longest * LETTER_PX - 40);
@@ -181,7 +181,7 @@ function axisOf(panel, name, length) {
   };
 }
 
-// A text that is longer than its axis, in two lines: parted at the space nearest to the middle.
+// Splits a text that is longer than its axis into two lines, at the space nearest to the middle.
 function fitted(text, length) {
   if (text.length * LETTER_PX <= length) return text;
   const spaces = [...text.matchAll(/ /g)].map((each) => each.index);
@@ -196,7 +196,7 @@ function endsOf(panel, name) {
   return [known.reduce((a, b) => Math.min(a, b), Infinity), known.reduce((a, b) => Math.max(a, b), 0)];
 }
 
-// The ticks that a person writes on a logarithmic axis: 1, 2, 5, or 1, 3, or 1 of each decade.
+// Ticks of a logarithmic axis: 1, 2, 5, or 1, 3, or 1 in each decade.
 function decades([low, high]) {
   const [first, last] = [Math.floor(Math.log10(low)), Math.ceil(Math.log10(high))];
   if (!Number.isFinite(first) || !Number.isFinite(last)) return [];
@@ -216,7 +216,7 @@ function written(value) {
   return `${digit} × 10<sup>${Number(power)}</sup>`;
 }
 
-// Plotly reads some HTML in its texts; names from logs are none.
+// Plotly interprets some HTML in its texts; names from logs must not be interpreted.
 function escaped(text) {
   return text.replaceAll("&", "&amp;").replaceAll("<", "&lt;");
 }

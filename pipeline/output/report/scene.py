@@ -56,7 +56,9 @@ def plan(run: FirstRun) -> Chart:
     series += [truth, *paths, *_landmarks(run)]
     panel = Panel(x=Axis(label="x (m)"), y=Axis(label="y (m)"), series=series, plane=True)
     drawn = f", with particles at {CLOUDS} times" if clouds else ""
-    shapes = "; ellipses: 95 %, as claimed" if any(each.style == "area" for each in series) else ""
+    shapes = (
+        "; ellipses: 95 % regions as claimed" if any(each.style == "area" for each in series) else ""
+    )
     return Chart(title=f"{run.case or 'paths'}, first run from above{drawn}{shapes}", panels=[panel])
 
 
@@ -104,8 +106,8 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
         drawn = [each for each in series if each.x]
         panels.append(Panel(x=x, y=y, series=drawn, title=title, plane=True))
     title = (
-        f"Lens: {length_s:g} s of the first run, from {begin_s:.1f} s. Ellipses: where each is 95 % "
-        "sure that it is; an honest one has the truth outside about 5 % of the time"
+        f"Lens: {length_s:g} s of the first run, from {begin_s:.1f} s. Ellipses: 95 % regions that each "
+        "estimator claims; for a consistent estimator the truth is outside about 5 % of the time"
     )
     return Chart(title=title, panels=panels, columns=len(panels), legend=False)
 
@@ -260,8 +262,8 @@ def tracked(
         if panels:
             of = f" of {case}" if case else ""
             which = f", the case of the median {of_what}," if len(errors) > 1 and case in errors else ""
-            dots = f"; dots: detections, {MOST_FIXES} of them at most" if len(shared) > 1 else ""
-            title = f"First run{of}{which} from above: tracks over the true ways, which are grey{dots}"
+            dots = f"; dots: detections, at most {MOST_FIXES}" if len(shared) > 1 else ""
+            title = f"First run{of}{which} from above: tracks over the true paths (grey){dots}"
             return Chart(title=title, panels=panels, columns=len(panels), legend=False)
     return None
 

@@ -83,7 +83,7 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
     if len(tables) == 1:
         return _sheet(found, tables[0], columns, ""), []
     medians = _medians(tables)
-    title = f"Median of {len(tables)} cases, from the least to the greatest"
+    title = f"Median of {len(tables)} cases, with the range from minimum to maximum"
     each = [_sheet(found, table, columns, table.case or "all") for table in tables]
     return _sheet(found, medians, columns, title, spreads=_spreads(tables)), each
 

@@ -37,28 +37,29 @@ from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consist
 CHEAPER = 0.9  # a run time below this share of another's is mentioned,
 TIMED_S = 0.02  # if it was measured over at least this time
 
-NONE_SOUND = "Believe none of them as they are set."
-NONE_SOUND_AT_BEST = "Where each errs least, none of them can be believed."
+NONE_SOUND = "None of the estimators can be trusted with its current settings."
+NONE_SOUND_AT_BEST = "Even at the point with its smallest error, none of the estimators can be trusted."
 MOST_CARDS = 4
 MOST_NAMED = 4  # more estimators are counted instead of named
 # Findings of the checks of a replay, phrased for the estimators concerned.
 _OF_COVARIANCES = {"innovations": "innovations", "errors": "errors"}
 _CHECKS: dict[str, Callable[[str], str]] = {
     "uninformed": lambda whose: (
-        f"components that {whose} cannot estimate, as no measurement informs the method of them"
+        f"components that {whose} cannot estimate, because no measurement informs the method about them"
     ),
     "origin": lambda whose: (
-        f"the error of {whose}, most of which is constant: truth and estimate may have other origins"
+        f"the error of {whose}, which is mostly constant: truth and estimate may have different origins"
     ),
     "lever arm": lambda whose: (
-        f"the error of {whose}, most of which turns along: the truth may be of another point of the body"
+        f"the error of {whose}, which is mostly constant in the body frame: the truth may refer to "
+        f"another point"
     ),
-    "minimum": lambda whose: (
-        f"the search of {whose}, which may have ended at a minimum that is not the least"
+    "minimum": lambda whose: f"the search of {whose}, which may have ended at a local minimum",
+    "digits": lambda whose: (
+        f"the precision of {whose}, whose covariances have lost most of their digits to rounding"
     ),
-    "digits": lambda whose: f"the digits of {whose}, of whose covariances rounding leaves few or none",
-    "unused": lambda whose: f"{whose}, as measurements came to nothing",
-    "gates": lambda _: "likelihoods: the gates differ, so that they are of different measurements",
+    "unused": lambda whose: f"{whose}, because measurements were not used",
+    "gates": lambda _: "likelihoods: the gates differ, so they are based on different measurements",
 }
 # The scale is logarithmic, from a third of the aim to ten times the aim.
 GAUGE_ENDS = (1 / 3, 10.0)
@@ -177,7 +178,7 @@ def _verdict(
         return [_of_innovations(found), *named]
     if not take:
         least = min(broken, key=lambda each: each.error.value if each.error else math.inf)
-        has = f"The least error has {least.estimator}, {_value(least.error, own)}."
+        has = f"The smallest error is that of {least.estimator}, {_value(least.error, own)}."
         return [none_sound, *named, *([has] if least.error else [])]
     return [_advice(found, broken, take, equal, own, timings), *named]
 
@@ -204,8 +205,9 @@ def _advice(
     if better:
         best = min(better, key=lambda each: each.error.value if each.error else math.inf)
         return (
-            f"{best.estimator} errs least, {_value(best.error, own)}, but mend it before you believe "
-            f"its covariance; of the others {take} errs least, {_value(error, own)}."
+            f"{best.estimator} has the smallest error, {_value(best.error, own)}, but fix its "
+            f"covariance "
+            f"before you rely on it; of the others, {take} has the smallest error, {_value(error, own)}."
         )
     runs, cases = count(found.runs, "run"), len(found.cases)
     how = "RMS" if "rmse" in found.main else "mean"
@@ -218,17 +220,19 @@ def _advice(
             return f"{both} tie in {main}: {whom}{_cheapest(left, timings)}."
         if any(relation(found, take, each) == Comparison.WITHHELD for each in equal):
             return (
-                f"No verdict between {both}: changes that should not matter move the {main} "
-                "farther than they differ."
+                f"No verdict between {both}: changes that should not matter change the {main} by more "
+                "than they differ."
             )
-        return f"A tie so far: {runs} do not tell {both} apart; {whom}."
+        return f"A tie so far: {runs} cannot distinguish {both}; {whom}."
     if all(relation(found, take, each) is None for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
-        tells = f"{FEWEST_RUNS} runs or more tell" if few else "is not known"
-        chance = f"; whether by chance{',' if few else ''} {tells}"
-        return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{of_cases}{chance}."
-    return f"Take {take}: it has the least {main}, {_value(error, own)}{of_cases}."
+        tells = f"use {FEWEST_RUNS} or more runs" if few else "is not known"
+        chance = f"; {'to rule out chance,' if few else 'whether by chance'} {tells}"
+        return (
+            f"Take {take}: it has the smallest {main} {alone}, {_value(error, own)}{of_cases}{chance}."
+        )
+    return f"Take {take}: it has the smallest {main}, {_value(error, own)}{of_cases}."
 
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
@@ -237,7 +241,7 @@ def _cheapest(labels: list[str], timings: Timings) -> str:
     if len(of) < 2 or not TIMED_S < of[0][0] < CHEAPER * of[1][0]:
         return ""
     (least_s, first), (next_s, second) = of
-    return f"; {first} needs {number(least_s / next_s, 2)} times the time of {second}"
+    return f"; {first} takes {number(least_s / next_s, 2)} times as long as {second}"
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
@@ -247,7 +251,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
     if only.is_broken:
         return [*filter(None, [errs and f"{errs}."]), _doubt(only, causes)]
     if only.decisive is None:
-        return [f"{errs}; whether its covariance is right is not known." if errs else ""]
+        return [f"{errs}; whether its covariance is right is unknown." if errs else ""]
     believed = _claim(only, found.runs)
     return [f"{errs}; {believed}." if errs else f"{only.estimator}: {believed}."]
 
@@ -255,11 +259,11 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 def _of_innovations(found: Findings) -> str:
     """Write what is known without a truth."""
     right = [each.estimator for each in found.of.values() if each.verdict == Consistency.CONSISTENT]
-    without = "Without a truth nobody's error is known"
+    without = "Without a truth, errors are unknown"
     if not right:
         return f"{without}."
     is_are = "is" if len(right) == 1 else "are"
-    return f"{without}; by the innovations {listed(right)} {is_are} consistent."
+    return f"{without}; according to the innovations, {listed(right)} {is_are} consistent."
 
 
 def _value(error: Interval | None, own: Scale) -> str:
@@ -290,9 +294,9 @@ def _claim(each: Evidence, runs: int) -> str:
     if by.verdict == Consistency.OVERCONFIDENT:
         return f"its {what} are {_times(by.factor)} what it states"
     if by.verdict == Consistency.CONSERVATIVE:
-        return f"its {what} are {number(by.factor, 2)} of what it states"
+        return f"its {what} are {number(by.factor, 2)} times what it states"
     if runs == 1 and by.name != "NIS" and len(each.squares) == 1:
-        return "one run does not show it to be inconsistent"
+        return "one run does not show that it is inconsistent"
     return f"its {what} are as large as it states"
 
 
@@ -364,7 +368,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
     if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
         nis = number(each.squares[1].found.value)
-        notes.append(f"By its innovations, NIS is {nis} per component; 1 is right.")
+        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is right.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes
@@ -376,11 +380,11 @@ def _of_tracks(found: Findings, label: str) -> list[str]:
     for key, words in (("missed_targets", "missed"), ("false_targets", "false")):
         values = found.values(label, key)
         counts += [f"{number(sum(values) / len(values), 2)} {words}"] if values else []
-    sentences = [f"Targets at a time: {listed(counts)}."] if counts else []
+    sentences = [f"Targets on average: {listed(counts)}."] if counts else []
     switches = found.values(label, "switches")
     if switches:
         a_run = number(sum(switches) / len(switches), 2)
-        sentences.append(f"Switches of identity: {a_run} a run.")
+        sentences.append(f"Identity switches: {a_run} per run.")
     return sentences
 
 
@@ -389,7 +393,7 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
     import pandas as pd
 
     if len(found.cases) > 1:
-        return [f"Least in {found.least_in()[take]} of {len(found.cases)} cases."]
+        return [f"Smallest error in {found.least_in()[take]} of {len(found.cases)} cases."]
     every = pd.concat(
         {label: found.by_run(label, found.main) for label in found.labels}, axis=1
     ).dropna()
@@ -397,7 +401,7 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
         return []
     best = int((every.idxmin(axis=1) == take).sum())
     which = "each of the" if best == len(every) else f"{best} of the"
-    return [f"Least error in {which} {count(len(every), 'run')}."]
+    return [f"Smallest error in {which} {count(len(every), 'run')}."]
 
 
 def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
@@ -410,7 +414,7 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
         beside = ""
         if each.estimator != take and best.get("seconds", 0.0) > 0.0:
             beside = _beside(seconds / best["seconds"], take)
-        foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
+        foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} per message{beside}")
     if each.failed is not None:
         foot.append(f"{each.failed:,} of {count(each.runs, 'run')} failed")
     return foot
@@ -438,20 +442,22 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
         ends = f"95 % {interval(more.low, more.high, near)} {near.sign}".rstrip()
         if is_tie:
             exactly = "are equal" if not size else f"differ by {near.with_unit(size)} on average, {ends}"
-            draws.append(f"In {main}, {take} and {label} cannot be told apart: they {exactly}.")
+            draws.append(f"In {main}, {take} and {label} cannot be distinguished: they {exactly}.")
         elif difference.verdict == Comparison.UNDECIDED:
             runs = count(difference.runs, "run")
-            draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
+            draws.append(f"In {main}, {runs} do not distinguish {take} from {label}: {ends}.")
         elif is_withheld(found, take, label, size):
             moved = near.with_unit(found.stressed(take, label))
             draws.append(
                 f"In {main}, the verdict on {take} and {label} is withheld: they differ by "
-                f"{near.with_unit(size)} on average, and changes that should not matter move one by "
+                f"{near.with_unit(size)} on average, and changes that should not matter change one by "
                 f"{moved}."
             )
         else:
-            errs = f"{near.with_unit(size)} {'more' if more.value > 0 else 'less'} than {take}"
-            differences.append(f"{label} errs {errs} in the mean over runs ({ends}).")
+            errs = (
+                f"{near.with_unit(size)} {'larger' if more.value > 0 else 'smaller'} than that of {take}"
+            )
+            differences.append(f"The error of {label} is {errs}, in the mean over runs ({ends}).")
     return draws, differences
 
 
@@ -499,11 +505,11 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
     left = [label for label in tied if label not in careful] or tied
     whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"
     if careful == tied:
-        return f"take {whom}, but mend its covariance, which is too large", left
+        return f"take {whom}, but reduce its covariance, which is too large", left
     if careful:
         whom = " or ".join(left) if len(left) <= MOST_CARDS else "any of the others"
         are = "is" if len(careful) == 1 else "are"
-        return f"take {whom}, as {listed(careful)} {are} conservative", left
+        return f"take {whom}, because {listed(careful)} {are} conservative", left
     return f"take {whom}", left
 
 
@@ -550,9 +556,7 @@ def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
             label for label in dict.fromkeys(whose) if verdicts.get(label) == Consistency.CONSISTENT
         ]
         if little:
-            sentences.append(
-                f"the {what} of {named(little)}, which are off by little, but beyond chance"
-            )
+            sentences.append(f"the {what} of {named(little)}, which are slightly but significantly off")
     return sentences
 
 
@@ -581,8 +585,8 @@ def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
         return []
     who = [f"{label} in {number}" for label, number in sorted(others.items(), key=lambda each: -each[1])]
     return [
-        f"that {take} is best everywhere, as in {sum(others.values())} of {len(found.cases)} cases "
-        f"another one has the least {found.error_name} ({named(who)})"
+        f"that {take} is best everywhere, because in {sum(others.values())} of {len(found.cases)} cases "
+        f"another estimator has the smallest {found.error_name} ({named(who)})"
     ]
 
 
@@ -591,14 +595,14 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
     runs = count(found.runs, "run")
     if compared and found.runs < FEWEST_RUNS:
         do = "does" if found.runs == 1 else "do"
-        return [f"who is better, as {runs} {do} not tell differences from chance"]
+        return [f"which one is better, because {runs} {do} not distinguish differences from chance"]
     unclear = [label for label in equal if relation(found, take, label) == Comparison.UNDECIDED]
     if unclear:
-        return [f"who of {named([take, *unclear])} is better, which {runs} do not tell"]
+        return [f"which of {named([take, *unclear])} is better, which {runs} do not decide"]
     if len(compared) > 1 and found.by_run(take or compared[0], found.main).empty:
         return [
-            f"whether differences are chance, as the result has no table of the {found.error_name} of "
-            "single runs"
+            f"whether differences are due to chance, because the result has no table of the "
+            f"{found.error_name} of individual runs"
         ]
     return []
 
@@ -613,7 +617,7 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
     ]
     if unjudged and found.main:
         whose = named(unjudged, len(found.labels))
-        unknown.append(f"the covariances of {whose}, which nothing here judges")
+        unknown.append(f"the covariances of {whose}, which were not judged")
     lacking = [label for label in found.labels if label not in found.compared]
     if lacking and found.compared:
         where = " in every case" if len(found.cases) > 1 else ""
@@ -645,7 +649,7 @@ def gauge(by: Squares) -> Gauge:
     low, high = by.usual
     found = by.found
     spread = (found.low, found.high) if found.is_bounded else (found.value, found.value)
-    words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
+    words = f"{numbers_of(by)}; for a consistent estimator {interval(low, high, Scale())}"
     is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
     ends = (place(spread[0]), place(spread[1]))
     box = min(low, (1.0 - MATERIAL) * by.aim), max(high, (1.0 + MATERIAL) * by.aim)

@@ -148,7 +148,7 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
     tried = _tried(sweep, labels)
     errors = {label: own for label in labels if not (own := sweep.errors(label)).empty}
     if not errors:
-        none = "Without a truth nobody's error is known; the charts show what the innovations say."
+        none = "Without a truth, errors are unknown; the charts show the innovations."
         return tried, Story([none]), Findings([], pd.DataFrame(), sweep.runs, labels)
     if sweep.of_world:
         found = sweep.everywhere()
@@ -201,8 +201,8 @@ def _with_points(
     sentences = []
     for point in dict.fromkeys(best[label] for label in moved):
         there = [label for label in moved if best[label] == point]
-        err = "errs" if len(there) == 1 else "err"
-        sentences.append(f"{listed(there)} {err} least with {sweep.where(point)}.")
+        err = "has its" if len(there) == 1 else "have their"
+        sentences.append(f"{listed(there)} {err} smallest error with {sweep.where(point)}.")
     if still:
         are = "do not depend" if len(still) > 1 else "does not depend"
         sentences.append(f"{listed(still)} {are} on it.")
@@ -218,7 +218,7 @@ def _with_points(
             cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
     first, *further = base.verdict or [""]
     verdict = [*filter(None, [first]), *sentences, *further]
-    at_best = ", each where it errs least" if len(base.cards) > 1 else ", where it errs least"
+    at_best = ", each at its smallest error" if len(base.cards) > 1 else ", at its smallest error"
     others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in base.doubts]
     return replace(base, verdict=verdict, cards=cards, doubts=[*doubts, *others])
 
@@ -252,12 +252,12 @@ def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike:
     if sure and best not in sure:
         parts.append(f"{label} at {_named(sweep, sure)}, where it is overconfident")
     if alike:
-        parts.append(f"which point is best for {label}, as {_named(sweep, alike)} may be as good")
+        parts.append(f"which point is best for {label}, because {_named(sweep, alike)} may be as good")
     key, *others = sweep.points[0]
     values = [each for point in sweep.points if _is_number(each := point[key])]
     if not others and len(values) == len(sweep.points) and sweep.points[best][key] in _ends_of(values):
         where = sweep.where(best, brief=True)
-        parts.append(f"whether {label} errs less beyond {where}, where the range ends")
+        parts.append(f"whether the error of {label} is smaller beyond {where}, where the range ends")
     return parts
 
 

@@ -109,7 +109,7 @@ def measurements() -> Iterator[str]:
         (0, 0, 0, UNTAKEN),
         (0, 0, 0, f"{UNTAKEN}; with rolling it does"),
         (0, 0, 0, SILENT),
-        (None, None, 0, "they are not counted"),
+        (None, None, 0, "not counted"),
         (None, None, 0, ""),
     ):
         row = Row("ekf", "/fix", 100, used, gated, skipped, why)

@@ -13,7 +13,7 @@ def claims() -> Iterator[str]:
         Claim("A is 1", "1 m", "1 m", "confirmed"),
         Claim("B is 2", "2 m", "3 m", "refuted", "by 1 m"),
     ]
-    elsewhere = Claim("C is 3", "3 m", "4 m", "no verdict", "claimed of first, not of these data")
+    elsewhere = Claim("C is 3", "3 m", "4 m", "no verdict", "claimed for first, not for these data")
     yield from printed(print_claims, made)
     yield from printed(print_claims, [*made, elsewhere])
 
