@@ -1,4 +1,4 @@
-"""Alters topics of a run at the source of any replay: a fault is undone, or put in.
+"""Alterations of a run's topics at the source of any replay, to correct a fault or to plant one.
 
 Begin with `sources`.
 """

@@ -1,7 +1,7 @@
-"""Puts faults into streams, or takes them out: each is a function of streams and one number.
+"""Alterations that plant faults in streams or correct them; each is a function of streams and a number.
 
-With the opposite number a fault is undone, but for what is lost. So one set of functions says what a
-diagnosis supposes, and what the experiment puts into logs to be found.
+The opposite number corrects a fault, except for lost data. The same functions thus define the faults
+that a diagnosis assumes and those that the experiment plants in logs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +17,12 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 Alteration = Callable[[Stream, float], Stream]
 STRAY = 20.0  # in the unit of the vector
-_BLOCKS = {"position_m": "covariance_m2", "velocity_mps": "covariance_m2ps2"}  # of vectors that turn
+# covariances of vectors that are rotated
+_BLOCKS = {"position_m": "covariance_m2", "velocity_mps": "covariance_m2ps2"}
 
 
 def altered(source: MemorySource, topic: str, alteration: Alteration, value: float) -> MemorySource:
-    """Return the run with one topic altered."""
+    """Copy a run with one topic altered."""
     stream = alteration(source.streams[topic], value)
     return replace(source, streams={**source.streams, topic: stream})
 
@@ -31,7 +32,7 @@ def _with(stream: Stream, **columns: NDArray) -> Stream:
 
 
 def shifted(field: str, entry: int | None = None) -> Alteration:
-    """Add a bias to a field, or to one entry of it where that is a vector."""
+    """Add a bias to a field, or to one entry of a vector."""
     return partial(added, field, entry)
 
 
@@ -40,9 +41,9 @@ def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.
 
     Args:
         field: a field of n messages.
-        entry: of a vector; None stands for all of it.
+        entry: an entry of a vector; None stands for the whole vector.
         stream: the messages.
-        by: in the field's unit: one number, or (n,), one for each message.
+        by: in the field's unit: one number, or (n,), one per message.
 
     Returns:
         The altered stream.
@@ -56,7 +57,7 @@ def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.
 
 
 def scaled(field: str, entry: int | None = None) -> Alteration:
-    """Multiply a field, or one entry of it where that is a vector."""
+    """Multiply a field, or one entry of a vector."""
     return partial(_scaled, field, entry)
 
 
@@ -70,20 +71,20 @@ def _scaled(field: str, entry: int | None, stream: Stream, factor: float) -> Str
 
 
 def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]:
-    """Make the alteration that multiplies a vector by a matrix, as where axes are not at right angles.
+    """Make the alteration that multiplies a vector by a matrix, for example for non-orthogonal axes.
 
     Args:
         field: a vector of three components.
-        matrix: (3, 3), from the left.
+        matrix: (3, 3), multiplied from the left.
 
     Returns:
-        A function of a stream, which returns the altered one.
+        A function that alters a stream.
     """
     return lambda stream: _with(stream, **{field: stream[field] @ matrix.T})
 
 
 def spread(field: str) -> Alteration:
-    """Multiply a covariance, as for standard deviations e^value times as large."""
+    """Multiply a covariance so that standard deviations become e^value times as large."""
     return partial(_spread, field)
 
 
@@ -92,7 +93,7 @@ def _spread(field: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def turned(field: str) -> Alteration:
-    """Turn a vector, and its covariance, about the vertical by an angle in rad."""
+    """Rotate a vector, and its covariance, about the vertical by an angle in rad."""
     return partial(_turned, field)
 
 
@@ -109,12 +110,12 @@ def _turned(field: str, stream: Stream, angle: float) -> Stream:
 
 
 def delayed(stream: Stream, by_s: float) -> Stream:
-    """Make stamps late by so many seconds."""
+    """Delay stamps by `by_s` seconds."""
     return replace(stream, publish_time_ns=stream.publish_time_ns + round(by_s * 1e9))
 
 
 def drifted(first_ns: int) -> Alteration:
-    """Let the clock of the stamps gain so many seconds a second from the run's begin on."""
+    """Let the clock of the stamps gain `rate` seconds per second from the start of the run."""
     return partial(_drifted, first_ns)
 
 
@@ -124,7 +125,7 @@ def _drifted(first_ns: int, stream: Stream, rate: float) -> Stream:
 
 
 def pace(rate: float) -> float:
-    """Return how fast a clock goes that gains so many seconds a second; of -rate the inverse.
+    """Compute the pace of a clock that gains `rate` seconds per second; -rate gives the inverse.
 
     >>> pace(0.25), pace(-0.25)
     (1.25, 0.8)
@@ -133,12 +134,12 @@ def pace(rate: float) -> float:
 
 
 def multiplied(field: str, entry: int | None = None) -> Alteration:
-    """Make a field, or one entry of it, e^value times as large."""
+    """Multiply a field, or one entry of it, by e^value."""
     return lambda stream, logarithm: _scaled(field, entry, stream, float(np.exp(logarithm)))
 
 
 def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
-    """Add a bias that grows by so much a second from the run's begin on."""
+    """Add a bias that grows linearly from the start of the run."""
     return partial(_ramped, first_ns, field, entry)
 
 
@@ -151,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Put the entries of a vector, and of its covariance, in another order, whatever the number."""
+    """Reorder the entries of a vector and of its covariance, whatever the number."""
     return partial(_permuted, field, tuple(order))
 
 
@@ -167,11 +168,11 @@ def _permuted(field: str, order: tuple[int, ...], stream: Stream, _: float) -> S
 
 
 def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream:
-    """Turn the orientations of a stream, or those of a Gaussian estimate, about the vertical.
+    """Rotate the orientations of a stream, or those of Gaussian estimates, about the vertical.
 
     Args:
-        stream: n messages with a quaternion, or with means that hold one.
-        angle: in rad, anticlockwise from above: one, or (n,), one for each message.
+        stream: n messages with a quaternion, or with means that contain one.
+        angle: in rad, anticlockwise seen from above: one, or (n,), one per message.
 
     Returns:
         The altered stream.
@@ -187,22 +188,22 @@ def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream
 
 
 def heading_multiplied(stream: Stream, factor: float) -> Stream:
-    """Multiply the headings of orientations; what else they are turned by stays."""
+    """Multiply the headings of orientations; all other rotation stays."""
     return heading_turned(stream, (factor - 1.0) * heading(stream["quaternion"]))
 
 
 def heading_ramped(first_ns: int) -> Alteration:
-    """Let orientations turn about the vertical by so many rad/s from the run's begin on."""
+    """Let orientations rotate about the vertical at a constant rate from the start of the run."""
     return lambda stream, rate: heading_turned(stream, rate * _since_s(stream, first_ns))
 
 
 def heading_from_north(stream: Stream, _: float) -> Stream:
-    """Change headings clockwise from north into those anticlockwise from east, and the reverse."""
+    """Convert headings clockwise from north to headings anticlockwise from east, and vice versa."""
     return heading_turned(stream, 0.5 * np.pi - 2.0 * heading(stream["quaternion"]))
 
 
 def spread_stated(name: str) -> Alteration:
-    """Multiply variances that a channel states, for standard deviations e^value times as large."""
+    """Multiply a channel's variances so that standard deviations become e^value times as large."""
     return partial(_spread_stated, name)
 
 
@@ -212,12 +213,12 @@ def _spread_stated(name: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def spread_variances(stated: str, factor: float) -> str:
-    """Multiply variances as a channel states them."""
+    """Multiply variances in a channel's text."""
     return ",".join(repr(float(each) * factor) for each in stated.split(","))
 
 
 def renumbered(field: str, first: int, second: int) -> Alteration:
-    """Exchange two numbers."""
+    """Swap two numbers of an identifier field."""
     return partial(_renumbered, field, first, second)
 
 
@@ -228,7 +229,7 @@ def _renumbered(field: str, first: int, second: int, stream: Stream, _: float) -
 
 
 def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
-    """Return the run with the messages of two topics exchanged."""
+    """Copy a run with the messages of two topics swapped."""
     streams: Mapping[str, Stream] = {
         first: replace(source.streams[second], topic=first),
         second: replace(source.streams[first], topic=second),
@@ -237,7 +238,7 @@ def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
 
 
 def thinned(seed: int) -> Alteration:
-    """Lose a share of the stamps, drawn at random, with all their messages."""
+    """Drop a random share of the stamps with all their messages."""
     return partial(_thinned, seed)
 
 
@@ -248,7 +249,7 @@ def _thinned(seed: int, stream: Stream, share: float) -> Stream:
 
 
 def strayed(seed: int, field: str) -> Alteration:
-    """Move a share of a vector's messages, drawn at random, by up to STRAY in every entry."""
+    """Move a random share of a vector's messages by up to STRAY in every entry."""
     return partial(_strayed, seed, field)
 
 

@@ -1,4 +1,4 @@
-"""Parses `--set /TOPIC.WHAT=VALUE`: which alteration, of which field, by how much."""
+"""The parser of `--set /TOPIC.WHAT=VALUE`: which alteration, of which field, by how much."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,11 +22,11 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.judging.errors.truths import COVERS
 
 AXES = "xyz"
-ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # of what is done to a field
-STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries the channel names
-STATED = "covariance_rad2"  # by a channel of orientations: their variances
+ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # endings of alterations of a field
+STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries are named by the channel
+STATED = "covariance_rad2"  # variances that a channel of orientations states
 ALL_TOPICS = "/*"
-# Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
+# Alterations of a topic with their meanings; each corrects a fault and takes its number.
 WHATS = {
     "delay_s": "The stamps are so late, and are taken back by it; messages that would be before 1970 "
     "are left out.",
@@ -53,7 +53,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """Holds one setting of a topic: as it was written, and its parts."""
+    """A setting of a topic: its text and its parts."""
 
     key: str
     what: str
@@ -61,11 +61,11 @@ class _Setting(NamedTuple):
     empty: Stream
 
     def refused(self, expected: str) -> BadInput:
-        """Return the sentence on a value that makes no sense."""
+        """Return the error for an invalid value."""
         return BadInput(f"--set {self.key}={self.value}: expected {expected}")
 
     def number(self, name: str, example: str) -> float:
-        """Return the value in the unit that `name` ends with, or in a unit of its own, as `300 ms`."""
+        """Parse the value in the unit that `name` ends with, or in its own unit, such as `300 ms`."""
         found = _NUMBER.fullmatch(str(self.value))
         if isinstance(self.value, bool) or found is None:
             raise self.refused(example)
@@ -79,7 +79,7 @@ class _Setting(NamedTuple):
         return number
 
     def several(self, counts: Sequence[int], example: str) -> list[str]:
-        """Return the value as a list, which may be written with commas."""
+        """Parse the value as a list, which may be text with commas."""
         is_list = isinstance(self.value, list | tuple)
         parts = list(self.value) if is_list else str(self.value).strip("[] ").split(",")
         if len(parts) not in counts:
@@ -89,14 +89,14 @@ class _Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Change:
-    """Describes what is done to a topic.
+    """The alteration of a topic.
 
     Attributes:
         topic: its name.
-        stored: the topic of the log that it is read from: its own, but of exchanged ones the other.
-        first_ns: where the run begins, from which a clock drifts.
-        columns: what is done to its columns, in turn.
-        metadata: what is stated of it beside what the log states.
+        stored: the topic of the log from which it is read: the other one for swapped topics.
+        first_ns: the start of the run, from which a clock drifts.
+        columns: alterations of its columns, in their order.
+        metadata: metadata in addition to those in the log.
         gain, delay_ns: its stamps lose `delay_ns`, and what a clock has gained since `first_ns`.
     """
 
@@ -110,27 +110,27 @@ class Change:
 
     @property
     def is_moving(self) -> bool:
-        """Tell whether its stamps move."""
+        """Test whether its stamps move."""
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Move stamps (n,) in ns, as `alterations.drifted` and `delayed` undo clock and delay."""
+        """Move stamps (n,) in ns, as `alterations.drifted` and `delayed` correct clock and delay."""
         since_ns = (stamps_ns - self.first_ns) * alter.pace(-self.gain) - self.delay_ns
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
     def before(self, stamp_ns: int) -> int:
-        """Return a stamp that is moved to this one, but for rounding."""
+        """Return the stamp that is moved to this one, up to rounding."""
         since_ns = (stamp_ns - self.first_ns + self.delay_ns) * alter.pace(self.gain)
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
-        """Return the topic as it is altered, from the one that is stored."""
+        """Return the altered topic for the stored one."""
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
-        """Return the topic's messages altered, from those of the one that is stored.
+        """Alter the messages of the stored topic.
 
-        Messages that would be before 1970 are left out: no log has such stamps.
+        Messages that would be before 1970 are left out, because no log has such stamps.
         """
         metadata = {**stream.metadata, **self.metadata}
         stream = replace(stream, topic=self.topic, metadata=metadata)
@@ -143,14 +143,14 @@ class Change:
 
 
 def is_of_topic(key: str) -> bool:
-    """Tell whether a setting is of a topic, and not of an estimator or experiment."""
+    """Test whether a setting belongs to a topic, in contrast to an estimator or experiment."""
     return key.startswith("/")
 
 
 def is_parameter(key: str) -> bool:
-    """Tell whether a setting of a topic is a parameter of its sensor, and no alteration of the log.
+    """Test whether a setting of a topic is a parameter of its sensor, not an alteration of the log.
 
-    No name is both: what sensors read is never called as a field of their messages with an ending.
+    No name is both: parameters of sensors are never named like a field of their messages with an ending.
     """
     _, dot, what = key.rpartition(".")
     if not (is_of_topic(key) and dot) or what in (*WHATS, "delay"):
@@ -159,7 +159,7 @@ def is_parameter(key: str) -> bool:
 
 
 def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Put the parameters of topics into tables: `/TOPIC.NAME` into that of `/TOPIC`."""
+    """Move the parameters of topics into tables: `/TOPIC.NAME` into that of `/TOPIC`."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         found = merge(found, nested(key, value) if is_parameter(key) else {key: value})
@@ -178,7 +178,7 @@ def _read_by_sensors() -> frozenset[str]:
 
 
 def _parameters() -> set[str]:
-    """Collect the parameters of all models, those that are not registered too."""
+    """Collect the parameters of all models, including unregistered ones."""
     registered_models()
     kinds: list[type[ModelParameters]] = [ModelParameters]
     for kind in kinds:
@@ -187,12 +187,12 @@ def _parameters() -> set[str]:
 
 
 def bare(name: str) -> str:
-    """Return the name of a field or component without its unit: `x` of `x_m`."""
+    """Return the name of a field or component without its unit: `x` for `x_m`."""
     return parted(name)[0]
 
 
 def names_in(stream: Stream, field_: str) -> list[str]:
-    """Name the entries of a vector: as the channel states them, else `position_x_m` of `position_m`."""
+    """Name a vector's entries: by the channel, or `position_x_m` and so on for `position_m`."""
     if field_ in STATED_ENTRIES and stream.components:
         return stream.components
     stem = bare(field_)
@@ -200,13 +200,14 @@ def names_in(stream: Stream, field_: str) -> list[str]:
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
-    """Return what settings of topics do to a run, by topic; several of one topic in their order.
+    """Find the alterations that settings of topics make in a run, by topic, in the order of settings.
 
-    What can be set is in `WHATS`. A field is named in full, or without its unit, or by its beginning
-    where that is clear; an entry of a vector with its axis, as `position_x_bias`; one of a state by its
-    component. A number may have a unit, as `300 ms` or `4.5 deg`.
+    `WHATS` lists the possible settings. A field is given by its full name, without its unit, or by the
+    beginning of its name if that is unambiguous; an entry of a vector with its axis, such as
+    `position_x_bias`; an entry of a state by its component. A number may have a unit, such as `300 ms`
+    or `4.5 deg`.
 
-    Raises BadInput where there is no such topic or field, or a value makes no sense.
+    Raises BadInput if the topic or field does not exist, or if a value is invalid.
     """
     changes: dict[str, Change] = {}
     for key, value in _of_one_topic(source, settings):
@@ -233,7 +234,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield settings of single topics: what is set of all topics is set of each that it is about."""
+    """Yield settings of single topics; a setting of all topics is repeated for each one it concerns."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:
@@ -246,7 +247,7 @@ def _of_one_topic(
 
 
 def _with(change: Change, given: _Setting) -> Change:
-    """Return the change with one more setting of its topic."""
+    """Add one more setting to the change of its topic."""
     what = given.what
     if what in ("delay_s", "delay"):
         delay_ns = 1e9 * given.number("delay_s", "seconds, such as 0.3 or 300 ms")
@@ -274,7 +275,7 @@ def _with(change: Change, given: _Setting) -> Change:
 
 
 def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | None:
-    """Return what is done to the headings of orientations, or of a Gaussian estimate; else None."""
+    """Return the alteration of headings of orientations or Gaussian estimates, or None."""
     has_field = "quaternion" in given.empty.columns
     if given.what == "heading_bias" and (
         has_field or "quaternion" in given.empty.metadata.get("kinds", "")
@@ -296,7 +297,7 @@ def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | 
 
 
 def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
-    """Return what is done to a field."""
+    """Return the alteration of a field."""
     name, _, what = given.what.rpartition("_")
     of_heading = _of_heading(given, first_ns)
     if of_heading is not None:
@@ -328,7 +329,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
 
 
 def _order(given: _Setting, field_: str) -> list[int]:
-    """Return the order that axes are to have."""
+    """Parse the order of axes."""
     text = str(given.value)
     order = [AXES.find(each) for each in text]
     if sorted(order) != list(range(len(order))) or len(order) < 2:
@@ -337,7 +338,7 @@ def _order(given: _Setting, field_: str) -> list[int]:
 
 
 def _matrix(given: _Setting, field_: str) -> Callable[[Stream], Stream]:
-    """Return the matrix that a vector of three entries is multiplied by."""
+    """Parse the matrix that multiplies a vector of three entries."""
     example = "nine numbers by rows, such as 1,0,0,0,1,0,0,0,1"
     if given.empty[field_].shape[1:] != (3,):
         raise BadInput(f"--set {given.key}: {field_} is no vector of three entries; leave it out")
@@ -350,7 +351,7 @@ def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:
 
 
 def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
-    """Return the one field, or entry of one, that a name means; raise BadInput where there is none."""
+    """Find the field, or entry of one, that a name means; raises BadInput if there is none."""
     fields: dict[str, tuple[str, int | None]] = {}
     for each in given.empty.schema:
         if each.kind not in ("real", "vector") or each.name not in given.empty.columns:
@@ -436,7 +437,7 @@ def _exchange(change: Change, given: _Setting) -> Change:
 def _check_exchange(
     source: LogSource | MemorySource, given: _Setting, other: str, changes: Mapping[str, Change]
 ) -> None:
-    """Refuse an exchange with a topic that is not there, of another type, or altered already."""
+    """Refuse to swap with a topic that is missing, of another type, or already altered."""
     if other not in source.topics:
         raise BadInput(
             f"--set {given.key}={other}: {source.name} has no topic {other}; "

@@ -1,4 +1,4 @@
-"""Finds which numbers of a topic's messages an estimator reads."""
+"""The numbers in a topic's messages that an estimator reads."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,17 +10,17 @@ from fuselog.pipeline.altering.changes import AXES, names_in
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Reading
 
-PROBED = 64  # messages, by which is found what is read
+PROBED = 64  # messages with which this is determined
 
 
 class Entry(NamedTuple):
-    """Describes one number of a topic's messages that is read.
+    """A number in a topic's messages that is read.
 
     Attributes:
-        field, place: where it stands; a heading is of the field `quaternion`.
-        name: as a setting names it, with its unit.
-        is_angle: whether it is an angle that is measured.
-        number: which of the numbers that are read it is; None where it is several.
+        field, place: its field, and its index there; a heading belongs to the field `quaternion`.
+        name: its name in a setting, with its unit.
+        is_angle: whether it is a measured angle.
+        number: its index among the numbers that are read; None if it affects several.
         varies: its standard deviation over the log.
     """
 
@@ -33,14 +33,14 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Tell whether it is the heading of orientations."""
+        """Test whether it is the heading of orientations."""
         return self.field == "quaternion"
 
 
 def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
-    """Return the numbers of a topic that are read: those whose change changes what is read.
+    """List the numbers of a topic that are read: those whose change changes what is read.
 
-    Where it is not known what is read, all numbers, and the entries of positions and velocities.
+    If the reading is unknown, all numbers are listed, with the entries of positions and velocities.
     """
     some = stream.take(slice(0, PROBED))
     found = []
@@ -70,7 +70,7 @@ def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
 
 
 def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
-    """Yield the numbers of a topic, but for covariances and orientations."""
+    """Yield the numbers of a topic, except covariances and orientations."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or entry.name.startswith(("covariance", "quaternion")):
@@ -83,7 +83,7 @@ def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
 
 
 def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
-    """Return which of the numbers that are read change."""
+    """List which of the numbers that are read change."""
     same = np.isclose(
         reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
     )

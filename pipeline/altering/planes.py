@@ -1,4 +1,4 @@
-"""Reads a run whose positions are in several planes as one in one plane."""
+"""The conversion of a run whose positions are in several tangent planes to one plane."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,16 +14,16 @@ from fuselog.replay.engine.streams.planes import into_plane_of
 def in_one_plane(
     name: str, topics: Mapping[str, Topic], changes: Mapping[str, Change]
 ) -> dict[str, Change]:
-    """Add to the changes of topics those that take all of them into one plane.
+    """Add to the changes of topics those that move all of them into one plane.
 
-    That is the plane of the truth, so that estimates are in its coordinates, else of the first topic.
+    This is the plane of the truth, so that estimates are in its coordinates, or that of the first topic.
 
     Args:
-        name: of the run.
-        topics: as the run states them.
-        changes: by topic, what is done to them before.
+        name: the run's name.
+        topics: the topics as the run states them.
+        changes: other alterations, by topic, which come first.
 
-    Raises BadInput where planes differ, and a topic of the log's plane does not state which is its.
+    Raises BadInput if planes differ and a topic with positions does not state which plane is its own.
     """
     stating = {
         topic: changes[topic].stated(topics[changes[topic].stored]) if topic in changes else own

@@ -1,6 +1,6 @@
-"""Alters topics of runs, as `--set /fix.delay_s=0.3` says; the files stay as they are.
+"""Runs with altered topics, such as `--set /fix.delay_s=0.3`; files stay as they are.
 
-A log is altered block by block. A topic whose stamps move is read for itself, and merged with the others
+A log is altered block by block. A topic whose stamps move is read separately and merged with the others
 by its new stamps: memory holds a block of each, however far the stamps move.
 """
 
@@ -20,7 +20,7 @@ from fuselog.recorders.log import Clock, Stream, Topic
 from fuselog.recorders.parsing import parse_json
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 
-NOTE = "alterations"  # in the metadata of an estimates log
+NOTE = "alterations"  # key in the metadata of an estimates log
 Settings = Mapping[str, Any]
 
 
@@ -31,15 +31,15 @@ def alter(source: MemorySource, settings: Settings) -> MemorySource: ...
 @overload
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource: ...
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
-    """Return a run with topics altered; of one that is altered already, more so.
+    """Alter the topics of a run; alterations are added to those that it already has.
 
-    Where its topics state different planes, it is read in one of them; see `in_one_plane`.
+    If its topics state different tangent planes, they are converted to one; see `in_one_plane`.
 
     Args:
         source: the run.
         settings: values by `/TOPIC.WHAT`, such as `{"/fix.delay_s": 0.3}`; see `changes_of`.
 
-    Raises BadInput where the run has no such topic, the topic no such field, or a value makes no sense.
+    Raises BadInput if the topic or field does not exist, or if a value is invalid.
     """
     if not settings and not in_one_plane(source.name, source.topics, {}):
         return source
@@ -63,7 +63,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 def alter_all(
     sources: Iterable[LogSource | MemorySource], settings: Settings
 ) -> list[LogSource | MemorySource]:
-    """Alter the topics of runs; what is left out, being before 1970, is counted and logged.
+    """Alter the topics of runs; messages left out because they would be before 1970 are logged.
 
     Raises BadInput as `alter`.
     """
@@ -81,7 +81,7 @@ def alter_all(
 def _before_1970(
     stored: LogSource | MemorySource, changes: Mapping[str, Change]
 ) -> dict[str, tuple[int, int]]:
-    """Count the messages, by topic, that changes put before 1970, and those there are."""
+    """Count the messages that changes move before 1970, and all messages, by topic."""
     found = {}
     for topic, change in changes.items():
         if change.is_moving and change.moved(np.array(stored.extent("publish_time")))[0] < 0:
@@ -93,23 +93,23 @@ def _before_1970(
 
 
 def alterations_of(source: Source) -> dict[str, Any]:
-    """Return how a run was altered, by `/TOPIC.WHAT`."""
+    """Return the alterations of a run, by `/TOPIC.WHAT`."""
     return dict(source.alterations) if isinstance(source, AlteredLog | AlteredRecording) else {}
 
 
 def note_of(source: Source) -> dict[str, str]:
-    """Return what the metadata of an estimates log says of the alterations; nothing without any."""
+    """Return the alterations for the metadata of an estimates log; {} without any."""
     return {name: json.dumps(applied) for name, applied in setting_of(source).items()}
 
 
 def setting_of(source: Source) -> dict[str, dict[str, Any]]:
-    """Return what the settings of a result say of the alterations; nothing where there are none."""
+    """Return the alterations for the settings of a result; {} without any."""
     applied = alterations_of(source)
     return {NOTE: applied} if applied else {}
 
 
 def stated_alterations(estimates: Source) -> dict[str, Any]:
-    """Return how the run of an estimates log was altered; raise BadInput where that is garbled."""
+    """Return the alterations of an estimates log's run; raises BadInput if they cannot be read."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get(NOTE, "{}"))
@@ -123,7 +123,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split settings into alterations of topics, and parameters, some of them of single topics.
+    """Split settings into alterations of topics, and parameters, which may belong to single topics.
 
     >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1, "/fix.lever_x_m": 0.4})
     ({'/fix.delay_s': 0.3}, {'gate_probability': 1, '/fix': {'lever_x_m': 0.4}})
@@ -139,7 +139,7 @@ def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @dataclass(frozen=True, repr=False)
 class AlteredRecording(MemorySource):
-    """Represents a recording in memory whose streams are altered; `before` is what it was."""
+    """A recording in memory whose streams are altered; `before` is the unaltered one."""
 
     before: MemorySource = field(kw_only=True)
     alterations: Settings = field(kw_only=True)
@@ -147,7 +147,7 @@ class AlteredRecording(MemorySource):
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """Count the messages, by topic, that would be before 1970, and those there are."""
+        """Count the messages that would be before 1970, and all messages, by topic."""
         return _before_1970(self.before, self.changes)
 
 
@@ -171,24 +171,24 @@ def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
 
 @dataclass(frozen=True, repr=False)
 class AlteredLog(LogSource):
-    """Represents a log file whose topics are altered as they are read."""
+    """A log file whose topics are altered as they are read."""
 
     alterations: Settings = field(default_factory=dict)
 
     @cached_property
     def changes(self) -> dict[str, Change]:
-        """Return what is done to topics."""
+        """Return the changes of topics."""
         changes = changes_of(LogSource(self.log), self.alterations)
         return in_one_plane(self.name, self.log.topics, changes)
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """Count the messages, by topic, that would be before 1970, and those there are."""
+        """Count the messages that would be before 1970, and all messages, by topic."""
         return _before_1970(LogSource(self.log), self.changes)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """Return the log's topics as they are altered."""
+        """Return the log's topics as altered."""
         of_log = self.log.topics
         return {
             name: self.changes[name].stated(of_log[self.changes[name].stored])
@@ -198,13 +198,13 @@ class AlteredLog(LogSource):
         }
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return a span in ns that holds all stamps by a clock, before they are altered and after."""
+        """Return a span in ns that contains all stamps of a clock, before and after alteration."""
         ends = np.array(super().extent(clock))
         moved = [ends, *(each.moved(ends) for each in self.changes.values() if clock == "publish_time")]
         return max(0, int(np.min(moved))), int(np.max(moved))
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return whole topics, in publish-time order, whatever the source's span."""
+        """Read whole topics in publish-time order, whatever the source's span."""
         return self._altered(super().read([self._stored(topic) for topic in topics]), topics)
 
     def empty(self, topic: str) -> Stream:
@@ -213,7 +213,7 @@ class AlteredLog(LogSource):
         return replace(stream, topic=topic, metadata=self.topics[topic].metadata)
 
     def whole(self) -> "AlteredLog":
-        """Return the whole log."""
+        """Return the source over the whole log."""
         return replace(self, start_ns=None, end_ns=None)
 
     def blocks(
@@ -248,7 +248,7 @@ class AlteredLog(LogSource):
         change = self.changes[topic]
         start_ns, end_ns = (
             None if at_ns is None else max(0, change.before(at_ns) + slack_ns)
-            for at_ns, slack_ns in ((self.start_ns, -1), (self.end_ns, 1))  # it was rounded
+            for at_ns, slack_ns in ((self.start_ns, -1), (self.end_ns, 1))  # allows for rounding
         )
         log = LogSource(self.log, start_ns, end_ns, rejections=self.rejections, is_raw=self.is_raw)
         for block in log.blocks([change.stored], "publish_time", block_messages):
@@ -263,9 +263,9 @@ class AlteredLog(LogSource):
 
 
 def in_turn(parts: Iterable[Iterator[dict[str, Stream]]], order: Clock) -> Iterator[dict[str, Stream]]:
-    """Join the blocks of several topics, each in order of time, to one such sequence.
+    """Merge the blocks of several topics, each ordered by time, into one ordered sequence.
 
-    Nothing is handed on before every part has come as far.
+    Messages are yielded only up to the time that every part has reached.
     """
     running, waiting = dict(enumerate(parts)), dict[int, dict[str, Stream]]()
     while running or waiting:

@@ -1,4 +1,5 @@
-"""Finds how sensors are mounted, scaled, biased and delayed, and which motion tells it.
+"""Calibration of mountings, scales, biases and delays of sensors, and which motion determines them.
 
-Begin with `calibrating`, which frees what a model marks for the search of `fuselog.pipeline.tuning`.
+Begin with `calibrating`, which frees the parameters that a model marks for the search in
+`fuselog.pipeline.tuning`.
 """

@@ -1,6 +1,6 @@
-"""Calibrates by the search of `tune`: how sensors are mounted, scaled, biased and delayed.
+"""Calibration with the search of `tune`: mountings, scales, biases and delays of sensors.
 
-A model says which of its parameters these are, see `fuselog.replay.inference.model.model.Model`.
+A model marks the parameters of its calibration, see `fuselog.replay.inference.model.model.Model`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from fuselog.recorders.parameters import merge
 from fuselog.replay.engine.replaying.estimator import Recursive, bind
 from fuselog.replay.foreign.naming import allowed
 
-OPTIONS = ("by", "free")  # of `tune`, which a calibration chooses itself
+OPTIONS = ("by", "free")  # options of `tune` that a calibration chooses itself
 
 
 @without_warnings_of_numbers()
@@ -31,25 +31,25 @@ def calibrate(
     next_motion: bool = False,
     **options: Any,
 ) -> Tuning:
-    """Search the parameters that say how sensors are mounted, scaled, biased and delayed.
+    """Search for the parameters of mountings, scales, biases and delays of sensors.
 
-    Those that the model marks as its calibration, and that something in the logs reads, are searched for
-    together by maximum likelihood. What the motion does not determine is named, stays where it started,
-    and has no interval.
+    All parameters that the model marks as its calibration, and that something in the logs reads, are
+    searched for together by maximum likelihood. Parameters that the motion does not determine are named,
+    stay at their start, and have no interval.
 
     Args:
-        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        logs: one or several logs with the same topics: paths, opened logs, or recordings.
         estimator: a registered name, or a label of your own with what it stands for; see `replay`.
-        set: other parameters, and where the search starts; see `tune`.
-        fixed: parameters of the calibration that are known, and stay as they are set.
-        next_motion: also say which manoeuvre to record next, of a robot with wheels and fixes.
-        options: as for `tune`, but for `free` and `by`.
+        set: values of other parameters, and start values; see `tune`.
+        fixed: calibration parameters that are known, and stay as they are set.
+        next_motion: also recommend the next manoeuvre to record, for a robot with wheels and fixes.
+        options: as for `tune`, except `free` and `by`.
 
     Returns:
-        The parameters with 95 % intervals, and the logs replayed with the values before and after.
+        The parameters with 95 % intervals, and replays of the logs with the start and the found values.
 
-    Raises BadInput where the model marks none, nothing in the logs depends on what it marks, or a next
-    motion is asked of logs without wheels and fixes.
+    Raises BadInput if the model marks no parameter, if nothing in the logs depends on those that it
+    marks, or if a next motion is requested for logs without wheels and fixes.
     """
     for name in OPTIONS:
         if name in options:

@@ -1,4 +1,4 @@
-"""Prints and writes what `fuselog calibrate` and `ellipsoid` find."""
+"""Output of `fuselog calibrate` and `fuselog ellipsoid`."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 def calibrate_logs(
     logs: Sequence[Path], *, fixed: Sequence[str], next_motion: bool, **options: Any
 ) -> None:
-    """Search a model's calibration; `fixed`, `next_motion` as of `calibrate`, others of `tune_logs`."""
+    """Calibrate; `fixed` and `next_motion` are as for `calibrate`, all others as for `tune_logs`."""
     tune_logs(logs, search=partial(calibrate, fixed=fixed, next_motion=next_motion), **options)
 
 
@@ -33,7 +33,7 @@ def show_ellipsoid(
     recover: bool,
     as_json: bool,
 ) -> None:
-    """Print a table of numbers with intervals, then sentences."""
+    """Print a table of numbers with intervals, followed by sentences."""
     paths = [log for path in logs for log in logs_in(path)]
     check_outputs(out, None, {"log": paths})
     sources = [LogSource(open_log(path, recover=recover)) for path in paths]

@@ -1,7 +1,7 @@
-"""Calibrates a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
+"""Calibration of a magnetometer or an accelerometer by rotation: offsets, scales, cross terms.
 
-The field of the Earth and gravity have one length, whichever way a unit is turned. So corrected readings
-lie on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.
+The magnetic field and gravity have a constant length in all orientations of a unit. Corrected readings
+are therefore on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,23 +25,23 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
-FEWEST, MOST = 30, 20_000  # readings; of more, one in so many is taken
-_STILL_S = 0.5  # of an accelerometer, readings are means over so long in which it is still
+FEWEST, MOST = 30, 20_000  # readings; larger sets are thinned out
+_STILL_S = 0.5  # accelerometer readings are means over this time in which it is still
 _STILL = 3.0  # times the spread of the quietest tenth
 _DRAWN = 500
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ellipsoid:
-    """Holds the calibration of a sensor that was turned: corrected = matrix (reading - offset).
+    """The calibration of a sensor that was rotated: corrected = matrix (reading - offset).
 
     Attributes:
-        topic, field: where the readings stand.
+        topic, field: the topic and field of the readings.
         logs: the names of the logs.
-        length: what corrected readings have.
-        is_assumed: whether that is the readings' own, which no one stated.
-        unit: a factor of what the fit calls one.
-        readings: (n, 3) that were fitted.
+        length: the length of corrected readings.
+        is_assumed: whether the length comes from the readings, because none was given.
+        unit: the length that is one in the fit.
+        readings: (n, 3) the fitted readings.
         fitted: the ellipsoid.
     """
 
@@ -59,23 +59,23 @@ class Ellipsoid:
 
     @property
     def offset(self) -> Floats:
-        """Return (3,) in the field's unit; a magnetometer's hard iron, an accelerometer's bias."""
+        """Return the offset (3,) in the field's unit: hard iron, or an accelerometer's bias."""
         return self.unit * self.fitted.numbers[:3]
 
     @property
     def matrix(self) -> Floats:
-        """Return (3, 3), symmetric: a magnetometer's soft iron, else scales and misalignment."""
+        """Return the symmetric matrix (3, 3): a magnetometer's soft iron, or scales and misalignment."""
         return matrix_of(self.fitted.numbers) * self.length / self.unit
 
     @property
     def left_open(self) -> list[str]:
-        """Say what the readings do not determine: all, where too few sides give no ellipsoid."""
+        """Return the undetermined numbers: all, if the orientations are too few for an ellipsoid."""
         places = self.fitted.lacking.places
         return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a row per number: value and 95 % interval; none of what is not determined."""
+        """Return a row per number: value and 95 % interval, NaN if not determined."""
         factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
         values = self.fitted.numbers * factors
         reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
@@ -86,7 +86,7 @@ class Ellipsoid:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Return what corrects a log's readings, for `set`; none where something is not determined."""
+        """Return settings that correct a log's readings; {} if something is not determined."""
         if self.left_open:
             return {}
         stem, _, unit = self.field.rpartition("_")
@@ -99,13 +99,13 @@ class Ellipsoid:
 
     @property
     def lengths(self) -> tuple[Floats, Floats]:
-        """Return the lengths (n,) of readings as they are, and corrected."""
+        """Return the lengths (n,) of uncorrected and corrected readings."""
         corrected = (self.readings - self.offset) @ self.matrix
         return np.linalg.norm(self.readings, axis=1), np.linalg.norm(corrected, axis=1)
 
     @property
     def notes(self) -> list[str]:
-        """Say what is not determined, how well it fits, how it is applied: a sentence each."""
+        """Return sentences on what is not determined, how well it fits, and how to apply it."""
         unit, fitted = unit_of(self.field), self.fitted
         before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
         sentences = []
@@ -139,7 +139,7 @@ class Ellipsoid:
 
     @property
     def chart(self) -> Chart:
-        """Draw the lengths of the readings, as they are and corrected."""
+        """Draw the lengths of uncorrected and corrected readings."""
         rows = np.linspace(0, len(self.readings) - 1, min(_DRAWN, len(self.readings))).astype(int)
         before, after = (each[rows] for each in self.lengths)
         panel = Panel(
@@ -156,7 +156,7 @@ class Ellipsoid:
     def save(self, folder: str | Path) -> ResultFolder:
         """Write the table and the figure to the result folder `folder`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder exists and is not a fuselog result.
         """
         place = Path(folder)
         check_folder(place, {"log": [Path(name) for name in self.logs]})
@@ -177,21 +177,21 @@ class Ellipsoid:
 
 @without_warnings_of_numbers()
 def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
-    """Find offsets, scales and cross terms of a magnetometer or an accelerometer that was turned.
+    """Find offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
 
-    Of an accelerometer readings are taken where it is still, as gravity is all that it senses there. The
-    matrix is symmetric: readings do not tell how the sensor's axes are turned against the body's.
+    Accelerometer readings are used while it is still, because it senses only gravity then. The matrix is
+    symmetric: readings do not determine the rotation between the sensor's and the body's axes.
 
     Args:
-        logs: paths, logs that were opened, or recordings, of one unit that is turned to all sides.
-        field: which, as `/imu.magnetic_field_ut`.
-        length: of the vector, in the field's unit; by default gravity's of a specific force, else what
-            makes the mean of the scales one.
+        logs: paths, opened logs, or recordings, of one unit that is rotated to all sides.
+        field: the field, such as `/imu.magnetic_field_ut`.
+        length: the vector's length in the field's unit; by default gravity's for a specific force,
+            otherwise the one with which the mean of the scales is one.
 
     Returns:
         Offset (3,) and matrix (3, 3) with 95 % intervals, and how well they fit.
 
-    Raises BadInput where a log has no such field, or too few readings.
+    Raises BadInput if a log has no such field, or too few readings.
     """
     sources = sources_of(logs)
     readings = np.concatenate([_readings(source, field) for source in sources])
@@ -220,7 +220,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
 
 
 def _readings(source: LogSource | MemorySource, field: str) -> Floats:
-    """Return the readings (n, 3) of a field; of an accelerometer means where it is still."""
+    """Return the readings (n, 3) of a field; for an accelerometer, means while it is still."""
     topic, _, name = field.rpartition(".")
     if not topic:
         raise BadInput(f"--field {field}: expected TOPIC.FIELD, as /imu.magnetic_field_ut")

@@ -1,8 +1,8 @@
-"""Fits the ellipsoid on which readings of a constant vector lie, however the unit is turned.
+"""A fit of the ellipsoid that readings of a constant vector form when the unit is rotated.
 
-A sensor reads m = A^-1 u + b + n of a vector u of known length, with noise n that is alike in all
-directions. The length tells b and the symmetric A, by maximum likelihood; it does not tell a rotation
-of the sensor's axes. Sets of readings that leave something open: Vasconcelos et al., IEEE T-AES 2011.
+A sensor reads m = A^-1 u + b + n for a vector u of known length, with isotropic noise n. The length
+determines b and the symmetric A, by maximum likelihood; it does not determine a rotation of the sensor's
+axes. Sets of readings that leave something undetermined: Vasconcelos et al., IEEE T-AES 2011.
 """
 
 from typing import NamedTuple
@@ -22,25 +22,25 @@ NAMES = (
     *(f"cross_{AXES[first]}{AXES[second]}" for first, second in PAIRS),
 )
 START = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-USEFUL = 0.01  # of the length: the standard error that a calibration wants
-_WIDE = 1.0  # of the length: how far from its start a value may well be
-_OF_A_CONIC = 5  # numbers: what readings in a plane tell at most
-_STEP = 1e-6  # of the differences
-_LEAST_SIGMA = 1e-9  # of the length
-_FLAT = 0.1  # of how far readings spread in their plane: those of turns about one axis leave it by less
+USEFUL = 0.01  # relative to the length: the standard error that a calibration should reach
+_WIDE = 1.0  # relative to the length: how far a value may be from its start
+_OF_A_CONIC = 5  # numbers that readings in a plane determine at most
+_STEP = 1e-6  # step of differences
+_LEAST_SIGMA = 1e-9  # relative to the length
+# relative to the spread in their plane: readings of rotations about one axis leave it by less
+_FLAT = 0.1
 
 
 class Fit(NamedTuple):
-    """Holds the ellipsoid of readings, in units of a length that they have about their middle.
+    """The ellipsoid of readings, in units of their length relative to their middle.
 
     Attributes:
-        numbers: (9,) as `NAMES` has them.
-        covariance: (9, 9) of the numbers that are determined; of others it is meaningless.
+        numbers: (9,) in the order of `NAMES`.
+        covariance: (9, 9) of the numbers that are determined; meaningless for others.
         lacking: what the readings do not determine.
-        turned_about: the axis next to the only one about which the unit was turned; empty where there
-            were several.
+        turned_about: the axis closest to the only axis of rotation; empty if there were several.
         sigma: the standard deviation of the noise.
-        correlation: of the noise of a reading with that of the next.
+        correlation: of the noise of successive readings.
     """
 
     numbers: Floats
@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
 
 def matrix_of(values: Floats) -> Floats:
-    """Return the symmetric matrix A (3, 3) of values (9,)."""
+    """Make the symmetric matrix A (3, 3) from values (9,)."""
     matrix = np.diag(values[3:6])
     for (row, column), value in zip(PAIRS, values[6:], strict=True):
         matrix[row, column] = matrix[column, row] = value
@@ -60,13 +60,13 @@ def matrix_of(values: Floats) -> Floats:
 
 
 def middle(readings: Floats) -> tuple[Floats, float]:
-    """Return the middle (3,) of readings (n, 3), and their median distance from there."""
+    """Compute the middle (3,) of readings (n, 3), and their median distance from it."""
     place = 0.5 * (readings.min(axis=0) + readings.max(axis=0))
     return place, float(np.median(np.linalg.norm(readings - place, axis=1)))
 
 
 def fit(readings: Floats) -> Fit:
-    """Find the ellipsoid of readings (n, 3), in units of their vector's length.
+    """Fit the ellipsoid of readings (n, 3), in units of their vector's length.
 
     >>> rng = np.random.default_rng(1)
     >>> directions = rng.standard_normal((500, 3))
@@ -79,7 +79,7 @@ def fit(readings: Floats) -> Fit:
     is_flat = bool(spreads[0] < _FLAT**2 * spreads[2])
     near, normal = middle(readings)[0], axes[:, 0]
     starts, directions = [START, np.concatenate([near, START[3:]])], np.eye(len(START))
-    if is_flat:  # else noise across the plane would be taken for the thickness of an ellipsoid
+    if is_flat:  # otherwise noise across the plane would look like the thickness of an ellipsoid
         readings = readings - np.outer((readings - readings.mean(axis=0)) @ normal, normal)
         starts = [np.concatenate([near + normal, START[3:] / np.sqrt(2.0)])]  # a sphere through a circle
         derivatives = _derivatives(starts[0], readings)
@@ -102,7 +102,7 @@ def fit(readings: Floats) -> Fit:
 
 
 def _distances(values: Floats, readings: Floats) -> Floats:
-    """Compute the distances (n,) of readings from an ellipsoid, to first order, outward positive."""
+    """Compute the distances (n,) of readings from an ellipsoid to first order, positive outside."""
     matrix = matrix_of(values)
     vectors = (readings - values[:3]) @ matrix
     lengths = np.linalg.norm(vectors, axis=1)
@@ -119,9 +119,9 @@ def _derivatives(values: Floats, readings: Floats) -> Floats:
 
 
 def _search(start: Floats, directions: Floats, readings: Floats, sigma: float) -> tuple[float, Floats]:
-    """Find the least cost from a start (9,) along directions (m, 9), under a wide prior, and where.
+    """Minimise the cost from a start (9,) along directions (m, 9), under a wide prior.
 
-    Noise along the surface, which is curved, moves readings outward by its variance.
+    Noise along the curved surface moves readings outwards by its variance.
     """
 
     def residuals(along: Floats) -> Floats:

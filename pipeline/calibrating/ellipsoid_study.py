@@ -1,7 +1,7 @@
-"""Studies ellipsoids: how often their intervals hold the truth.
+"""A study of ellipsoids: how often their intervals cover the truth.
 
-A magnetometer is turned steadily, an accelerometer put down in many positions; both err by offsets,
-scales and cross terms.
+A magnetometer is rotated steadily, and an accelerometer is put down in many positions; both have
+offsets, scale errors and cross terms.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,7 +35,7 @@ STEP_S, HELD_S, MOVED_S, POSITIONS = 0.02, 2.0, 1.0, 40
 
 
 class EllipsoidOptions(Parameters):
-    """States which units are calibrated.
+    """Options of the study: the units to calibrate.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.
@@ -70,20 +70,20 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _held(unit: str, seed: int) -> dict[str, bool]:
-    """Tell which intervals of a unit hold the truth."""
+    """Test which intervals of a unit cover the truth."""
     _, truth = UNITS[unit]
     table = calibrated(unit, seed).table
     return dict(zip(NAMES, (table["low"] <= truth) & (truth <= table["high"]), strict=True))
 
 
 def calibrated(unit: str, seed: int) -> Ellipsoid:
-    """Return what is found of a simulated unit."""
+    """Calibrate a simulated unit."""
     name, length = (FIELD, FIELD_UT) if unit == "magnetometer" else (FORCE, None)
     return ellipsoid(recorded(unit, seed), name, length=length)
 
 
 def recorded(unit: str, seed: int) -> MemorySource:
-    """Return a log of a simulated unit; its other sensors say zero."""
+    """Make a log of a simulated unit whose other sensors read zero."""
     draw, truth = UNITS[unit]
     rng = np.random.Generator(np.random.Philox(key=seed))
     vectors, noise = draw(rng)
@@ -103,7 +103,7 @@ def recorded(unit: str, seed: int) -> MemorySource:
 
 
 def turned(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Return the field (n, 3) in a unit that is turned steadily for a minute, and the noise."""
+    """Simulate the field (n, 3) in a unit that is rotated steadily for a minute, and the noise."""
     time_s = STEP_S * np.arange(3000)
     across, up = 1.1 * time_s, 1.5 * np.sin(0.13 * time_s)
     across, up = across + 6.0 * rng.random(), up + 0.05 * rng.random()
@@ -112,7 +112,7 @@ def turned(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def put_down(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Return the specific force (n, 3) of a unit that is moved between positions, and the noise."""
+    """Simulate the specific force (n, 3) of a unit that is moved between positions, and the noise."""
     directions = rng.standard_normal((POSITIONS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     held, moved = round(HELD_S / STEP_S), round(MOVED_S / STEP_S)

@@ -1,7 +1,7 @@
-"""Writes a calibration as Kalibr does: mountings, time shifts and errors of sensors, in YAML.
+"""A calibration in Kalibr's format: mountings, time shifts and errors of sensors, in YAML.
 
-T_sensor_body takes a point from the body's axes to the sensor's, and a message was measured at its stamp
-plus timeshift_sensor_body; Kalibr has both of a camera as T_cam_imu and timeshift_cam_imu.
+T_sensor_body converts a point from the body's axes to the sensor's, and a message was measured at its
+stamp plus timeshift_sensor_body; for a camera, Kalibr calls these T_cam_imu and timeshift_cam_imu.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ HEADING = "bias_heading_rad"
 
 
 def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
-    """Write the values of a calibration by their names, of what is held that nothing is known.
+    """Write the values of a calibration by name, with a comment on those that are not determined.
 
     >>> print(kalibr_yaml({"lever_x_m": 1.2, "fix_delay_s": 0.15}, []).removeprefix(HEAD).strip())
     fix:

@@ -1,8 +1,8 @@
-"""Says which manoeuvre to record next: what each would add to what logs tell of a calibration.
+"""Advice on the next manoeuvre to record: what each would add to the information on a calibration.
 
-Wheeled manoeuvres are simulated without noise, with the sensors, steps and noise of the log and the
-values that were found, and asked for their information. Which is best depends on what is wanted: the
-determinant counts all parameters together, the widest interval the one that is known worst.
+Manoeuvres of a wheeled robot are simulated without noise, with the sensors, steps and noise of the log
+and the values found, to compute their information. The best one depends on the criterion: the
+determinant counts all parameters together, the widest interval the least accurate one.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from fuselog.replay.engine.streams.sources import Source
 
 Floats = NDArray[np.float64]
 DURATION_S = 20.0
-PRIOR = 10.0  # how far off a parameter may be before anything is recorded, in useful units
+PRIOR = 10.0  # how wrong a parameter may be before anything is recorded, in useful units
 SIMULATED = {
     "/car/odometry": schemas.ODOMETRY,
     "/car/fix": schemas.POSITION_FIX,
@@ -35,10 +35,10 @@ SIMULATED = {
 
 
 class Gain(NamedTuple):
-    """Holds what a manoeuvre adds.
+    """The gain of a manoeuvre.
 
     Attributes:
-        nats: half the logarithm of the ratio of determinants, with it and without.
+        nats: half the logarithm of the ratio of determinants, with and without it.
         sigmas: (m,) the standard deviations with it, in useful units.
     """
 
@@ -59,7 +59,7 @@ def gain(known: Floats, added: Floats) -> Gain:
         added: (m, m), in useful units; both together are positive definite.
 
     Returns:
-        The information gained, and the standard deviations (m,) that are left.
+        The information gained, and the remaining standard deviations (m,).
 
     >>> found = gain(np.diag([4.0, 1.0]), np.diag([0.0, 3.0]))
     >>> round(found.nats, 3), found.sigmas.tolist()
@@ -70,12 +70,12 @@ def gain(known: Floats, added: Floats) -> Gain:
 
 
 def manoeuvres(found: Tuning) -> pd.DataFrame:
-    """Return a row per manoeuvre of 20 s, the one first after which the widest interval is narrowest.
+    """Tabulate manoeuvres of 20 s, in ascending order of the widest interval after them.
 
-    Columns: manoeuvre, nats that it gains, and per parameter the standard deviation with it, in its own
-    unit; the row "none" is what the logs tell already.
+    The columns are the manoeuvre, the nats that it gains, and per parameter the standard deviation with
+    it, in its own unit; the row "none" is what the logs already determine.
 
-    Raises BadInput where the logs are not of a robot with wheels.
+    Raises BadInput if the logs are not those of a robot with wheels.
     """
     free = [each for each in found.found.coordinates.free if each.name in NAMES]
     objective, values = found.objective, found.found.optimum
@@ -97,7 +97,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
 
 
 def advice(found: Tuning) -> list[str]:
-    """Say which manoeuvre shrinks the widest interval most, and which the determinant prefers."""
+    """Recommend the manoeuvres that are best for the widest interval and for the determinant."""
     table = manoeuvres(found)
     names = list(table.columns[3:])
     before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
@@ -116,7 +116,7 @@ def advice(found: Tuning) -> list[str]:
 
 
 def _simulated(found: Tuning, log: Source, motion: str) -> Run:
-    """Simulate a manoeuvre as a log of the same topics, with the values that were found."""
+    """Simulate a manoeuvre as a log of the same topics, with the values found."""
     streams = _of_kinds(log)
     odometry_s, fix_s, compass_s = (_step_s(streams.get(topic)) for topic in SIMULATED)
     usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}
@@ -147,7 +147,7 @@ def _simulated(found: Tuning, log: Source, motion: str) -> Run:
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
-    """Find the first topic of a schema that the run has of its own."""
+    """Find the first topic of a schema that the run itself has."""
     for name in topics_of(log.topics, schema):
         if not name.startswith("/estimates/"):
             return log.read([name])[name]
@@ -166,20 +166,20 @@ def _of_kinds(log: Source) -> dict[str, Stream]:
 
 
 def _step_s(stream: Stream | None) -> float:
-    """Return the usual time between messages, in s."""
+    """Compute the median time between messages, in s."""
     if stream is None or len(stream) < 2:
         return 1.0
     return float(np.median(np.diff(stream.publish_time_ns))) * 1e-9
 
 
 def _errors(values: Mapping[str, Any]) -> Floats:
-    """Return the errors of a car (7,), of readings by the motion, where a model has the reverse."""
+    """Compute the errors (7,) of a car, of readings relative to the motion, from a model's values."""
     forward, turn, bias, *others = (float(values[name]) for name in NAMES)
     return np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])
 
 
 def _alike(stream: Stream, like: Stream) -> Stream:
-    """Give a simulated stream the name, the metadata and the covariance of another."""
+    """Give a simulated stream the name, the metadata and the covariance of another one."""
     columns = {
         name: np.repeat(like[name][:1], len(stream), axis=0) if "covariance" in name else column
         for name, column in stream.columns.items()

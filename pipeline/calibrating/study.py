@@ -1,7 +1,7 @@
-"""Studies calibration: how often its intervals hold the truth, and what each motion leaves open.
+"""A study of calibration: how often its intervals cover the truth, and what each motion leaves open.
 
-Cars are calibrated one by one, from a start that knows nothing. What a motion determines is asked of a
-log without noise, under a prior so wide that it tells nothing.
+Cars are calibrated one by one, from an uninformative start. What a motion determines is tested on a log
+without noise, under a prior so wide that it holds no information.
 """
 
 from collections.abc import Sequence
@@ -26,11 +26,11 @@ NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * 
 
 
 class CalibrationOptions(Parameters):
-    """States which cars are calibrated.
+    """Options of the study: the cars to calibrate, and the motions.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.
-        motions: the motions to ask what they leave undetermined.
+        motions: the motions for which undetermined parameters are listed.
     """
 
     seeds: tuple[NonNegativeInt, ...] = ()
@@ -75,7 +75,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> list[dict[str, Any]]:
-    """Calibrate one car; return a row per parameter."""
+    """Calibrate one car and return a row per parameter."""
     table = calibrate(recorded(drive(seed)), {label: settings}).parameters.set_index("parameter")
     rows: list[dict[str, Any]] = []
     for name, true in zip(NAMES, OURS, strict=True):
@@ -95,7 +95,7 @@ def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> 
 
 
 def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[Any]:
-    """Return the motion, and of each parameter whether it stays undetermined."""
+    """Return the motion, and for each parameter whether it stays undetermined."""
     found = calibrate(recorded(drive(None, TRUTH, motion=motion, **WIDE)), {label: settings})
     held = set(found.found.held)
     return [motion, *(name in held for name in NAMES)]

@@ -1,5 +1,5 @@
-"""Explores a filter by hand: a local page whose sliders replay a log while they are dragged.
+"""Interactive exploration of a filter: a local page whose sliders replay a log while they are dragged.
 
 Begin with `session`: a log and the filters on it, without server or browser. `page` binds it to widgets
-and plots, `serving` shows the page to this machine alone.
+and plots, `serving` serves the page to this machine only.
 """

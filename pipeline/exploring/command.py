@@ -1,4 +1,4 @@
-"""The command `fuselog explore`: it serves the page until that is closed."""
+"""The command `fuselog explore`: it serves the page until it is closed."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ def explore_log(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Serve the page, say where it is, and wait until it is closed."""
+    """Serve the page, print its address, and wait until it is closed."""
     alterations, own = split_texts(settings)
     chosen = settings_of_estimators(names, own, settings_file, model=model)
     source = LogSource(open_log(log, recover=recover))

@@ -1,4 +1,4 @@
-"""Computes the curves of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
+"""The curves of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,19 +22,19 @@ from fuselog.replay.judging.errors.evaluation import (
 )
 
 Floats = NDArray[np.float64]
-BIN_S = 1.0  # NIS is drawn as means over so long
-LINES = 400  # a curve has no more points than these, so that it follows the slider
+BIN_S = 1.0  # NIS is drawn as means over this time
+LINES = 400  # most points of a curve, so that it follows the slider
 
 
 class Path(NamedTuple):
-    """Holds positions in the plane (n, 2), at times (n,) since the epoch."""
+    """Positions in the plane (n, 2), at times (n,) since the epoch."""
 
     time_s: Floats
     points: Floats
 
 
 class Nis(NamedTuple):
-    """Holds the mean NIS per component of each span of time (n,), and where 95 % of these lie."""
+    """The mean NIS per component of each time span (n,), and its 95 % interval."""
 
     time_s: Floats
     mean: Floats
@@ -44,19 +44,19 @@ class Nis(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """Holds the curves of one thing that is estimated, such as `robot1`.
+    """The curves of one estimated object, such as `robot1`.
 
     Attributes:
-        name: of it; may be empty.
-        components, kinds: of the state's tangent space.
-        path: of the estimate; None where that has no position.
+        name: its name; may be empty.
+        components, kinds: those of the state's tangent space.
+        path: the path of the estimate; None if it has no position.
         covariance: (n, 2, 2) of the positions on the path.
         sigma: (n, d) as the filter states it at `time_s` (n,).
-        errors: against truth; None without truth.
-        nis: by topic of the sensor or of the filter; None without innovations.
+        errors: errors against truth; None without truth.
+        nis: NIS over time; None without innovations.
         whiteness: by measured component.
-        log_likelihood: of all measurements; NaN where the filter states none.
-        beside: the estimates (n,) of parameters in the state, and of all else that the truth lacks.
+        log_likelihood: of all measurements; NaN if the filter states none.
+        beside: the estimates (n,) of parameters in the state, and of components without truth.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Case:
 
     @property
     def nees_interval(self) -> tuple[float, float]:
-        """Return where 95 % of NEES of a consistent filter lie, of the components that the truth has."""
+        """Return the 95 % interval of a consistent filter's NEES, over the truth's components."""
         assert self.errors is not None
         return chi_square_interval(len(self.errors.components), 1)
 
@@ -85,12 +85,12 @@ def cases_of(
     epoch_ns: int,
     estimated: Sequence[str] = (),
 ) -> dict[str, Case]:
-    """Return what is drawn of a filter's outputs on one log, by the name of what is estimated.
+    """Compute the curves of a filter's outputs on one log, by the name of what is estimated.
 
     Args:
-        outputs: by topic.
-        errors: of them, where there is truth.
-        epoch_ns: of the log.
+        outputs: the outputs, by topic.
+        errors: their errors, if there is truth.
+        epoch_ns: the epoch of the log.
         estimated: parameters that are part of the state.
     """
     of_case = {each.case: each for each in errors}
@@ -171,19 +171,19 @@ def _of_innovations(
 
 
 def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
-    """Return the rows that are drawn of so many: evenly chosen, with the first and the last."""
+    """Choose rows to draw: evenly spaced, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
-    """Choose the rows that are drawn: the extremes of each span, so that no outlier is lost.
+    """Choose rows to draw: the extremes of each span, so that no outlier is lost.
 
     Args:
-        values: (n,); what is not finite counts as 0.
-        most: how many rows are chosen at most; of fewer values all are.
+        values: (n,); values that are not finite count as 0.
+        most: the largest number of rows; fewer values are all chosen.
 
     Returns:
-        The rows, ascending.
+        The rows, in ascending order.
     """
     count = len(values)
     if count <= most:
@@ -198,12 +198,12 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Floats:
-    """Outline the region of the plane that holds the truth with a probability.
+    """Outline the region of the plane that contains the truth with a probability.
 
     Args:
         center: (2,), the estimate.
         covariance: (2, 2), of the estimate.
-        probability: with which the ellipse holds the truth.
+        probability: the probability with which the ellipse contains the truth.
 
     Returns:
         (61, 2), a closed outline in the unit of the center.
@@ -216,9 +216,9 @@ def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Fl
 
 
 def typical_time_s(case: Case) -> float | None:
-    """Return the second whose share of truths outside is nearest the whole run's: there the lens looks.
+    """Choose the second whose share of errors outside the interval is nearest that of the whole run.
 
-    Of several the one in the middle of the run; None without truth.
+    Among several, it is the one in the middle of the run; None without truth.
     """
     if case.errors is None or len(case.errors.nees) == 0:
         return None
@@ -234,7 +234,7 @@ def typical_time_s(case: Case) -> float | None:
 
 
 def instant_of(case: Case | None) -> float:
-    """Return where the lens looks at first: at a typical second, else in the middle."""
+    """Return the first instant of the lens: a typical second, or the middle of the run."""
     if case is None or not len(case.time_s):
         return 0.0
     found = typical_time_s(case)
@@ -242,7 +242,7 @@ def instant_of(case: Case | None) -> float:
 
 
 def true_path(source: MemorySource, topic: str) -> Path | None:
-    """Return the path of a truth of a log; None where it has no position."""
+    """Return the path of a log's truth; None if it has no position."""
     if topic not in source.topics:
         return None
     stream = source[topic]

@@ -1,4 +1,4 @@
-"""Offers `fuselog explore` as a function: a page on which a filter's parameters are dragged."""
+"""The function behind `fuselog explore`: a page with sliders for a filter's parameters."""
 
 import webbrowser
 from collections.abc import Mapping
@@ -23,22 +23,22 @@ def explore(
 ) -> "Explorer":
     """Serve a page on which parameters are dragged while the log is replayed.
 
-    It is served to this machine only, under an address that cannot be guessed. In a notebook the page is
-    shown in the cell that this is the last line of.
+    It is served to this machine only, under an address that cannot be guessed. In a notebook, a cell
+    whose last line calls this function shows the page.
 
     Args:
-        log: a path, a log that was opened, or a recording.
-        estimators: one or two, as `replay` takes them.
-        set: parameters of the filters, and how topics are altered; as `replay` has it.
+        log: a path, an opened log, or a recording.
+        estimators: one or two, as for `replay`.
+        set: parameters of the filters, and alterations of topics; as for `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        show: open it in the browser, but in a notebook.
+        show: whether to open it in the browser, except in a notebook.
 
     Returns:
-        What serves the page until it is closed; `url` is its address, `wait()` waits until the last
-        page is closed, `close()` ends it.
+        The server of the page: `url` is its address, `wait()` waits until the last page is closed,
+        `close()` ends it.
 
-    Raises BadInput where there are several logs, more than two filters, one cannot follow the log, or
-    the extra `explore` is not installed.
+    Raises BadInput if there are several logs or more than two filters, if a filter cannot follow the
+    log, or if the extra `explore` is not installed.
     """
     session = open_session(log, estimators, set=set, gap_limit_s=gap_limit_s)
     try:

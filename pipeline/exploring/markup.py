@@ -1,4 +1,4 @@
-"""Writes the page's words as HTML: verdicts, numbers, labels of sliders. All text is escaped."""
+"""The page's texts as HTML: verdicts, numbers, labels of sliders. All text is escaped."""
 
 from collections.abc import Iterable, Mapping
 from html import escape
@@ -12,14 +12,14 @@ from fuselog.pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
 SIDE = 300  # the width of the sliders' column, in pixels
-SLOW_S = 1.0  # a replay that takes longer is said to
+SLOW_S = 1.0  # a replay that takes longer is reported
 SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
 def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
-    """Write the name of a slider, its value, its ends and where the log's own value is.
+    """Write the name of a slider, its value, its ends and the position of the log's own value.
 
-    Of a parameter in the state the value is where the estimate begins.
+    For a parameter in the state, the value is the initial estimate.
     """
     name = f"{slider.title}, estimated from" if is_estimated else slider.title
     changed = "" if value == slider.default else f"color:{COLOURS[0]};"
@@ -38,20 +38,20 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
 
 
 def pre_html(text: str, width: int | None = None) -> str:
-    """Write a text to copy, in so many pixels if they are given."""
+    """Write a text to copy, with this width in pixels if it is given."""
     fixed = f";width:{width}px" if width else ""
     return f'<pre style="white-space:pre-wrap;margin:4px 0{fixed}">{escape(text)}</pre>'
 
 
 def heading_html(log: str) -> str:
-    """Write what the page is, and of which log."""
+    """Write the page's heading with the name of the log."""
     return f'<h1 style="font:inherit;margin:0"><b>fuselog</b> explore<br>{escape(log)}</h1>'
 
 
 def head_html(
     labels: Iterable[str], played: Mapping[int | str, Played], case: str, estimated: Mapping[str, Slider]
 ) -> str:
-    """Write what stands above the plots: verdicts, numbers, what is estimated in the state."""
+    """Write the text above the plots: verdicts, numbers, parameters estimated in the state."""
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
@@ -68,7 +68,7 @@ def head_html(
 
 
 def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
-    """Say what a filter makes of the parameters in its state, at the end of the log."""
+    """Describe a filter's estimates of the parameters in its state at the end of the log."""
     found = []
     for name, slider in estimated.items():
         if name in case.beside and len(case.time_s):
@@ -80,7 +80,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
 
 
 def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
-    """Write a filter's verdict, in its colour."""
+    """Write a filter's verdict in its colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
     return (
@@ -91,7 +91,7 @@ def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
 
 
 def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
-    """Write its numbers, above those that are pinned."""
+    """Write its numbers, above the pinned ones."""
     cells = []
     before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
     for name, (value, unit) in numbers_of(played.cases[case]).items():

@@ -1,4 +1,4 @@
-"""Does in the background what is asked for: only the newest of what waits."""
+"""A background worker that does only the newest of the waiting requests."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,11 +8,11 @@ Work = Callable[[Callable[[], bool]], None]
 
 
 class NewestFirst:
-    """Does the newest work it is given in a thread; what was waiting before that is forgotten.
+    """A thread that does the newest work; older waiting work is dropped.
 
-    Work is handed a function that tells whether newer work waits, so that it can give up. One thread
-    calls `ask` and `end`. At its end, Python waits for the work at hand, because a thread that is
-    broken off in NumPy's C++ aborts the process.
+    Work receives a function that tells whether newer work waits, so that it can give up. One thread
+    calls `ask` and `end`. At exit, Python waits for the current work, because a thread that is
+    interrupted in NumPy's C++ aborts the process.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -21,13 +21,13 @@ class NewestFirst:
         self._on_error = on_error
 
     def ask(self, work: Work) -> None:
-        """Do this next, in place of what waits; nothing after the end."""
+        """Do this work next, in place of waiting work; nothing after the end."""
         self._newest += 1
         with suppress(RuntimeError):  # it has ended, or Python ends
             self._pool.submit(self._do, work, self._newest)
 
     def end(self) -> None:
-        """Do nothing any more; the work at hand is told that newer work waits."""
+        """Stop; the current work is told that newer work waits."""
         self._newest += 1
         self._pool.shutdown(wait=False)
 

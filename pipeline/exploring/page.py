@@ -1,4 +1,4 @@
-"""Builds the page: sliders, plots and words, bound to a session. Replays run in the background."""
+"""The page: sliders, plots and texts, bound to a session. Replays run in the background."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -43,19 +43,19 @@ from fuselog.pipeline.output.words import label_of as label_of_quantity
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import schemas, topics_of
 
-WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
-# The sliders are to the left of the plots, and below them where there is no room beside.
+WRAP = {"flex-wrap": "wrap"}  # what does not fit goes below, as on a phone
+# The sliders are to the left of the plots, or below them on narrow screens.
 SIDE_LAST = WRAP | {"flex-direction": "row-reverse", "justify-content": "flex-end"}
 GROW = {"flex": "1 1 350px"}
 
 
 class Page:
-    """Builds one page that looks at a session.
+    """A page that shows a session.
 
     Attributes:
-        session: what it looks at.
-        values: of the parameters, where they are not the log's own.
-        played: what was replayed last, by filter (0, 1, or `PINNED`).
+        session: the session.
+        values: values of parameters that differ from the log's own.
+        played: the last replays, by filter (0, 1, or `PINNED`).
     """
 
     def __init__(self, session: Session, document: Document) -> None:
@@ -66,17 +66,17 @@ class Page:
         self._work = NewestFirst(self._say_error)
         self._active = session.sliders[0] if session.sliders else None
         self._at_s: float | None = None
-        self._known = dict(session.filters)  # those that were given can be chosen again
+        self._known = dict(session.filters)  # given filters can be chosen again
         self._is_setting = False
         self._along: Callable[..., None] = lambda **_: None
         self._make()
         self._first()
 
     def end(self) -> None:
-        """Replay nothing any more."""
+        """Stop replaying."""
         self._work.end()
 
-    # What is on the page.
+    # Contents of the page.
 
     def _make(self) -> None:
         log = self.session.log
@@ -86,7 +86,8 @@ class Page:
         self._command = Div(name="command", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
-        self._time = time = time_range(self.session.source.epoch_ns)  # its ends come with estimates
+        # its ends are set with the first estimates
+        self._time = time = time_range(self.session.source.epoch_ns)
         self.truths = topics_of(log.topics, schemas.TRUTH_STATE)
         self.plots: dict[str, Plot] = {
             "scene": scene_plot(log, self.truths),
@@ -119,7 +120,7 @@ class Page:
         self._fill_side()
 
     def _fill_side(self) -> None:
-        """Fill all that is to the left: filters, buttons, sliders."""
+        """Fill the left column: filters, buttons, sliders."""
         session = self.session
         heading = Div(text=heading_html(session.source.name), width=SIDE)
         names = list(dict.fromkeys([*self._known, *session.methods]))
@@ -163,7 +164,7 @@ class Page:
         label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
         widget.tags = tags_of(slider, value)
 
-    # What a person does.
+    # Actions of the user.
 
     def _choose(self, attr: str, old: str, new: str) -> None:  # noqa: ARG002
         """Show another case or component."""
@@ -172,7 +173,7 @@ class Page:
             self._along(case=self._chosen_case())
 
     def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
-        """Look at other filters with the same values."""
+        """Show other filters with the same values."""
         first, second = (each.value for each in choices)
         labels = [first] if second in (NONE, first) else [first, second]
         try:
@@ -248,7 +249,7 @@ class Page:
         self._work.ask(work)
 
     def _estimate(self) -> None:
-        """Take the parameter that was dragged last into the state, or out of it again."""
+        """Add the parameter that was dragged last to the state, or remove it from the state."""
         if self._active is None:
             return
         name = self._active.name
@@ -279,7 +280,7 @@ class Page:
         self._work.ask(work)
 
     def _set(self, values: Mapping[str, float]) -> None:
-        """Put the sliders to values, and replay."""
+        """Set the sliders to values, and replay."""
         self.values = dict(values)
         self._is_setting = True
         try:
@@ -292,7 +293,7 @@ class Page:
             self._is_setting = False
         self._replay()
 
-    # What follows from it.
+    # Reactions.
 
     def _first(self) -> None:
         played: dict[int | str, Played] = {
@@ -309,9 +310,9 @@ class Page:
         self._replay()
 
     def _replay(self) -> None:
-        """Replay with the values as they are; what is newer by then is replayed instead."""
+        """Replay with the current values; newer requests replace this one."""
         values, session, active = dict(self.values), self.session, self._active
-        self._saved.text = ""  # it was of other values
+        self._saved.text = ""  # it belongs to other values
 
         def work(is_newer: Callable[[], bool]) -> None:
             played: dict[int | str, Played] = {}
@@ -335,7 +336,7 @@ class Page:
         self._work.ask(work)
 
     def _rest(self, along: Callable[..., None]) -> None:
-        """Show the likelihood, and name what the plots show, once a slider rests."""
+        """Show the likelihood, and update the plots' accessible names, once a slider rests."""
         self._along = along
         self._along(case=self._chosen_case())
         self.plots["likelihood"].show_if_drawn()
@@ -359,7 +360,7 @@ class Page:
             self._component.value = components[0]
 
     def _show(self) -> None:
-        """Draw what was replayed, and say what it is worth."""
+        """Draw the last replays and the verdicts."""
         case = self._chosen_case()
         component = str(self._component.value or "")
         for place, played in self.played.items():
@@ -387,7 +388,7 @@ class Page:
         self._head.text = head_html(self.session.filters, self.played, case, estimated)
         try:
             self._command.text = pre_html(self.session.command(self.played[0].values))
-        except BadInput as error:  # of an estimator of one's own
+        except BadInput as error:  # an estimator defined in Python has no command
             self._command.text = f"<p>{escape(str(error))}</p>"
 
     def _chosen_case(self) -> str:
@@ -404,5 +405,5 @@ class Page:
         self._later(lambda: self._tell(message))
 
     def _later(self, act: Callable[[], object]) -> None:
-        """Change the page from the thread that may."""
+        """Schedule a change of the page on the thread that may make it."""
         self._document.add_next_tick_callback(act)

@@ -1,4 +1,4 @@
-"""Makes the plots of the page, and fills them: Bokeh figures over sources that change with a drag."""
+"""The plots of the page: Bokeh figures over sources that change with a drag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,56 +32,56 @@ from fuselog.pipeline.output.words import label_of, quantity
 from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.sources import MemorySource
 
-# The report's ink, quiet grey and crimson; a filter has its own colour, what is pinned is a grey ghost.
+# The report's ink, quiet grey and crimson; each filter has its colour, and pinned results are grey.
 INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e7eb"
 COLOURS = ("#a35c00", "#1f7a4d")
 PINNED = "pinned"
-SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # so that lags can be told apart
+SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # so that lags can be distinguished
 HEIGHT, HEIGHT_OVER_TIME = 220, 235
-LEAST_DROP = 10.0  # of log-likelihood, that its plot shows at least
-ABOUT_PEAK = 3  # values to either side of it that are seen
+LEAST_DROP = 10.0  # least range of log-likelihood in its plot
+ABOUT_PEAK = 3  # values on either side of the peak that are shown
 LEAST_CORRELATION = 0.25
-TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # places of a slider
+TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # positions of a slider
 
 
 @dataclass
 class Plot:
-    """Holds a figure with what changes in it.
+    """A figure with its changing sources.
 
     Attributes:
-        figure: as Bokeh draws it.
-        sources: of what changes, by filter (0, 1, or `PINNED`) and by what it is, such as "line".
+        figure: the Bokeh figure.
+        sources: the changing data, by filter (0, 1, or `PINNED`) and by content, such as "line".
     """
 
     figure: Any
     sources: dict[tuple[int | str, str], ColumnDataSource] = field(default_factory=dict)
 
     def source(self, of: int | str, what: str, *columns: str) -> ColumnDataSource:
-        """Return a source that is empty still."""
+        """Add an empty source."""
         made = ColumnDataSource({name: [] for name in columns}, name=f"{self.figure.name}-{what}-{of}")
         self.sources[of, what] = made
         return made
 
     def say(self, title: str) -> None:
-        """Give it a title."""
+        """Set the title."""
         self.figure.title.text = title
 
     def name(self) -> None:
-        """Tell a screen reader the title; this is slow, and so done once a slider rests."""
+        """Set the title for screen readers; this is slow, and so done only once a slider rests."""
         self.figure.html_attributes = {"role": "img", "aria-label": self.figure.title.text}
 
     def show_if_drawn(self) -> None:
-        """Show it only where something is drawn of a filter."""
+        """Show the figure only if it has data of a filter."""
         self.figure.visible = any(len(x) for of in self.sources.values() for x in of.data.values())
 
     def clear(self, of: int | str) -> None:
-        """Draw nothing of a filter."""
+        """Remove the data of a filter."""
         for own, what in self.sources:
             if own == of:
                 self.fill(of, what, **{name: [] for name in self.sources[own, what].data})
 
     def fill(self, of: int | str, what: str, **columns: Any) -> None:
-        """Draw other values; nothing where there is no such source, or they are drawn already."""
+        """Set the data of a source if the source exists and the data differs."""
         if (of, what) not in self.sources:
             return
         source = self.sources[of, what]
@@ -90,7 +90,7 @@ class Plot:
 
 
 def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
-    """Return an empty figure of the page's look, without a tool bar."""
+    """Make an empty figure in the page's style, without a tool bar."""
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
@@ -100,7 +100,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
         toolbar_location=None,
         tools="",
         output_backend="canvas",
-        min_border_right=20,  # where the last number of the axis stands
+        min_border_right=20,  # room for the last number of the axis
         **ranges,
         **options,
     )
@@ -124,7 +124,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
-    """Plot errors of one component, tinted where the filter says that 95 % of them lie."""
+    """Make the plot of one component's errors, tinted over the 95 % interval that the filter states."""
     plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
     plot.figure.yaxis.ticker = FixedTicker(ticks=[])
     for of in (1, 0):
@@ -137,7 +137,7 @@ def error_plot(over_time: Range1d, cursor: Span) -> Plot:
 
 
 def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
-    """Plot NEES or NIS on a logarithmic axis over time, grey where those of an honest filter lie."""
+    """Make a logarithmic plot of NEES or NIS over time, grey over the interval if consistent."""
     plot = blank(name, title, over_time=over_time, y_range=Range1d(0.1, 100.0), y_axis_type="log")
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT, fill_alpha=1.0)
@@ -149,7 +149,7 @@ def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
 
 
 def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
-    """Plot the plane from above: map, truth, estimates."""
+    """Make the plot of the plane from above: map, truth, estimates."""
     plot = blank("scene", "Scene from above (m)", match_aspect=True)
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     points = map_points(log)
@@ -167,10 +167,10 @@ def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
 
 
 def lens_plot() -> Plot:
-    """Draw the scene at one instant, so near that errors of centimetres are seen."""
+    """Make the plot of the scene at one instant, close enough to show errors of centimetres."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
-    plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # of many digits each
+    plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # its numbers have many digits
     plot.figure.match_aspect = True
     plot.figure.line("x", "y", source=plot.source(0, "truth", "x", "y"), line_color=INK, line_width=2)
     for of in (PINNED, 1, 0):
@@ -184,7 +184,7 @@ def lens_plot() -> Plot:
 
 
 def whiteness_plot() -> Plot:
-    """Plot autocorrelations of the component of the whitened innovations that is least white."""
+    """Make the autocorrelation plot of the whitened innovations' least white component."""
     plot = blank("whiteness", "Whiteness", y_range=Range1d(-0.25, 0.25))
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT)
@@ -198,7 +198,7 @@ def whiteness_plot() -> Plot:
 
 
 def likelihood_plot() -> Plot:
-    """Plot the log-likelihood of all measurements over the parameter that is dragged."""
+    """Make the plot of the log-likelihood of all measurements over the dragged parameter."""
     plot = blank("likelihood", "Likelihood", x_range=Range1d(-0.05, 1.05), y_range=Range1d(0.0, 1.0))
     plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
     plot.figure.xaxis.ticker = FixedTicker(ticks=TICKS)
@@ -228,10 +228,10 @@ def show_played(
 
 
 def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
-    """Show the error of a component; without truth its estimate or how sure the filter is of it."""
+    """Draw the error of a component; without truth, its estimate or the filter's 95 % interval."""
     errors, name = case.errors, label_of(component)
     if errors is None or component not in errors.components:
-        if component not in case.components:  # as of a filter without it in the state
+        if component not in case.components:  # for example, a filter without it in the state
             plot.clear(of)
             return
         sigma, t = 1.96 * case.sigma[:, case.components.index(component)], case.time_s
@@ -301,7 +301,7 @@ def show_lens(
     truth: Path | None,
     at_s: float,
 ) -> None:
-    """Look at one instant: truth, estimates and the ellipses that hold the truth with 95 %."""
+    """Show one instant: truth, estimates and the ellipses that contain the truth with 95 %."""
     first = played[0].cases.get(case) if 0 in played else None
     if first is None or first.path is None or not len(first.path.points):
         return
@@ -336,7 +336,7 @@ def show_likelihood(
     case: str,
     now: float,
 ) -> None:
-    """Draw a case's likelihood along a parameter, its peak, and where its value is now."""
+    """Draw a case's likelihood along a parameter, its peak, and the current value."""
     points = [(value, each[case]) for value, each in along if np.isfinite(each.get(case, np.nan))]
     if not points:
         return
@@ -356,7 +356,7 @@ def show_likelihood(
 
 
 def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
-    """Choose the error's axis so that all but rare errors are seen, of what is pinned too."""
+    """Scale the error's axis so that all except rare errors are visible, including pinned ones."""
     most, ends = 0.0, [0.0]
     for each in played.values():
         one = each.cases.get(case)
@@ -373,21 +373,22 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
         low, high = min(ends) - 1.1 * most, max(ends) + 1.1 * most
         plot.figure.y_range.update(start=low, end=high)
         ticks = ticks_between(low, high, unit_of(component))
-        plot.figure.yaxis[0].ticker.ticks = list(ticks)  # a new ticker has Bokeh look through all models
+        # with a new ticker, Bokeh would search all models
+        plot.figure.yaxis[0].ticker.ticks = list(ticks)
         plot.figure.yaxis.major_label_overrides = ticks
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
-    """Draw a line for what is pinned and for each filter, the second dashed on top."""
+    """Add a line for pinned results and one for each filter, the second dashed and on top."""
     for of in (PINNED, 0, 1):
         colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
         source = plot.source(of, "line", x, y)
-        dash = "dashed" if of == 1 else "solid"  # so that two that coincide are both seen
+        dash = "dashed" if of == 1 else "solid"  # so that both are visible if they coincide
         plot.figure.line(x, y, source=source, line_color=colour, line_width=width, line_dash=dash)
 
 
 def _foot(plot: Plot) -> None:
-    """Draw a strip of marks at the foot, where the first filter is outside."""
+    """Add a strip of marks at the bottom, where the first filter is outside its interval."""
     plot.figure.extra_y_ranges = {"foot": Range1d(0.0, 1.0)}
     marks = plot.source(0, "outside", "t", "foot")
     plot.figure.scatter("t", "foot", source=marks, marker="dash", angle=np.pi / 2, size=7, color=RED,

@@ -1,7 +1,8 @@
-"""Shows the page to this machine alone: a server on the loopback interface, its address a secret.
+"""The server of the page: on the loopback interface, under a secret address.
 
-Whoever does not know the token in the address is refused, and so is a request by another host name or
-from another origin; the WebSocket needs the page's own. When the last page is closed the server ends.
+Requests without the token in the address are refused, and so are requests by another host name or from
+another origin; the WebSocket requires the page's own origin. When the last page is closed the server
+ends.
 """
 
 import asyncio
@@ -46,23 +47,23 @@ TEMPLATE = """
 <script>
 """
 TEMPLATE += NAME_SLIDERS + "</script>{% endblock %}"
-CLOSED_MS = 3000  # after a page is closed; one that is loaded again is back by then
+CLOSED_MS = 3000  # after a page is closed; a reloaded page is back by then
 
-# Whose loggers say what a request did wrong, with its address.
+# Loggers that report faulty requests, with their address.
 _LOGGERS = ("asyncio", "bokeh", "tornado")
 _LONGEST = 300
 
 
 class Explorer:
-    """Serves a page.
+    """A server of pages.
 
     Attributes:
-        session: what it looks at.
+        session: the session that the pages show.
         url: its address, which only this machine reaches.
     """
 
     def __init__(self, session: Session) -> None:
-        """Serve pages on a free port of the loopback interface, in a thread of its own."""
+        """Serve pages on a free port of the loopback interface, in a separate thread."""
         self.session = session
         self._token = secrets.token_urlsafe(24)
         self._pages: dict[str, Page] = {}
@@ -72,10 +73,10 @@ class Explorer:
         self._thread = Thread(target=self._serve, name="fuselog explore, server", daemon=True)
         self._thread.start()
         self._is_up.wait()
-        atexit.register(self.close)  # Python up to 3.13 would break the thread off, which can abort it
+        atexit.register(self.close)  # Python up to 3.13 would kill the thread, which can abort it
 
     def close(self) -> None:
-        """End the server and what it is doing."""
+        """End the server and its work."""
         atexit.unregister(self.close)
         self._stop()
         self._thread.join(timeout=5.0)
@@ -88,7 +89,7 @@ class Explorer:
             self.close()
 
     def _repr_html_(self) -> str:
-        """Return the page within a notebook's cell."""
+        """Return the page for a notebook's cell."""
         return f'<iframe src="{self.url}" width="100%" height="900" style="border:0"></iframe>'
 
     def _serve(self) -> None:
@@ -138,22 +139,22 @@ class Explorer:
 
 
 class _Refused(RequestHandler):
-    """Answers a request that is not the page's own."""
+    """An answer to requests that are not the page's own."""
 
     def initialize(self, code: int) -> None:
-        """Keep the code of the answer."""
+        """Store the code of the answer."""
         self._code = code
 
     def prepare(self) -> None:
-        """Answer before any method is called."""
+        """Send the answer before any method is called."""
         self.send_error(self._code)
 
     def log_exception(self, *_: Any) -> None:
-        """Say nothing: who is refused may ask very often."""
+        """Log nothing, because refused requests may be frequent."""
 
 
 def _guard(application: Handlers, origin: str, prefix: str) -> None:
-    """Have an application answer only what is asked by the address that its page was printed with."""
+    """Make an application answer only requests to the address that was printed for its page."""
     find = application.find_handler
 
     def find_own(request: HTTPServerRequest, **given: Any) -> Any:
@@ -167,7 +168,10 @@ def _guard(application: Handlers, origin: str, prefix: str) -> None:
 
 
 def _code_of(request: HTTPServerRequest, origin: str, prefix: str) -> int | None:
-    """Return why a request is refused: 404 without the secret, 403 from elsewhere; None if it is not."""
+    """Return the code for a refused request, or None.
+
+    It is 404 without the secret, and 403 from another host or origin.
+    """
     path = (request.path or "").encode()
     begin = f"{prefix}/".encode()
     if not compare_digest(path[: len(begin)], begin):
@@ -179,7 +183,7 @@ def _code_of(request: HTTPServerRequest, origin: str, prefix: str) -> int | None
 
 
 class _OneLineAKind(logging.Handler):
-    """Says one line for each kind of fault, without the secret."""
+    """A logging handler that emits one line per kind of fault, without the secret."""
 
     def __init__(self, secret: str) -> None:
         super().__init__(logging.WARNING)
@@ -187,7 +191,7 @@ class _OneLineAKind(logging.Handler):
         self._said: set[object] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Say what is wrong unless its like was said before."""
+        """Log a fault unless a similar one was logged before."""
         error = record.exc_info[1] if record.exc_info else None
         kind = (record.name, type(error), None if error else record.msg)
         if kind not in self._said:
@@ -199,7 +203,7 @@ class _OneLineAKind(logging.Handler):
 
 @contextmanager
 def _quiet(secret: str) -> Iterator[None]:
-    """Reduce what the server's libraries log meanwhile to one line for each kind of fault."""
+    """Reduce the log messages of the server's libraries to one line per kind of fault."""
     handler = _OneLineAKind(secret)
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(each, each.handlers, each.propagate) for each in loggers]

@@ -1,4 +1,4 @@
-"""Keeps a log in memory and the filters on it, without server or browser: replays what changes."""
+"""A log in memory and the filters on it, without server or browser, and its replays."""
 
 import json
 import shlex
@@ -36,19 +36,19 @@ from fuselog.replay.timeline import viewer
 
 Values = Mapping[str, float]
 MOST = 2  # filters side by side
-NO_FILTERS = ("bound",)  # methods that estimate nothing
+NO_FILTERS = ("bound",)  # methods without estimates
 
 
 @dataclass(frozen=True)
 class Played:
-    """Holds one filter's replay with some settings.
+    """One filter's replay with some settings.
 
     Attributes:
-        label: the filter's.
-        values: of the parameters that were set.
-        cases: what is drawn, by the name of what is estimated.
-        verdicts: likewise.
-        seconds: what replaying and judging took.
+        label: the filter's label.
+        values: the values of parameters that were set.
+        cases: the curves, by the name of what is estimated.
+        verdicts: the verdicts, likewise.
+        seconds: the time for replaying and judging.
     """
 
     label: str
@@ -60,13 +60,13 @@ class Played:
 
 @dataclass
 class Session:
-    """Explores one log with one filter or several.
+    """One log with one filter or several.
 
     Attributes:
-        source: the log, altered as it was asked for.
+        source: the log, with the requested alterations.
         filters: settings by label.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        estimated: parameters that are part of the state, with their standard deviations at the start.
+        estimated: parameters that are part of the state, with their initial standard deviations.
     """
 
     source: LogSource | MemorySource
@@ -84,22 +84,22 @@ class Session:
 
     @property
     def log(self) -> MemorySource:
-        """Return what is in memory of the log."""
+        """Return the part of the log that is in memory."""
         return self._run.ensemble[0]
 
     def slider(self, name: str) -> Slider:
-        """Return the slider of a parameter; raises BadInput where it has none."""
+        """Return the slider of a parameter; raises BadInput if it has none."""
         found = next((each for each in self.sliders if each.name == name), None)
         if found is None:
             raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
         return found
 
     def has(self, name: str) -> bool:
-        """Tell whether a parameter has a slider."""
+        """Test whether a parameter has a slider."""
         return any(each.name == name for each in self.sliders)
 
     def like_first(self, method: str) -> dict[str, Any]:
-        """Return the settings of a filter by another method, of the same model if it is one's own."""
+        """Copy the first filter's settings for another method, with the same model."""
         like = next(iter(self.filters.values()))
         kind = like.get("kind")
         model = model_of(kind) if isinstance(kind, Estimator) else None
@@ -107,7 +107,7 @@ class Session:
 
     @property
     def methods(self) -> list[str]:
-        """Return the methods by which another filter can follow the log, with the first's settings."""
+        """Return the methods that can follow the log with the first filter's settings."""
         found = []
         for method in METHODS:
             with suppress(BadInput):
@@ -116,13 +116,14 @@ class Session:
         return found
 
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
-        """Return the same log with other filters; raises BadInput where one cannot follow it."""
+        """Make a session of the same log with other filters; raises BadInput if one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
-        """Return the same with these parameters in the state, each from a quarter of its slider's way.
+        """Make a session with these parameters in the state.
 
-        Raises BadInput where a filter cannot estimate one.
+        Their initial standard deviation is a quarter of the slider's range. Raises BadInput if a filter
+        cannot estimate one of them.
         """
         for label in self.filters:
             if names and not self._takes(label, "estimate"):
@@ -133,7 +134,7 @@ class Session:
     def play(self, label: str, values: Values) -> Played:
         """Replay one filter with some parameters set, and judge it.
 
-        The log-likelihood is that with an open gate, as `likelihoods` has it. Raises BadInput where it
+        The log-likelihood is that with an open gate, as in `likelihoods`. Raises BadInput if the filter
         refuses the parameters, or cannot begin.
         """
         begin = time.perf_counter()
@@ -155,10 +156,10 @@ class Session:
     def likelihoods(
         self, label: str, values: Values, name: str, count: int = 15
     ) -> Iterator[tuple[float, Mapping[str, float]]]:
-        """Yield the log-likelihood of each case along one parameter, from its least value on.
+        """Yield the log-likelihood of each case along one parameter, in ascending order.
 
-        One of the parameter's values is that which it has. The gate is open: likelihoods of other
-        measurements are not to be compared.
+        The current value is included. The gate is open, because likelihoods of different measurements
+        cannot be compared.
         """
         slider = self.slider(name)
         opened = OPEN if name not in OPEN and self._takes(label, *OPEN) else {}
@@ -167,13 +168,13 @@ class Session:
                 yield value, self._likelihoods(label, {**values, **opened, name: value})
 
     def _likelihoods(self, label: str, values: Values) -> dict[str, float]:
-        """Return the log-likelihood of each case by a replay that is not judged."""
+        """Compute the log-likelihood of each case with a replay that is not judged."""
         outputs = collect(replay(self._run.ensemble, self._bound(label, values, self._run.ensemble)))
         cases = cases_of(outputs, [], self.source.epoch_ns)
         return {name: case.log_likelihood for name, case in cases.items()}
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
-        """Find the best values of some parameters, the others as they are set, and by what.
+        """Find the best values of some parameters, with the others as set, and return the criterion too.
 
         Raises BadInput as `tune` does.
         """
@@ -184,16 +185,16 @@ class Session:
         return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}, found.objective.by
 
     def diagnosed(self, label: str, values: Values) -> list[str]:
-        """Return what is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
+        """Return the sentences of a diagnosis; raises BadInput as `diagnose` does."""
         found = diagnose(
             self.source, {label: self.settings(label, values)}, gap_limit_s=self.gap_limit_s
         )
         return found.told
 
     def view(self, values: Values, at_s: float | None) -> None:
-        """Open the timeline of all filters in the viewer, at an instant; until it is closed.
+        """Show the timeline of all filters in the viewer, at an instant, until the viewer is closed.
 
-        Raises BadInput where there is no screen, or the viewer cannot run.
+        Raises BadInput if there is no screen, or if the viewer cannot run.
         """
         with scratch_folder("fuselog-explore") as folder:
             rrd = folder / "timeline.rrd"
@@ -202,7 +203,7 @@ class Session:
             viewer.view(rrd, at_s=at_s)
 
     def settings(self, label: str, values: Values) -> dict[str, Any]:
-        """Return the settings of a filter, with values over its own where it has such parameters."""
+        """Return the settings of a filter, with values for those parameters that it has."""
         own = self.filters[label]
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
         for name, value in taken.items():
@@ -212,9 +213,9 @@ class Session:
         return dict(own)
 
     def toml(self, values: Values) -> str:
-        """Return all filters' settings as a settings file has them, for `--settings`.
+        """Write all filters' settings as a settings file for `--settings`.
 
-        Raises BadInput where one is no text, such as an estimator of one's own.
+        Raises BadInput for an estimator defined in Python, which is not text.
         """
         tables = {}
         for label in self.filters:
@@ -227,7 +228,7 @@ class Session:
         return tomli_w.dumps(tables)
 
     def command(self, values: Values) -> str:
-        """Write the command that replays the same; raises BadInput for an estimator of one's own."""
+        """Write the command of the same replay; raises BadInput for an estimator defined in Python."""
         place = self.source.log.path if isinstance(self.source, LogSource) else self.source.name
         words = ["fuselog replay", shlex.quote(str(place))]
         for label, own in self.filters.items():
@@ -258,7 +259,7 @@ class Session:
 
 
 def _set_to(label: str, value: Any) -> str:
-    """Write a setting as `--set` takes it: JSON's texts, numbers and lists are TOML's."""
+    """Write a setting as `--set` takes it: texts, numbers and lists of JSON are valid TOML."""
     if isinstance(value, Estimator):
         raise BadInput(f"{label}: is an estimator of your own; a command cannot name it")
     return json.dumps(value)
@@ -271,15 +272,15 @@ def open_session(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
 ) -> Session:
-    """Begin to explore one log.
+    """Start exploring one log.
 
     Args:
-        log: a path, a log that was opened, or a recording.
-        estimators: as `replay` takes them.
-        set: parameters of the filters, and how topics are altered; as `replay` has it.
+        log: a path, an opened log, or a recording.
+        estimators: as for `replay`.
+        set: parameters of the filters, and alterations of topics; as for `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
-    Raises BadInput where there are several logs or too many filters, or one cannot follow the log.
+    Raises BadInput if there are several logs or too many filters, or if one cannot follow the log.
     """
     alterations, given = split_settings(set or {})
     sources = sources_of(log, alterations)

@@ -1,4 +1,4 @@
-"""Chooses which parameters have sliders, between which values, and how a person reads these."""
+"""The choice of parameters with sliders, their ranges, and the text of their values."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,24 +15,25 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.model.parameters import number_fields
 
 STEPS = 400  # between the ends of a slider
-FACTOR = 10.0  # a positive parameter goes from its own value divided by this to as many times it
-# How far a parameter of either sign goes where its own value is zero, by its unit.
+# a positive parameter ranges from its own value divided by this to its own value times this
+FACTOR = 10.0
+# Range of a parameter with an own value of zero, by unit.
 REACH = {"m": 1.0, "rad": 0.2, "rad/s": 0.05, "m/s": 1.0, "s": 1.0, "m/s^2": 0.5}
 STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
 
 
 class Slider(Parameter):
-    """Is a parameter that can be dragged; `default` is its own value on the log.
+    """A parameter that can be dragged; `default` is its own value on the log.
 
-    Its group is a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
+    Its group is a topic, `MOTION` or `GATE`, or the label of an estimator without a model.
     """
 
     __slots__ = ()
 
     @property
     def title(self) -> str:
-        """Return the name as a person reads it: without its unit.
+        """Return the name without its unit, as text for people.
 
         >>> Slider("sigma_range_m").title
         'sigma range'
@@ -40,12 +41,12 @@ class Slider(Parameter):
         return parted(self.name)[0].replace("_", " ")
 
     def place(self, value: float) -> float:
-        """Return where a value lies between the ends: 0 to 1, beyond them less or more."""
+        """Compute the position of a value between the ends: 0 to 1, or outside that range."""
         value, low, high = (self._straight(each) for each in (value, self.low, self.high))
         return (value - low) / (high - low)
 
     def value(self, place: float) -> float:
-        """Return the value at a place from 0 to 1, to four digits; the own value where it is that."""
+        """Compute the value at a position from 0 to 1, to four digits; the own value at its position."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
         value = float(f"{math.exp(there) if self.is_log else there:.4g}")
@@ -54,7 +55,7 @@ class Slider(Parameter):
         return min(max(value, self.low), self.high)
 
     def values(self, count: int) -> list[float]:
-        """Return so many values from end to end."""
+        """Compute `count` values from end to end."""
         return [self.value(place) for place in np.linspace(0.0, 1.0, count).tolist()]
 
     def _straight(self, value: float) -> float:
@@ -63,12 +64,12 @@ class Slider(Parameter):
         return math.log(value) if value > 0.0 else -math.inf
 
     def words(self, value: float) -> str:
-        """Return a value with its unit, as people write it."""
+        """Return a value with its unit, as text for people."""
         return in_words(value, self.unit)
 
 
 def in_words(value: float, unit: str) -> str:
-    """Return a number with its unit, as people write it.
+    """Format a number with its unit, as text for people.
 
     >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
     ('10 cm', '1.15°', '−0.99', '0°')
@@ -79,7 +80,7 @@ def in_words(value: float, unit: str) -> str:
 
 
 def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
-    """Round values between two ends, a few of them, as people write them: in one unit.
+    """Choose a few round values between two ends, with their texts in one unit.
 
     >>> ticks_between(-0.03, 0.03, "m")
     {-0.02: '−2 cm', 0.0: '0', 0.02: '2 cm'}
@@ -94,14 +95,14 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
-    """Return the parameters of filters that can be dragged, those of one group together.
+    """List the parameters of filters that can be dragged, grouped.
 
-    Of an estimator of a model these are the parameters that its functions read on this log; of any other
-    all its numbers that have a value above zero, but for how a program is run.
+    For an estimator with a model, these are the parameters that its functions read on this log; for any
+    other one, all its positive numbers, except settings of how a program is run.
 
     Args:
         source: the log.
-        bound: by label.
+        bound: the filters, by label.
     """
     found: dict[str, Slider] = {}
     for label, each in bound.items():
@@ -115,7 +116,7 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
 
 
 def _groups(label: str, bound: Bound) -> dict[str, str]:
-    """Name the parameters that matter on this log, with what they are of."""
+    """Return the parameters that matter on this log, with their groups."""
     assert bound.parameters is not None
     if not isinstance(bound, Recursive) or bound.reading is None:
         numbers = numbers_of(type(bound.parameters))
@@ -133,12 +134,12 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
 
 
 def _order(group: str, topics: Sequence[str]) -> int:
-    """Order sensors as they are read, then the motion."""
+    """Order sensors as they are read, followed by the motion."""
     return topics.index(group) if group in topics else len(topics)
 
 
 def _slider(name: str, group: str, source: LogSource | MemorySource, bound: Bound) -> Slider | None:
-    """Make the slider of a parameter; None where it is no number, or has no value on this log."""
+    """Make the slider of a parameter; None if it is not a number, or has no value on this log."""
     assert bound.parameters is not None
     try:
         each = number_of(type(bound.parameters), name)

@@ -1,4 +1,4 @@
-"""Writes the verdict on a filter on a log: one sentence, and what it rests on."""
+"""The verdict on a filter on a log: one sentence, and its evidence."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,12 @@ Level = Literal["good", "doubtful", "failed"]
 
 
 class Summary(NamedTuple):
-    """States a judgement in words.
+    """A verdict in words.
 
     Attributes:
-        level: how bad it is.
-        headline: in a few words.
-        detail: what it rests on.
+        level: its severity.
+        headline: the verdict in a few words.
+        detail: its evidence.
     """
 
     level: Level
@@ -32,7 +32,7 @@ class Summary(NamedTuple):
 
 
 def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Summary:
-    """Judge one filter on one log, by NEES and NIS and by the alarms of its replay, if of this case."""
+    """Judge one filter on one log by NEES, NIS and those warnings of its replay on this case."""
     if failures:
         return Summary("failed", "It stopped.", failures[0])
     own = [each for each in alarms if each.part in ("", case.name)]
@@ -48,7 +48,7 @@ def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -
 
 
 def _squares_of(case: Case) -> list[Squares]:
-    """Return NEES and NIS of one log, as far as there are any."""
+    """Return NEES and NIS of one log, if available."""
     found = []
     if case.errors is not None and np.isfinite(case.errors.nees).any():
         nees, size = float(np.nanmean(case.errors.nees)), len(case.errors.components)
@@ -61,7 +61,7 @@ def _squares_of(case: Case) -> list[Squares]:
 
 
 def mean_nis(case: Case) -> float:
-    """Return the mean square of the whitened innovations; NaN without any."""
+    """Compute the mean square of the whitened innovations; NaN without any."""
     known = {name: each for name, each in case.whiteness.items() if np.isfinite(each.mean_square)}
     count = sum(each.size for each in known.values())
     if not count:
@@ -77,7 +77,7 @@ def _evidence(case: Case) -> str:
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:
-    """Return the numbers at the head of the page, by what they are of, each with its unit."""
+    """Return the numbers at the top of the page by name, each with its unit."""
     found: dict[str, tuple[float, str]] = {}
     if case.errors is not None and len(case.errors.nees):
         main = case.errors.main

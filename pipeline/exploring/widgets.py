@@ -1,4 +1,4 @@
-"""Makes the page's sliders, buttons, choices and the axis of time, as Bokeh has them."""
+"""The page's sliders, buttons, choices and time axis, as Bokeh widgets."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -15,8 +15,9 @@ from fuselog.recorders.recording import SIMULATION_EPOCH_NS
 
 NONE = "none"
 A_ROW = 2  # buttons
-YEAR_2000_NS = 946_684_800_000_000_000  # clocks that show less do not show the date
-# Bokeh's sliders have no name for a screen reader, and say a place from 0 to 1: tags hold both in words.
+YEAR_2000_NS = 946_684_800_000_000_000  # earlier clocks do not show the date
+# Bokeh's sliders have no name for screen readers, and give a position from 0 to 1: tags have both in
+# words.
 NAME_SLIDERS = """
 const view = Bokeh.Models.get("Slider").prototype.default_view.prototype;
 const render = view.render;
@@ -35,7 +36,7 @@ view.render = function () {
 
 
 def widget_of(slider: Slider, value: float) -> Any:
-    """Return the slider of a parameter, from 0 to 1, at its value."""
+    """Make the slider of a parameter, from 0 to 1, at its value."""
     return SliderWidget(
         start=0.0,
         end=1.0,
@@ -53,12 +54,12 @@ def widget_of(slider: Slider, value: float) -> Any:
 
 
 def tags_of(slider: Slider, value: float) -> list[str]:
-    """Return what a screen reader says of a slider: its name with what it is of, and its value."""
+    """Return the text of a slider for screen readers: its name with its group, and its value."""
     return [f"{slider.title}, {slider.group}", slider.words(value)]
 
 
 def time_range(epoch_ns: int) -> Range1d:
-    """Make the range of all plots over time, whose name says since when it counts."""
+    """Make the range of all plots over time, whose name states its zero."""
     if epoch_ns == SIMULATION_EPOCH_NS or epoch_ns < YEAR_2000_NS:
         return Range1d(0.0, 1.0, name="time since the log began (s)")
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)

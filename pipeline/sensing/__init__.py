@@ -1,4 +1,4 @@
-"""Finds what noise sensors have, by recordings of them, with intervals, and how filters state it.
+"""Estimation of sensor noise from recordings, with intervals, and its export to filters.
 
-Begin with `noise`. The mathematics stands in `terms`, `allan`, `likelihood` and `fitting`, over columns.
+Begin with `noise`. The mathematics is in `terms`, `allan`, `likelihood` and `fitting`, over columns.
 """

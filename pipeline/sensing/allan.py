@@ -1,4 +1,4 @@
-"""Computes the overlapping Allan deviation, and intervals by a model's degrees of freedom.
+"""The overlapping Allan deviation, with intervals from a model's degrees of freedom.
 
 NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms: with M
 second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of (M - |k|) g_k^2.
@@ -16,12 +16,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 PER_DECADE = 8
 _BLOCK = 1 << 16
-_FULL = 1 << 17  # samples, from which on every so many differences are looked at
-_A_WINDOW = 1000  # differences a window then, which are as good as all
+_FULL = 1 << 17  # samples, from which on only a part of the differences is used
+_A_WINDOW = 1000  # differences per window then, which are as good as all
 
 
 class Curve(NamedTuple):
-    """Holds an Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
+    """An Allan deviation: times (n,), deviations (n,), and numbers of differences (n,)."""
 
     taus_s: Floats
     deviations: Floats
@@ -29,21 +29,21 @@ class Curve(NamedTuple):
 
 
 def multiples_of(count: int) -> Integers:
-    """Return at how many samples the curve of `count` of them is looked at, up to a third of all."""
+    """Choose the window lengths, in samples, for the curve of `count` samples, up to a third of it."""
     decades = np.log10(max(count // 3, 1))
     spread = np.logspace(0, decades, int(PER_DECADE * decades) + 1)
     return np.unique(np.floor(spread + 1e-9).astype(np.int64))
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Return every how many differences are looked at: neighbours of long windows are alike."""
+    """Compute the step between differences; neighbouring differences of long windows are similar."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 
 def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
-    """Return the overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
+    """Compute the overlapping Allan deviation of samples (n,) every `step_s`; NaN marks lost samples.
 
-    Only pairs of whole windows count. Of many samples a thousand differences a window do.
+    Only pairs of complete windows count. For many samples, a thousand differences per window are used.
 
     Args:
         values: the samples, in any unit, on a grid without gaps.
@@ -72,7 +72,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
 
 
 def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
-    """Return the degrees of freedom of an Allan variance of `pairs` differences, by its terms."""
+    """Compute the degrees of freedom of an Allan variance of `pairs` differences from its terms."""
     coarser = _stride(multiple, pairs + 2 * multiple)
     multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
     g = terms.autocovariance(multiple, step_s, pairs)
@@ -82,12 +82,12 @@ def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -
 
 
 def interval(deviations: Floats, degrees: Floats, confidence: float = 0.95) -> tuple[Floats, Floats]:
-    """Compute, by chi-square, between what the true deviations lie.
+    """Compute chi-square intervals of the true deviations.
 
     Args:
         deviations: (n,), Allan deviations in any unit.
-        degrees: (n,), of freedom, of each variance.
-        confidence: with which the intervals hold the truth.
+        degrees: (n,), the degrees of freedom of each variance.
+        confidence: the probability with which an interval covers the truth.
 
     Returns:
         The lower and the upper ends, (n,) each, in the unit of the deviations.

@@ -1,7 +1,8 @@
-"""Writes noise as the settings of other programs: which number each reads, in which unit.
+"""Noise as settings of other programs: the numbers that each reads, in its units.
 
-A filter takes the larger of three axes, so that none is stated too small. Continuous densities are N in
-unit/sqrt(Hz) and K in unit/sqrt(s); who wants a standard deviation per step divides by its root.
+A filter gets the largest of three axes, so that no noise is stated too small. Continuous densities are N
+in unit/sqrt(Hz) and K in unit/sqrt(s); for a standard deviation per step, divide by the root of the
+step.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,7 @@ _FORCE, _RATE = "specific_force_mps2", "turn_rate_radps"
 
 
 class Density(NamedTuple):
-    """Holds the noise of one field: the largest of its axes, N and K, at a step."""
+    """The noise of one field: the largest N and K of its axes, at a step."""
 
     white: float
     walk: float
@@ -22,7 +23,7 @@ class Density(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """Holds what is written: the noise by field, and sentences to be read first."""
+    """The exported noise: densities by field, and sentences to be read first."""
 
     topic: str
     fields: Mapping[str, Density]
@@ -30,12 +31,12 @@ class Densities(NamedTuple):
 
     @property
     def unit(self) -> tuple[Density, Density] | None:
-        """Return the accelerometer's and the gyro's, where there are both."""
+        """Return the densities of accelerometer and gyroscope; None if one is missing."""
         force, rate = self.fields.get(_FORCE), self.fields.get(_RATE)
         return None if force is None or rate is None else (force, rate)
 
     def warned(self, mark: str, text: str) -> str:
-        """Return the text after the sentences, as comments that begin with a mark."""
+        """Prepend the sentences to a text, as comments that begin with a mark."""
         return "".join(f"{mark} {each}\n" for each in self.doubts) + text
 
 
@@ -55,7 +56,7 @@ def settings(found: Densities) -> str:
 
 
 def kalibr(found: Densities) -> str:
-    """Write Kalibr's imu.yaml: N and K, continuous; it divides by the root of the step itself."""
+    """Write Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the root of the step itself."""
     if found.unit is None:
         return ""
     force, rate = found.unit
@@ -72,7 +73,7 @@ def kalibr(found: Densities) -> str:
 
 
 def px4(found: Densities) -> str:
-    """Write PX4's EKF2 parameters: discrete, N and K over the root of the filter's step."""
+    """Write PX4's EKF2 parameters: discrete, N and K divided by the root of the filter's step."""
     if found.unit is None:
         return ""
     force, rate = (density.white / _PX4_STEP_S**0.5 for density in found.unit)
@@ -107,7 +108,7 @@ def gtsam(found: Densities) -> str:
 
 
 def robot_localization(found: Densities) -> str:
-    """Say what robot_localization's process noise is, and which part an inertial unit states."""
+    """Write robot_localization's process noise, and the covariances of an inertial unit's messages."""
     if found.unit is None:
         return ""
     force, rate = found.unit

@@ -1,7 +1,7 @@
-"""Fits a sensor's noise by maximum likelihood: which terms, how large, how well that is known.
+"""A maximum-likelihood fit of a sensor's noise: the terms, their sizes, and their intervals.
 
-A walk of zero is at the boundary of what may be: with no walk at all its likeliest density is zero in
-two of three recordings, so "none found, and it is less than" is an answer.
+A random walk of zero is at the boundary of possible values. Without any walk, its most likely density is
+zero in two of three recordings, so the result may be "none found, and it is less than".
 """
 
 import math
@@ -17,10 +17,10 @@ from fuselog.pipeline.sensing.likelihood import Likelihood, Samples, likelihood
 from fuselog.pipeline.sensing.terms import Terms
 
 Floats = NDArray[np.float64]
-_GAIN = 1e-7  # of the log-likelihood: what a step towards the likeliest terms has to gain
-# of the ends of intervals: how near, and how often twice as far: up to 16 standard deviations
+_GAIN = 1e-7  # smallest gain of a step in log-likelihood
+# accuracy of the ends of intervals, and doublings of the distance: up to 16 standard deviations
 _WITHIN, _DOUBLINGS = 1e-4, 4
-_SHORTEST = 30  # steps: a Gauss-Markov time below is the sensor's own filter, and no drift
+_SHORTEST = 30  # steps: a shorter Gauss-Markov time is the sensor's own filter, not a drift
 
 
 WORDS = {
@@ -32,14 +32,14 @@ WORDS = {
 
 
 class Fit(NamedTuple):
-    """Holds the likeliest terms of one kind.
+    """The most likely terms of one kind.
 
     Attributes:
         free: the names of the terms' numbers.
-        terms: the likeliest.
-        log_likelihood: with them.
+        terms: the most likely terms.
+        log_likelihood: the log-likelihood with these terms.
         curvature: (p, p) minus its second derivatives by the logarithms of the numbers.
-        size: how many samples it is of.
+        size: the number of samples.
     """
 
     free: tuple[str, ...]
@@ -50,7 +50,7 @@ class Fit(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """Return the log-likelihood less half of BIC's penalty: the greater the better."""
+        """Return the log-likelihood minus half of BIC's penalty: larger is better."""
         return self.log_likelihood - 0.5 * len(self.free) * math.log(self.size)
 
     @property
@@ -65,7 +65,7 @@ class Fit(NamedTuple):
 
 
 def choose(samples: Samples) -> Fit:
-    """Return the fit that BIC prefers: white noise, and what of the other terms there is."""
+    """Choose the fit with the best BIC: white noise and any other terms that improve it."""
     white = fit(samples, ())
     walk, markov = fit(samples, ("walk",)), fit(samples, ("markov", "markov_time_s"))
     best = max(white, walk, markov, key=lambda each: each.criterion)
@@ -79,8 +79,8 @@ def choose(samples: Samples) -> Fit:
 def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
     """Maximise the likelihood over white noise and other numbers of the terms.
 
-    All are searched as logarithms, relative to the white noise, which then follows from the residuals;
-    Newton's steps end it. A term whose likeliest size is zero stays tiny.
+    All are searched as logarithms relative to the white noise, which then follows from the residuals;
+    Newton steps complete the search. A term whose most likely size is zero stays tiny.
     """
     free = ("white", *beside_white)
     span_s = samples.step_s * float(samples.steps.sum())
@@ -90,7 +90,7 @@ def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
         return terms, likelihood(samples, terms)
 
     def cost(points: Floats) -> Floats:
-        """Compute minus the log-likelihoods with white noise scaled so that the mean square is one."""
+        """Compute minus the log-likelihoods with white noise scaled to a mean square of one."""
         squares, size = [], len(samples.values) - 1
         for point in points:
             _, found = relative(point)
@@ -112,10 +112,10 @@ def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
 
 
 def _limits(name: str, step_s: float, span_s: float) -> tuple[float, float]:
-    """Return where the logarithm of a number is searched for, relative to white noise of 1."""
+    """Return the range in which the logarithm of a number is searched, relative to white noise of 1."""
     if name == "markov_time_s":
         return math.log(_SHORTEST * step_s), math.log(max(span_s / 2, 2 * _SHORTEST * step_s))
-    if name == "walk":  # from what no recording of that length shows to what one sample shows
+    if name == "walk":  # from what is invisible in a recording of that length to what one sample shows
         return math.log(0.01 / span_s), math.log(3.0 / step_s)
     if name == "markov":
         return math.log(0.03 / math.sqrt(span_s)), math.log(3.0 / math.sqrt(step_s))
@@ -128,27 +128,27 @@ def _scaled(terms: Terms, name: str, scale: float) -> float:
 
 
 def _cost(samples: Samples, free: Sequence[str]) -> Cost:
-    """Return minus the log-likelihoods (n,) of the logarithms (n, p) of numbers."""
+    """Make a function of minus the log-likelihoods (n,) of the logarithms (n, p) of numbers."""
     return lambda points: np.array(
         [-likelihood(samples, of_point(free, each)).log_likelihood for each in points]
     )
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
-    """Return the terms whose free numbers have these logarithms.
+    """Make the terms whose free numbers have these logarithms.
 
     Args:
         free: the names of the p numbers, as fields of `Terms`.
         point: (p,), their natural logarithms.
 
     Returns:
-        The terms; all other numbers are as `Terms` has them by default.
+        The terms; all other numbers have the defaults of `Terms`.
     """
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 
 def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fit:
-    """Take Newton's steps, as long as they gain; none where a number is not determined."""
+    """Take Newton steps while they gain; none if a number is not determined."""
     [best] = cost(point[None])
     reach = np.full(len(point), 0.01)
     bent = np.zeros((len(point), len(point)))
@@ -169,9 +169,9 @@ def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fi
 
 
 def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
-    """Return the 95 % intervals of a fit's numbers by name, for each all others following it.
+    """Compute the 95 % profile-likelihood intervals of a fit's numbers, by name.
 
-    An end that no value within reach is at is zero, or infinite.
+    An end that is beyond the search's reach is zero or infinite.
     """
     point = np.log([getattr(found.terms, each) for each in found.free])
     ends = profile_ends(
@@ -187,7 +187,7 @@ def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
 
 
 def walk_below(samples: Samples, white: Fit) -> float:
-    """Return the walk that a recording in which none was found may have at most, with 95 %."""
+    """Compute the 95 % upper limit of the walk for a recording in which none was found."""
     size = len(samples.values) - 1
 
     def beside(log_ratio: float) -> tuple[float, float]:

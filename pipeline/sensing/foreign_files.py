@@ -1,8 +1,8 @@
-"""Reads files of noise of imu_utils and allan_variance_ros: what their numbers are, in what unit.
+"""Noise files of imu_utils and allan_variance_ros: the meaning and units of their numbers.
 
 imu_utils states `gyr_n` as the root of the rate times the Allan deviation at 1 s, a standard deviation
-per sample, although its README says rad/s/sqrt(Hz); `gyr_w` is the least of its curve and no walk.
-allan_variance_ros differences neighbouring bins that overlap, and its curve of a gyro is in deg/s.
+per sample, although its README gives rad/s/sqrt(Hz); `gyr_w` is the minimum of its curve, not a walk.
+allan_variance_ros differences neighbouring bins that overlap, and its gyroscope curve is in deg/s.
 """
 
 import math
@@ -16,7 +16,7 @@ _NUMBER = r"\s*:\s*([-+.\deE]+)"
 
 
 def explained(path: Path) -> list[str]:
-    """Return what the numbers of a file of theirs mean, in sentences; none of any other file."""
+    """Explain the numbers in a file of these tools; [] for any other file."""
     if path.suffix not in (".yaml", ".yml", ".txt") or not path.is_file():
         return []
     text = path.read_bytes()[:_MOST_BYTES].decode(errors="replace")
@@ -73,7 +73,7 @@ def _number(text: str) -> float:
 
 
 def _deviation_at_1_s(path: Path) -> float | None:
-    """Average the Allan deviation at 1 s of the gyro's axes, in rad/s, of a file's curves."""
+    """Average the Allan deviations at 1 s of the gyroscope's axes, in rad/s, from a file's curves."""
     name = path.name.partition("_imu_param")[0]
     times = path.with_name(f"data_{name}_gyr_t.txt")
     curves = [path.with_name(f"data_{name}_gyr_{axis}.txt") for axis in "xyz"]

@@ -1,8 +1,9 @@
-"""Computes the likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov and angle.
+"""The likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov noise, quantised angle.
 
-A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, exactly diffuse at first, the
-Gauss-Markov noise g, errors e of a quantised angle and white v. So the first sample is not counted.
-What was lost is a longer step. Columns beside the samples are regressors, explained by least squares.
+A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, which starts exactly diffuse, the
+Gauss-Markov noise g, errors e of a quantised angle and white noise v. The first sample therefore does
+not count. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
+squares.
 """
 
 import math
@@ -19,12 +20,12 @@ Integers = NDArray[np.int64]
 
 
 class Samples(NamedTuple):
-    """Holds the samples of one column, as the likelihood takes them.
+    """The samples of one column, as the likelihood takes them.
 
     Attributes:
-        values: (n, 1 + regressors) the samples, then what they may depend on.
-        steps: (n,) how many grid steps each is after the one before.
-        step_s: the grid's step.
+        values: (n, 1 + regressors) the samples, and regressors that they may depend on.
+        steps: (n,) the number of grid steps since the previous sample.
+        step_s: the step of the grid.
     """
 
     values: Floats
@@ -33,12 +34,12 @@ class Samples(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """Computes what the samples say of some terms.
+    """The likelihood of some terms.
 
     Attributes:
-        log_likelihood: with these terms.
-        mean_square: of the normalised innovations, one if the terms are as large as they should be.
-        coefficients, sigmas: (regressors,) those that suit best, and their standard deviations.
+        log_likelihood: the log-likelihood of these terms.
+        mean_square: of the normalised innovations; one if the terms have the right size.
+        coefficients, sigmas: (regressors,) the best coefficients, and their standard deviations.
     """
 
     log_likelihood: float
@@ -48,7 +49,7 @@ class Likelihood(NamedTuple):
 
 
 def likelihood(samples: Samples, terms: Terms) -> Likelihood:
-    """Compute the exact Gaussian log-likelihood of samples, with the coefficients that suit best."""
+    """Compute the exact Gaussian log-likelihood of samples, with the best coefficients."""
     columns = samples.values.shape[1]
     moments = np.zeros((columns, columns))
     log_determinant = _filtered(samples, terms, moments, np.empty((0, columns)))
@@ -62,7 +63,7 @@ def likelihood(samples: Samples, terms: Terms) -> Likelihood:
 
 
 def residuals(samples: Samples, terms: Terms) -> Floats:
-    """Return the normalised innovations (n - 1,) of samples, without what regressors explain."""
+    """Compute the normalised innovations (n - 1,) of samples, without the regressors' part."""
     columns = samples.values.shape[1]
     moments, found = np.zeros((columns, columns)), np.zeros(samples.values.shape)
     _filtered(samples, terms, moments, found)
@@ -89,12 +90,12 @@ def filter_samples(
 
     Args:
         values: (n, m) the columns.
-        steps: (n,) of the grid.
-        step_s: one of them.
+        steps: (n,) in steps of the grid.
+        step_s: the step of the grid.
         noise: (5,) the terms.
-        means: (m, 4) memory: b, g, e of the sample before and the innovation, per column.
-        moments: (m, m) become the products of normalised innovations, summed.
-        found: (n, m) become the normalised innovations; or no rows.
+        means: (m, 4) work memory: b, g, e of the previous sample and the innovation, per column.
+        moments: (m, m) filled with the sums of products of normalised innovations.
+        found: (n, m) filled with the normalised innovations; or no rows.
     """
     white = noise[0] * noise[0] / step_s
     walk = noise[1] * noise[1] * step_s

@@ -1,6 +1,6 @@
-"""Finds the noise of a sensor at rest: its terms with intervals, its Allan deviation, notes.
+"""The noise of a sensor at rest: its terms with intervals, its Allan deviation, notes.
 
-Begin here: `noise` goes through the columns of a log's topics, `_analysed` through one column.
+Begin here: `noise` processes the columns of a log's topics, `_analysed` a single column.
 """
 
 import math
@@ -26,13 +26,14 @@ from fuselog.recorders.units import unit_of
 from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
-_DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times
+# probability of the interval in which a fitted curve should be, at each of thirty times
+_DOUBTFUL = 0.999
 _FEWEST_DEGREES = 3.0
 _CLOCKS = "publish_time_ns", "log_time_ns", "position"
-_BLOCK = 1 << 18  # messages that are read at once
-# What a data sheet's number is by its unit, {} being the column's.
+_BLOCK = 1 << 18  # messages that are read at a time
+# Meaning of a data sheet's number by its unit; {} is the unit of the column.
 _STATED = {"white": "{}/sqrt(Hz)", "walk": "{}/sqrt(s)"}
-_USUAL = "rad/s", "m/s^2"  # units of columns whose names end with none
+_USUAL = "rad/s", "m/s^2"  # units for columns whose names have none
 
 
 @without_warnings_of_numbers()
@@ -43,21 +44,22 @@ def noise(
     sheet: Mapping[str, str] | None = None,
     taus: Iterable[float] = (),
 ) -> SensorNoise:
-    """Say what noise sensors at rest have, with intervals: by maximum likelihood, and Allan deviations.
+    """Estimate the noise of sensors at rest: maximum-likelihood terms with intervals, Allan deviations.
 
     Args:
-        log: a path, a log that was opened, or a recording, of a unit at rest.
-        topics: which, as `/imu` or, for one field, `/imu.turn_rate_radps`; by default all inertial
-            units, or the only topic that has numbers.
-        sheet: what a data sheet states, by the name of a field: `{"turn_rate_radps": "0.007
+        log: a path, an opened log, or a recording, of a unit at rest.
+        topics: topics such as `/imu` or single fields such as `/imu.turn_rate_radps`; by default all
+            inertial units, or the only topic with numbers.
+        sheet: values of a data sheet, by the name of a field: `{"turn_rate_radps": "0.007
             deg/s/sqrt(Hz)"}`.
-        taus: also say the Allan deviation at these times, in s.
+        taus: times in s for which the Allan deviation is also reported.
 
     Returns:
-        The noise of every column, with 95 % intervals: its terms, and its Allan deviations.
+        The noise of every column with 95 % intervals: its terms, and its Allan deviations.
 
-    Raises BadInput where a unit moves, the log is too short, a column is constant, stamps go back, too
-    many messages are lost, a time is beyond the log's third, or a unit is another quantity's.
+    Raises BadInput if a unit moves, the log is too short, a column is constant, stamps go backwards, too
+    many messages are lost, a time is longer than a third of the log, or a unit belongs to another
+    quantity.
     """
     (source,) = _one(sources_of(log))
     stated = {name: (text, *parse_sheet(name, text)) for name, text in (sheet or {}).items()}
@@ -82,11 +84,11 @@ def noise(
 
 
 def parse_sheet(field: str, text: str) -> tuple[str, float]:
-    """Return what a data sheet states, as `white` or `walk` and a number in our units.
+    """Parse a value of a data sheet to `white` or `walk` and a number in our units.
 
     A one-sided density, as spectrum analysers show it, is sqrt(2) times the two-sided one.
 
-    Raises BadInput if the text is no number with a unit, or the unit is another quantity's.
+    Raises BadInput if the text is not a number with a unit, or the unit belongs to another quantity.
     """
     found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s+(\S.*?)\s*(one-sided)?\s*", text)
     value = float(found[1]) if found else 0.0
@@ -114,7 +116,7 @@ def _one(sources: Sequence[Any]) -> Sequence[Any]:
 
 
 def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
-    """Choose the topics and, where they are named, their fields."""
+    """Choose the topics and, if given, their fields."""
     chosen: dict[str, list[str]] = {}
     for text in wanted:
         topic, _, name = (text, "", "") if text in source.topics else text.rpartition(".")
@@ -137,7 +139,7 @@ def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _numbers(stream: Stream) -> list[str]:
-    """List the fields that are real numbers and no covariances."""
+    """List the fields with real numbers, except covariances."""
     return [
         name
         for name, column in stream.columns.items()
@@ -223,7 +225,7 @@ def _drifts(drift: Drift, unit: str) -> str:
 
 
 def _misfits(found: ColumnNoise) -> list[str]:
-    """Say where the fitted model's curve leaves the measured one's interval."""
+    """Report where the fitted model's curve leaves the interval of the measured one."""
     low, high = interval(found.curve.deviations, found.degrees, _DOUBTFUL)
     model, taus_s = found.model_deviations, found.curve.taus_s
     is_seen = (found.degrees > _FEWEST_DEGREES) & (taus_s > 0.99 * found.block * found.step_s)
@@ -260,7 +262,7 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
 
 
 def _least(found: ColumnNoise, unit: str) -> str:
-    """Say the least of the curve, which data sheets call bias instability, in both conventions."""
+    """Report the minimum of the curve, which data sheets call bias instability, in both conventions."""
     least = int(np.nanargmin(np.where(found.degrees > _FEWEST_DEGREES, found.curve.deviations, np.inf)))
     value = float(found.curve.deviations[least])
     return (

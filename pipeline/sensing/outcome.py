@@ -1,4 +1,4 @@
-"""Holds what is found of the noise of sensors: tables, curves, sentences, a result folder."""
+"""The result of a noise analysis: tables, curves, sentences, a result folder."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from fuselog.recorders.units import unit_of
 from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
-MISFIT = "misfit: "  # what a sentence has that whoever uses the numbers reads first
-_TERMS = {  # what a table says of each number: the name of its field, and its unit beside the column's
+MISFIT = "misfit: "  # prefix of a sentence that users of the numbers should read first
+_TERMS = {  # words for each number in a table; {} is the unit of the column
     "white": "white noise N ({}/sqrt(Hz))",
     "walk": "random walk K ({}/sqrt(s))",
     "markov": "Gauss-Markov s ({})",
@@ -33,15 +33,15 @@ _TERMS = {  # what a table says of each number: the name of its field, and its u
 
 @dataclass(frozen=True, eq=False)
 class ColumnNoise:
-    """Holds the noise of one column.
+    """The noise of one column.
 
     Attributes:
-        topic, field, component: where it stands; no component of a scalar.
+        topic, field, component: the column; `component` is empty for a scalar.
         step_s: the mean time between samples.
-        block: over how many samples it was averaged before the likelihood.
+        block: the number of samples averaged before the likelihood.
         numbers: by the names of `Terms`, and `ramp`; 0 for a walk that was not found.
-        fitted: the model that was chosen.
-        curve: the Allan deviation that was measured.
+        fitted: the chosen model.
+        curve: the measured Allan deviation.
         degrees: (n,) its degrees of freedom.
         notes: sentences.
     """
@@ -59,7 +59,7 @@ class ColumnNoise:
 
     @property
     def name(self) -> str:
-        """Return the column as sentences name it."""
+        """Return the column's name in sentences."""
         return f"{self.topic}.{self.field}" + (f".{self.component}" if self.component else "")
 
     @property
@@ -70,11 +70,11 @@ class ColumnNoise:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorNoise:
-    """Holds the noise of a log's columns.
+    """The noise of a log's columns.
 
     Attributes:
-        name: of the log.
-        columns: one after the other.
+        name: the name of the log.
+        columns: the columns.
     """
 
     name: str
@@ -95,16 +95,16 @@ class SensorNoise:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences on all columns."""
+        """Return the sentences on all columns."""
         return [note for column in self.columns for note in column.notes]
 
     @property
     def densities(self) -> Densities:
         """Return what other programs read: N and K of each field, the largest of its axes.
 
-        Of Gauss-Markov noise without a walk, the walk is the one that begins as it does: s sqrt(2 / T).
-        Where no axis has a walk, K is the most that it may be: Kalibr refuses a zero, and a covariance
-        of zero cannot be inverted.
+        Gauss-Markov noise without a walk is replaced by the walk with the same initial growth: s sqrt(2
+        / T). If no axis has a walk, K is its upper limit, because Kalibr refuses a zero, and a
+        covariance of zero cannot be inverted.
         """
         found: dict[str, Density] = {}
         bounds: dict[str, float] = {}
@@ -126,7 +126,7 @@ class SensorNoise:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """Return a row per column and time: the deviation, its 95 % interval, the model's."""
+        """Return a row per column and time: the deviation, its 95 % interval, that of the model."""
         tables = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -143,7 +143,7 @@ class SensorNoise:
 
     @property
     def chart(self) -> Chart:
-        """Draw the measured curves, their intervals, and the models'."""
+        """Draw the measured curves with their intervals, and those of the models."""
         panels = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -190,7 +190,7 @@ class SensorNoise:
     def save(self, folder: str | Path) -> ResultFolder:
         """Write tables, curves, and the numbers as other programs read them to the folder `folder`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder exists and is not a fuselog result.
         """
         place = Path(folder)
         check_folder(place, {"log": [Path(self.name)]})

@@ -1,4 +1,4 @@
-"""Prepares recordings at rest: on a grid, still, without the drift of warming up."""
+"""The preparation of recordings at rest: samples on a grid, without motion and warm-up drift."""
 
 import math
 from typing import NamedTuple
@@ -16,18 +16,18 @@ from fuselog.recorders.units import unit_of
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 FEWEST, SHORTEST_S = 500, 20.0
-MOST = 1 << 16  # samples that a likelihood is of; of more, the means of blocks
-_GAP = 1.75  # times the median step: a longer one is a gap
+MOST = 1 << 16  # samples in a likelihood; longer recordings are averaged in blocks
+_GAP = 1.75  # times the median step: a longer step is a gap
 _MOST_LOST = 0.4
-# By how much means over a second of a unit at rest may spread, by its unit: no sensor drifts so far.
+# Largest spread of one-second means of a unit at rest, by unit: no sensor drifts that far.
 _STILL = {"rad/s": 0.03, "m/s^2": 0.3}
-_DRIFT_GAIN = 4.6  # of the log-likelihood, by a line and an exponential: by chance once in a hundred
+_DRIFT_GAIN = 4.6  # gain in log-likelihood of a line and an exponential that chance exceeds in 1 of 100
 _IMPROBABLE = 1e-4
 _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """Lays the stamps of a topic on a grid: its step, and which of its places (n,) the messages have."""
+    """A grid for the stamps of a topic: its step, and the places (n,) of messages on it."""
 
     step_s: float
     places: Integers
@@ -35,17 +35,17 @@ class Grid(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Count how many places there are."""
+        """Return the number of places."""
         return int(self.places[-1]) + 1
 
     @property
     def lost(self) -> float:
-        """Return the share of messages that are not there."""
+        """Return the share of lost messages."""
         return 1 - len(self.places) / self.size
 
 
 class Drift(NamedTuple):
-    """Holds what a column drifts by, a rate and an offset that decays, and their gain in likelihood."""
+    """The drift of a column, a rate and a decaying offset, and its gain in log-likelihood."""
 
     rate: float
     rate_sigma: float
@@ -54,14 +54,14 @@ class Drift(NamedTuple):
     gain: float
 
     def over(self, times_s: Floats) -> Floats:
-        """Return the drift (n,) at times since the first sample."""
+        """Compute the drift (n,) at times since the first sample."""
         return self.rate * times_s + self.offset * np.exp(-times_s / self.time_s)
 
 
 def grid_of(stream: Stream) -> Grid:
-    """Lay a topic's stamps on a grid; the step is the mean of those that are no gaps.
+    """Fit a grid to a topic's stamps; its step is the mean of all steps that are not gaps.
 
-    Raises BadInput where there are too few messages, stamps go back, or too many are lost.
+    Raises BadInput if there are too few messages, stamps go backwards, or too many are lost.
     """
     stamps = stream.publish_time_ns
     span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
@@ -96,10 +96,10 @@ def on_grid(values: Floats, grid: Grid) -> Floats:
 
     Args:
         values: (n,), of all messages, in the order of the stream.
-        grid: of the stream.
+        grid: the grid of the stream.
 
     Returns:
-        (grid.size,), NaN where a sample was lost.
+        The samples (grid.size,), NaN where a sample was lost.
     """
     found = np.full(grid.size, np.nan)
     found[grid.places] = values[grid.rows]
@@ -107,11 +107,11 @@ def on_grid(values: Floats, grid: Grid) -> Floats:
 
 
 def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
-    """Raise BadInput where samples are too few or constant, or those of a unit that moves.
+    """Raise BadInput if samples are too few or constant, or if the unit moves.
 
     Args:
-        name: what messages call the samples.
-        field: its name; its ending says the unit.
+        name: the name of the samples in messages.
+        field: the field's name, which ends with its unit.
         values: (n,), on a grid, NaN where a sample was lost.
         step_s: the grid's step.
     """
@@ -140,10 +140,10 @@ def block_means(values: Floats, block: int) -> Floats:
 
     Args:
         values: (n,), NaN where a sample was lost.
-        block: how many places a block has.
+        block: the number of places in a block.
 
     Returns:
-        (n // block,), NaN where less than half of a block is there.
+        The means (n // block,), NaN if more than half of a block is lost.
     """
     if block == 1:
         return values
@@ -155,19 +155,19 @@ def block_means(values: Floats, block: int) -> Floats:
 
 
 def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) -> Samples:
-    """Return samples on a grid as the likelihood takes them.
+    """Convert samples on a grid to the form that the likelihood takes.
 
     Args:
         values: (n,), NaN where a sample was lost.
         step_s: the grid's step.
-        regressors: (n, k), what the samples may depend on; by default nothing.
+        regressors: (n, k), which the samples may depend on; by default none.
 
     Returns:
-        Those that were not lost, less the first.
+        The samples that were not lost, minus the first one.
     """
     rows = np.flatnonzero(np.isfinite(values))
     columns = values[rows, None] if regressors is None else np.column_stack([values, regressors])[rows]
-    # the first value is taken off, that digits are kept
+    # the first value is subtracted to keep digits
     return Samples(np.ascontiguousarray(columns - columns[0]), np.diff(rows, prepend=rows[0]), step_s)
 
 
@@ -203,15 +203,15 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
 
 
 def fewest_block(count: int) -> int:
-    """Return over how many samples to average so that a likelihood has no more than it can take."""
+    """Compute how many samples to average so that a likelihood has at most `MOST`."""
     return -(-count // MOST)
 
 
 def white_block(values: Floats, step_s: float) -> int:
-    """Find over how many samples to average, so that noise is white beside what drifts.
+    """Find how many samples to average, so that the noise is white apart from drift.
 
-    A sensor that filters its output correlates neighbours, and a likelihood at its full rate gives too
-    little noise. The residuals of white noise and a walk tell.
+    A sensor that filters its output correlates neighbouring samples, and a likelihood at its full rate
+    gives too little noise. The residuals of white noise and a walk show this.
 
     Args:
         values: (n,), on a grid, NaN where a sample was lost.
@@ -232,7 +232,7 @@ def white_block(values: Floats, step_s: float) -> int:
 
 
 def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
-    """Find a line in the spectrum, as of something that vibrates.
+    """Find a line in the spectrum, for example from vibration.
 
     Args:
         values: (n,), on a grid, NaN where a sample was lost; the first `MOST` count.

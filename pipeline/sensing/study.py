@@ -1,7 +1,7 @@
-"""Studies noise: how often the intervals of a sensor at rest hold the truth.
+"""A study of noise: how often the intervals of a sensor at rest cover the truth.
 
-Each unit is recorded at rest, with white noise and a walk, and looked at as a user's log is: drifts,
-vibration and correlation are looked for, the terms chosen, and intervals given.
+Each unit is recorded at rest, with white noise and a walk, and analysed like a user's log: with tests
+for drift, vibration and correlation, a choice of terms, and intervals.
 """
 
 from typing import Any
@@ -32,7 +32,7 @@ QUANTITIES = ("white", "walk", *(f"deviation-{tau_s:g}s" for tau_s in TAUS_S))
 
 
 class NoiseOptions(Parameters):
-    """States which units are looked at.
+    """Options of the study: the units to analyse.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.
@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _looked_at(seed: int) -> dict[str, Any]:
-    """Find one unit's noise, and which intervals hold the truth."""
+    """Estimate one unit's noise, and test which intervals cover the truth."""
     values = unit(seed, SIZE, TERMS, STEP_S)
     [column] = noise(at_rest(values, STEP_S), TURN).columns
     low, high = interval(column.curve.deviations, column.degrees)
@@ -85,7 +85,7 @@ def _looked_at(seed: int) -> dict[str, Any]:
 def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
     """Draw samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
 
-    A seed draws the same numbers for all terms, whichever there are.
+    A seed gives the same random numbers for all terms, whichever are present.
     """
     rng = np.random.Generator(np.random.Philox(key=seed))
     white, walk, markov = (rng.standard_normal(size) for _ in range(3))

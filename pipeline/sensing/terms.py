@@ -1,7 +1,7 @@
-"""Defines the terms of a sensor's noise, by IEEE Std 952-1997, annex C: Allan variances add.
+"""The terms of a sensor's noise by IEEE Std 952-1997, annex C, whose Allan variances add.
 
-White noise N, random walk K, Gauss-Markov noise of standard deviation s and time T, a quantised angle Q.
-With u the unit of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
+White noise N, random walk K, Gauss-Markov noise with standard deviation s and time T, a quantised angle
+Q. With the unit u of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
 """
 
 import math
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-_DECAYED = 1e-7  # of the variance: what is left of an autocovariance counts by its square
+_DECAYED = 1e-7  # relative variance at which an autocovariance has decayed; it counts by its square
 
 
 class Terms(NamedTuple):
-    """Holds the noise of one column; a term that is zero is not there."""
+    """The noise of one column; a term of zero is absent."""
 
     white: float = 0.0
     walk: float = 0.0
@@ -24,23 +24,23 @@ class Terms(NamedTuple):
     quantisation: float = 0.0
 
     def allan_variance(self, taus_s: Floats, step_s: float) -> Floats:
-        """Return the expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
+        """Compute the exact expected Allan variance (n,) at times (n,) of samples every `step_s`."""
         multiples = np.rint(taus_s / step_s)
         return self._second_differences(multiples, step_s) / (2 * taus_s**2)
 
     def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
-        """Return the autocovariance, at lags 0, 1, ... below `count`, of the second differences.
+        """Compute the autocovariance of second differences, at lags 0, 1, ... below `count`.
 
-        These are of the phases, the sums of samples times `step_s`, at a distance of `multiple` samples:
-        what the Allan variance is the mean square of. Beyond twice that distance only the Gauss-Markov
-        term is left; it ends where it has decayed.
+        They are differences of the phases, the sums of samples times `step_s`, at a distance of
+        `multiple` samples; the Allan variance is their mean square. Beyond twice that distance only the
+        Gauss-Markov term remains; the result ends where that has decayed.
         """
         near = np.arange(min(count, 2 * multiple + 2), dtype=float)
         found = self._second_differences(multiple, step_s, near)
         if not self.markov:
             return found
         a, power = self._decay(step_s)
-        # all four differences of an exponential, without their cancellation
+        # all four differences of an exponential, without cancellation
         tail = -power * np.expm1(multiple * np.log(a)) ** 4
         lasts = math.log(max(abs(tail) / (_DECAYED * found[0]), 1.0)) * self.markov_time_s / step_s
         beyond = np.arange(len(near), min(count, len(near) + int(lasts)), dtype=float)
@@ -49,14 +49,14 @@ class Terms(NamedTuple):
     def _second_differences(
         self, multiple: Floats | int, step_s: float, lags: Floats | float = 0.0
     ) -> Floats:
-        """Compute the autocovariance of second differences as differences of what is summed twice."""
+        """Compute the autocovariance of second differences as differences of a double sum."""
         far = 2 * np.asarray(multiple)
         ends = (lags + far, lags - far), (lags + far / 2, lags - far / 2)
         outer, inner = (sum(self._summed_twice(np.abs(end), step_s) for end in pair) for pair in ends)
         return np.atleast_1d(-outer + 4 * inner - 6 * self._summed_twice(np.abs(lags), step_s))
 
     def _summed_twice(self, lag: Floats | float, step_s: float) -> Floats:
-        """Return what has as second differences the samples' autocovariance times step_s^2."""
+        """Compute a function whose second differences are the samples' autocovariance times step_s^2."""
         lag = np.asarray(lag, dtype=float)
         white = self.white**2 / step_s * lag / 2
         walk = -(self.walk**2) * step_s * (lag * lag * lag - lag) / 12

@@ -1,4 +1,4 @@
-"""Replays a log under changes that should not matter, and says whether its result is one.
+"""Replays of a log under changes that should not matter, and a verdict on whether its result is robust.
 
 Begin with `stressing`.
 """

@@ -1,6 +1,6 @@
-"""Changes a run in ways that should not matter: each copies it, all topics at once by a seed.
+"""Changes of a run that should not matter; each copies it with all topics changed, by a seed.
 
-Most have a size, 1 or a half of it, so that it is seen whether the difference shrinks with the change.
+Most have a size, 1 or a half, to test whether the difference shrinks with the change.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -24,7 +24,7 @@ PARAMETERS, DROPPED = "parameters", "dropped"
 
 
 class Inputs(NamedTuple):
-    """States what a change may touch: topics that are sensed, those that drive the estimator, priors."""
+    """What a change may alter: topics of sensors, topics of controls, priors."""
 
     sensed: Collection[str]
     controls: Collection[str]
@@ -35,7 +35,7 @@ Changed = Callable[[MemorySource, Inputs, float, int], MemorySource]
 
 
 class Change(NamedTuple):
-    """Describes one change: what it does in words, to a run; whether half of it is defined."""
+    """A change: its words, its function of a run, and whether half of it is defined."""
 
     words: str
     of_run: Changed | None
@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """Name the group of a topic: those of one scan get one sign, and are dropped together."""
+    """Return the group of a topic: topics of one scan get the same sign, and are dropped together."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -60,7 +60,7 @@ def _groups(source: MemorySource, inputs: Inputs) -> dict[str, list[str]]:
 
 
 def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]:
-    """Return another share, -1 to 1, for each topic, so that no two of equal stamps stay together."""
+    """Draw a share from -1 to 1 for each topic, so that no two topics keep equal stamps."""
     groups = _groups(source, inputs)
     shares = np.linspace(1.0, -1.0, len(groups))
     drawn = np.random.default_rng(seed).permutation(shares).tolist()
@@ -69,7 +69,7 @@ def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]
 
 
 def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move stamps, none past the run's first message: what came before the start would be lost."""
+    """Move stamps, but none past the run's first message, because earlier messages would be lost."""
     starts_ns = [source.streams[topic].publish_time_ns for topic in inputs.priors]
     first_ns = min((int(each[0]) for each in starts_ns if len(each)), default=SHIFT_NS)
     moved = {}
@@ -84,7 +84,7 @@ def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> Mem
 
 
 def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySource:
-    """Take topics of equal stamps the other way round, those of one scan together."""
+    """Reverse the order of topics with equal stamps, keeping those of one scan together."""
     last = max(int(each.position.max()) for each in source.streams.values() if len(each))
     turned = {}
     for topics in _groups(source, inputs).values():
@@ -103,7 +103,7 @@ def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySou
 
 
 def _inputs(change: Callable[[NDArray[np.float64], np.random.Generator], NDArray]) -> Changed:
-    """Change every floating number that is sensed."""
+    """Make a change of every floating-point number of sensors."""
 
     def changed(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
         rng, streams = np.random.default_rng(seed), {}
@@ -132,7 +132,7 @@ def _by_an_ulp(column: NDArray[np.float64], rng: np.random.Generator) -> NDArray
 
 
 def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move the start by START_SIGMAS of the prior's sigma along all its axes; A is that then."""
+    """Move the start by START_SIGMAS of the prior's sigma along all its axes, which is also its A."""
     rng, streams = np.random.default_rng(seed), {}
     for topic in inputs.priors:
         stream = source.streams[topic]
@@ -165,7 +165,7 @@ def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray
 
 
 def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> MemorySource:
-    """Drop messages by one draw for every stamp of a group, so that a scan goes with detections."""
+    """Drop messages by one draw per stamp of a group, so that a scan is dropped with its detections."""
     streams = {}
     for number, topics in enumerate(_groups(source, inputs).values()):
         of_group = [source.streams[topic].publish_time_ns for topic in topics]
@@ -179,7 +179,7 @@ def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> Memor
 
 
 def _again(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySource:
-    """Give every message that drives the motion twice."""
+    """Repeat every message of the controls."""
     streams = {}
     for topic in inputs.controls:
         stream = source.streams[topic]
@@ -201,7 +201,7 @@ CHANGES: Mapping[str, Change] = {
 
 
 def inputs_of(source: MemorySource, topics: Collection[str], controls: Collection[str]) -> Inputs:
-    """Choose what may be changed of an estimator's topics: not the truth, nor what has no time."""
+    """Choose an estimator's topics that may be changed: not the truth, nor those without a time."""
     streams = {topic: source.streams[topic] for topic in topics if topic in source.streams}
     names = {topic: stream.schema.full_name for topic, stream in streams.items() if len(stream)}
     priors = [t for t, name in names.items() if name == schemas.GAUSSIAN_ESTIMATE.full_name]
@@ -210,7 +210,7 @@ def inputs_of(source: MemorySource, topics: Collection[str], controls: Collectio
 
 
 def parameters_changed(parameters: Any, size: float, rng: np.random.Generator) -> Any:
-    """Change every number of parameters but whole ones, 0 and the chance of a gate."""
+    """Change every number of parameters except integers, 0 and the probability of a gate."""
     if isinstance(parameters, Mapping):
         changed = {name: parameters_changed(each, size, rng) for name, each in parameters.items()}
         return {
@@ -226,7 +226,7 @@ def parameters_changed(parameters: Any, size: float, rng: np.random.Generator) -
 
 
 def _probability(before: Any, changed: Any) -> Any:
-    """Change a probability, where less is left to 1, by what is left."""
+    """Change a probability above one half by changing its complement."""
     if not isinstance(before, float) or before <= 0.5 or before > 1.0:
         return changed
     return 1.0 - (1.0 - before) * (changed / before)

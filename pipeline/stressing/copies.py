@@ -1,4 +1,4 @@
-"""Replays copies of a run and compares them with it: estimates, metrics, and whether they fail."""
+"""Replays of copies of a run and their comparison with it: estimates, metrics, failures."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -30,13 +30,13 @@ from fuselog.replay.judging.judge import Judge
 
 
 class How(NamedTuple):
-    """Says how runs are replayed and stressed.
+    """Options of how runs are replayed and stressed.
 
     Attributes:
-        seed: of signs, coins, and what is dropped.
+        seed: the seed of signs, coins, and dropped messages.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        order: the clock to go by.
-        late: what is done about messages that come late, in the order of log time.
+        order: the clock that orders messages.
+        late: how late messages are treated, in the order of log time.
     """
 
     seed: int = 0
@@ -49,11 +49,10 @@ class How(NamedTuple):
 class Replayed:
     """Runs and copies that one estimator replayed.
 
-    Attributes:
-        sources: runs and copies.
-        bound: the estimator.
-        outputs: what it gave, by topic.
-        how: how they were replayed.
+    sources: the runs and copies.
+    bound: the estimator.
+    outputs: its outputs, by topic.
+    how: how they were replayed.
     """
 
     sources: Ensemble[MemorySource]
@@ -75,7 +74,7 @@ class Replayed:
         }
 
     def failure(self, run: int) -> str:
-        """Say when and why a run ends before its time; empty where it does not."""
+        """Describe when and why a run ends early; "" if it does not."""
         for rows in self.outputs.values():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 own = rows.of_run(run)
@@ -98,16 +97,16 @@ class Replayed:
         return found
 
     def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """Return the metrics of one run by case and quantity, those that are known."""
+        """Return the known metrics of a run by case and quantity."""
         return self._metrics.get(run, {})
 
 
 def replayed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> Replayed:
-    """Replay runs by one estimator.
+    """Replay runs with one estimator.
 
-    Raises BadInput where it can replay none of them.
+    Raises BadInput if it can replay none of them.
     """
     ensemble = Ensemble(sources)
     bound, report = bind(label, ensemble, settings), Report()
@@ -124,12 +123,12 @@ def compared(
     """Compare a copy with its run.
 
     Args:
-        name: of the change.
-        before: what holds the run, in `row`; its estimates are `base`.
-        row: see there.
-        done: what holds the copy.
-        run: where it is in that.
-        base: see there.
+        name: the name of the change.
+        before: the replay that contains the run, in `row`; its estimates are `base`.
+        row: see `before`.
+        done: the replay that contains the copy.
+        run: its index there.
+        base: see `before`.
     """
     within_ns = SHIFT_NS if name == "stamps" else 0
     found = partings(base, done.estimates(run), within_ns, has_less=name == DROPPED)
@@ -156,9 +155,9 @@ def compared(
 
 
 def _reach(found: Sequence[Parting], main: str) -> float:
-    """Return by how much an RMSE can change: no more than estimates of common stamps are apart.
+    """Return the largest possible change of an RMSE: the distance of estimates with common stamps.
 
-    What a copy has not an estimate of, as at a stamp where the message is lost, is in one RMSE alone.
+    Stamps at which the copy has no estimate, because a message is lost, occur in only one RMSE.
     """
     unit = main.rpartition("_")[2]
     if unit not in ("m", "deg", "rad"):
@@ -169,18 +168,18 @@ def _reach(found: Sequence[Parting], main: str) -> float:
 
 
 def _main(quantities: Sequence[str]) -> str:
-    """Choose a verdict's metric: RMSE of position or orientation, else the first one."""
+    """Choose the metric of a verdict: the RMSE of position or orientation, or the first error."""
     errors = [each for each in quantities if "rmse" in each]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in errors]
     return next(iter([*main, *errors]), "")
 
 
 def _parameters(done: Replayed, label: str) -> dict[str, Any]:
-    """Return all parameters of an estimator: those that it has, and those that one channel states."""
+    """Return all parameters of an estimator: its own, and those that a single channel states."""
     stated = {}
     for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
         number, _, topics = words.partition(" (")
-        if "(" in topics:  # channels that state different ones
+        if "(" in topics:  # channels with different values
             continue
         try:
             stated[name] = float(number)
@@ -196,7 +195,7 @@ def with_parameters(
     settings: Mapping[str, Any],
     size: float,
 ) -> Replayed | str:
-    """Replay runs with other parameters than they had; returns why where that cannot be."""
+    """Replay runs with changed parameters; returns the reason if this is not possible."""
     known = _parameters(done, label)
     changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
     changed = {name: value for name, value in changed.items() if value != known[name]}
@@ -206,7 +205,8 @@ def with_parameters(
     for name in [*changed]:
         try:
             bind(label, sources, merge(settings, {name: changed[name]}))
-        except BadInput as error:  # as of a setting that its method has by name, and does not use
+        # for example, a setting that the method fixes by its name and does not use
+        except BadInput as error:
             refused = str(error)
             del changed[name]
     if not changed:

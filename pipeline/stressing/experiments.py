@@ -1,4 +1,4 @@
-"""Stresses the runs of an experiment that was run: `fuselog run --stress`."""
+"""Stress of the runs of an experiment: `fuselog run --stress`."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,12 +27,12 @@ from fuselog.replay.judging.verdicts import Claimed
 
 
 class _Part(NamedTuple):
-    """Holds runs of an experiment that are stressed together.
+    """Runs of an experiment that are stressed together.
 
     Attributes:
-        experiment: all of it.
-        data: what it imports.
-        first, end: the runs.
+        experiment: the whole experiment.
+        data: the folder that it imports from.
+        first, end: the range of runs.
     """
 
     experiment: Experiment
@@ -61,15 +61,15 @@ def stress_result(
     scheduler: str | None = None,
     progress: Progress = no_progress,
 ) -> list[Stressing]:
-    """Stress the estimators of an experiment over all of its runs, as it was run in this process.
+    """Stress the estimators of an experiment over all its runs, under the settings of its result.
 
     Args:
-        result: what the run left.
-        workers: processes that share the runs; None stands for all cores where that pays.
-        scheduler: of Dask, whose workers share them.
-        progress: is told how it goes.
+        result: the result of the run.
+        workers: processes that share the runs; None stands for all cores if that is worthwhile.
+        scheduler: the address of a Dask scheduler whose workers share them.
+        progress: reports the progress.
 
-    Raises BadInput where the experiment has no estimators or no runs of its own.
+    Raises BadInput if the experiment has no estimators or no runs of its own.
     """
     beside = ("data", "parameters")
     values = {name: value for name, value in result.settings.items() if name not in beside}
@@ -90,10 +90,10 @@ def stress_result(
 def claims_under_stress(
     experiment: Experiment, result: Result, stress: Sequence[Stressing]
 ) -> list[Claim]:
-    """Return the claims of a result: those that stress may carry across their limit are inconclusive.
+    """Return the claims of a result; those that stress may move across their limit are inconclusive.
 
-    They are decided again with each metric's interval, or its value, wider on both sides by the largest
-    change that stress makes to it. Verdicts on metrics that are not of single estimators stay.
+    They are decided again with each metric's interval, or its value, widened on both sides by the
+    largest change under stress. Verdicts on metrics that do not belong to single estimators stay.
     """
     moved = {f"{each.estimator}.{key}": by for each in stress for key, by in each.moved.items()}
     intervals = dict[str, Sequence[float | None]](result.intervals)
@@ -105,7 +105,7 @@ def claims_under_stress(
     study: Study = load("studies", experiment.study, Study)
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
     again = decide(experiment.claims, result.metrics, intervals, numbers_of(experiment, options))
-    first = len(result.claims) - len(again)  # those that the study decides itself come before
+    first = len(result.claims) - len(again)  # claims that the study decides itself come first
     claims = list(result.claims)
     for place, found in enumerate(again, first):
         own = claims[place]
@@ -116,7 +116,7 @@ def claims_under_stress(
 
 
 def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[str, StressSums]]:
-    """Yield what each part leaves, in their order; a few are handed out at a time."""
+    """Yield the results of the parts in their order; a few parts are submitted at a time."""
     working = deque[Future[Any]]()
     for part in parts:
         working.append(pool.executor.submit(part.stressed))
@@ -127,7 +127,7 @@ def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[st
 
 
 def _merged(parts: Sequence[_Part], pool: WorkerPool, progress: Progress) -> Mapping[str, StressSums]:
-    """Merge what stress did, part by part, in their order."""
+    """Merge the results of the parts in their order."""
     whole: dict[str, StressSums] = {}
     try:
         for found in progress(_worked_off(parts, pool), "stressing: parts of the runs", len(parts)):

@@ -1,8 +1,8 @@
-"""Measures how far two replays are apart: in sigmas of the first, in metres and degrees, and since when.
+"""The distance of two replays: in sigmas of the first, in metres and degrees, and since when.
 
 A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
-replay. A moved start never grows in A where the filter is linear: d' P^-1 d does not rise (Deyst and
-Price, Conditions for asymptotic stability of the discrete minimum-variance linear estimator, 1968).
+replay. After a moved start, A never grows if the filter is linear: d' P^-1 d does not increase (Deyst
+and Price, Conditions for asymptotic stability of the discrete minimum-variance linear estimator, 1968).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,22 +17,21 @@ from fuselog.replay.engine.vectors.covariances import normalized_error_squared
 from fuselog.replay.engine.vectors.tangent import difference, tangent_components
 
 Floats = NDArray[np.float64]
-PARTED = 10.0  # copies part where A is that many times its first value
-LEAST = 1e-6  # below this share of a sigma, copies have not parted
+PARTED = 10.0  # copies diverge when A exceeds its first value by this factor
+LEAST = 1e-6  # below this share of a sigma, copies have not diverged
 AXES = ("x_m", "y_m", "z_m")
 
 
 class Parting(NamedTuple):
-    """Holds how far two replays of one estimate are apart.
+    """The distance of two replays of one estimate.
 
     Attributes:
-        topic: the estimate's.
+        topic: the topic of the estimate.
         stamps_ns: (n,) of the unchanged replay.
         amplification: (n,) A.
-        metres, degrees: (n,) of positions and of angles; NaN where the state has none.
-        spread: how much the standard deviations differ at most, as a share of them; NaN where none is
-            known.
-        explained: (n,) how large A may be where the other replay had less data, else 0.
+        metres, degrees: (n,) distances of positions and of angles; NaN if the state has none.
+        spread: the largest relative difference of standard deviations; NaN if none is known.
+        explained: (n,) how large A may be by chance if the other replay had less data; 0 otherwise.
     """
 
     topic: str
@@ -45,18 +44,18 @@ class Parting(NamedTuple):
 
     @property
     def has_sigmas(self) -> bool:
-        """Tell whether any covariance is known, without which A is zero."""
+        """Test whether any covariance is known; without one, A is zero."""
         return bool(np.isfinite(self.spread))
 
     @property
     def growth(self) -> float:
-        """Return the largest A for the first one that is not zero."""
+        """Return the ratio of the largest A to the first one that is not zero."""
         there = self.amplification[self.amplification > 0.0]
         return float(np.max(there) / there[0]) if len(there) else 1.0
 
     @property
     def parted(self) -> int | None:
-        """Return the row where the copies part; None where they do not."""
+        """Return the row from which the copies diverge; None if they do not."""
         there = np.flatnonzero(self.amplification > 0.0)
         if not len(there):
             return None
@@ -72,9 +71,9 @@ def partings(
 
     Args:
         base: the estimates of the unchanged replay, by topic.
-        copy: those of the other.
-        within_ns: how much later the copy's estimate of a stamp may be, or how much earlier.
-        has_less: whether the other one had less data, so that chance moves it.
+        copy: the estimates of the other replay.
+        within_ns: the largest difference in time between the two estimates of a stamp.
+        has_less: whether the other replay had less data, so that chance changes it.
     """
     return [
         _parting(stream, copy[topic], within_ns, has_less)
@@ -82,7 +81,7 @@ def partings(
         if stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
         and len(stream)
         and len(copy.get(topic, ()))
-        and np.all(np.diff(stream.publish_time_ns) > 0)  # of several things at once none is the same
+        and np.all(np.diff(stream.publish_time_ns) > 0)  # several objects at one stamp cannot be matched
     ]
 
 
@@ -115,11 +114,12 @@ def _largest_finite(spread: Floats) -> float:
 
 
 def _explained(covariance: Floats, other: Floats) -> Floats:
-    """Compute how large A may be by chance at n stamps (n,), where one estimate has less data.
+    """Compute the largest A that chance explains at n stamps (n,) if one replay has less data.
 
-    The difference of a consistent estimate with covariance P, and of another with less data and P', has
-    the covariance P' - P. So n A^2 is at most the largest eigenvalue of (P' - P) P^-1 times chi-square
-    of n degrees of freedom, which one of 1000 replays exceeds somewhere.
+    The difference between a consistent estimate with covariance P and one with less data and covariance
+    P' has the covariance P' - P. Therefore n A^2 is at most the largest eigenvalue of (P' - P) P^-1
+    times a chi-square quantile with n degrees of freedom, which 1 of 1,000 replays exceeds at some
+    stamp.
     """
     count, size = covariance.shape[:2]
     known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(other).all(axis=(1, 2))
@@ -144,14 +144,14 @@ def _norm(apart: Floats, is_in: Sequence[bool]) -> Floats:
 
 
 class Undetermined(NamedTuple):
-    """Holds a direction of the state that the measurements do not determine.
+    """A direction of the state that the measurements do not determine.
 
     Attributes:
-        components: their names, all of one unit.
-        direction: (n,) of length one, its largest entry positive.
-        sigma: along it, at the end.
-        next_sigma: the largest across it.
-        since_ns: when a measurement narrowed it last.
+        components: the names of its components, which have one unit.
+        direction: (n,) the unit vector, with a positive largest entry.
+        sigma: the standard deviation along it, at the end.
+        next_sigma: the largest standard deviation across it.
+        since_ns: the last stamp at which a measurement reduced it.
     """
 
     components: tuple[str, ...]
@@ -172,14 +172,14 @@ class Undetermined(NamedTuple):
 
 
 def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermined | None:
-    """Find the worst direction among components of one unit, where one is known far worse than others.
+    """Find the worst direction among components of one unit, if it is known far worse than others.
 
-    Components of different units have no common length, so that only those of one are compared.
+    Components of different units have no common length, so only those of one unit are compared.
 
     Args:
         stream: Gaussian estimates.
-        row: of which of them.
-        least: how many times the standard deviation is that of the other directions, at least.
+        row: the index of the estimate.
+        least: the smallest ratio to the standard deviation in the other directions.
     """
     kinds = stream.metadata["kinds"].split(",")
     names = [name for name, _ in tangent_components(stream.metadata["components"].split(","), kinds)]
@@ -208,5 +208,5 @@ def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermi
 
 
 def _last_narrowed(variances: Floats) -> int:
-    """Find the last row narrower than all before it since the variance was that small."""
+    """Find the last row with the smallest variance so far."""
     return int(np.flatnonzero(variances <= variances.min())[-1])

@@ -1,6 +1,6 @@
-"""Tells whether a result is one: replays under changes that should not matter; see `stress`.
+"""A test of whether a result is robust: replays under changes that should not matter; see `stress`.
 
-Runs that hold the same topics are replayed together with all their copies, as further runs of one pass.
+Runs with the same topics are replayed together with all their copies, as further runs of one pass.
 """
 
 from collections import defaultdict
@@ -28,7 +28,7 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_se
 from fuselog.replay.foreign.naming import allowed
 
 MOST_HALVED, MOST_REPLAYS = 3, 12
-# Runs that are stressed together: with their copies about as many as a replay holds at once.
+# Runs that are stressed together: with their copies about as many as a replay processes together.
 TOGETHER = max(1, RUNS_AT_ONCE // (1 + len(CHANGES)))
 
 
@@ -41,22 +41,23 @@ def stress(
     gap_limit_s: float = 0.2,
     set: Mapping[str, Any] | None = None,  # noqa: A002
 ) -> Stress:
-    """Replay under changes that should not matter, and say what they do to the result.
+    """Replay under changes that should not matter, and report their effect on the result.
 
-    A run and an estimator take twelve replays at most: one as it is, one for each change, one with half
-    the change for the three that do most, and one with a quarter where half does neither half nor all.
+    At most twelve replays are made per run and estimator: one without changes, one for each change, one
+    with half the change for the three with the largest effect, and one with a quarter if the effect of
+    half is neither half nor the whole.
 
     Args:
-        logs: paths, logs that were opened, or recordings.
+        logs: paths, opened logs, or recordings.
         estimators: as for `replay`.
-        seed: of signs, coins, and what is dropped.
+        seed: the seed of signs, coins, and dropped messages.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        set: parameters of estimators, and how topics are altered first, as for `replay`.
+        set: parameters of estimators, and alterations of topics that come first, as for `replay`.
 
     Returns:
-        What each change does to the estimates of each run and estimator, and a verdict.
+        The effect of each change on the estimates of each run and estimator, and a verdict.
 
-    Raises BadInput where an estimator cannot replay a run, or fails in all of them before it has an
+    Raises BadInput if an estimator cannot replay a run, or if it fails in all runs before its first
     estimate.
 
     >>> from fuselog.pipeline.api.api import record
@@ -80,11 +81,11 @@ def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -
     """Stress estimators over runs in memory, run by run.
 
     Args:
-        sources: the runs; those that hold the same topics are replayed together.
-        settings: of the estimators, by label.
+        sources: the runs; those with the same topics are replayed together.
+        settings: the settings of the estimators, by label.
         how: how they are replayed.
 
-    Raises BadInput where an estimator cannot replay a run.
+    Raises BadInput if an estimator cannot replay a run.
     """
     alike: dict[Any, list[int]] = defaultdict(list)
     for run, source in enumerate(sources):
@@ -114,7 +115,7 @@ def _in_memory(source: LogSource | MemorySource) -> MemorySource:
 def _stressed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> list[Stressed]:
-    """Stress runs that hold the same topics: replay all copies, parameters, the halves."""
+    """Stress runs with the same topics: replay all copies, changed parameters, and halved changes."""
     bound = bind(label, sources, settings)
     controls = [
         topic
@@ -129,7 +130,7 @@ def _stressed(
         made = []
         for run, name in of:
             change = CHANGES[name].of_run
-            assert change is not None  # parameters are no change of the run
+            assert change is not None  # parameters are not part of the run
             made.append(change(sources[run], inputs[run], size, how.seed))
         return made
 
@@ -143,7 +144,7 @@ def _stressed(
     try:
         done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
     except BadInput:
-        replayed(sources, label, settings, how)  # which raises where it is no fault of a copy
+        replayed(sources, label, settings, how)  # raises if the fault is not that of a copy
         for name in CHANGES:
             own = [what for what in whole if what[1] == name]
             try:
@@ -169,7 +170,7 @@ def _stressed(
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
 
     def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
-        """Try these changes of these runs, so much smaller."""
+        """Try these changes of these runs at a smaller size."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
             again = replayed(copies(own, size), label, settings, how)
@@ -205,9 +206,10 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Choose which changes are quartered: whose half does less, but not half as much, worst first.
+    """Choose the changes to quarter: those whose half does less, but not half as much, worst first.
 
-    What bends is in proportion where it is small enough. No run is replayed more than twelve times.
+    A curved effect is proportional if the change is small enough. No run is replayed more than twelve
+    times.
     """
     chosen = []
     for run, own in enumerate(found):
@@ -224,7 +226,7 @@ def _bent(
 
 
 def _topics(bound: Sequence[Bound]) -> list[str]:
-    """List what is read: of an estimator in time its streams and priors, of a batch all it takes."""
+    """List the topics that are read: streams and priors, or all inputs of a batch estimator."""
     found = [
         topic
         for each in bound
@@ -242,7 +244,7 @@ def _lacking(name: str, inputs: Inputs) -> str:
 
 
 def _doubtful(tried: Iterable[Tried]) -> list[str]:
-    """Choose which changes are halved: of those that do something the three that do most."""
+    """Choose the changes to halve: the three with the largest effect."""
     own = [
         each
         for each in tried

@@ -1,4 +1,4 @@
-"""Sums over runs what changes that should not matter do to an estimator: counts and means."""
+"""Sums over runs of the effects of changes that should not matter: counts and means."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -8,19 +8,20 @@ from fuselog.pipeline.output.alarms import Stressing, Verdict
 from fuselog.pipeline.output.words import count
 from fuselog.pipeline.stressing.verdicts import ORDER, Stressed
 
-# Of so many runs one may be worse by chance: a lost message moves one of 1000 farther than it should.
+# One in this many runs may be worse by chance: 1 in 1,000 lost messages has a larger effect than
+# expected.
 RARE_RUNS = 100
 
 
 @dataclass
 class StressSums:
-    """Counts what stress did to one estimator, run by run.
+    """The effects of stress on one estimator, summed over runs.
 
     Attributes:
-        estimator: whose.
-        verdicts: how many runs have which.
-        worst: of each verdict the largest A, and the sentences of that run.
-        moved: by change and by (case, metric) the sum of what it moved, and of how many runs.
+        estimator: the estimator's label.
+        verdicts: the number of runs with each verdict.
+        worst: the largest A of each verdict, with the sentences of that run.
+        moved: by change and by (case, metric), the sum of the metric's changes, and the number of runs.
     """
 
     estimator: str
@@ -29,7 +30,7 @@ class StressSums:
     moved: dict[str, dict[tuple[str, str], tuple[float, int]]] = field(default_factory=dict)
 
     def add(self, stressed: Stressed) -> None:
-        """Take in a run."""
+        """Add a run."""
         largest = max((each.largest for each in stressed.tried.values()), default=0.0)
         moved = {
             name: {key: (by, 1) for key, by in each.moved.items()}
@@ -39,7 +40,7 @@ class StressSums:
         self.merge(StressSums(self.estimator, Counter([stressed.worst]), own, moved))
 
     def merge(self, other: "StressSums") -> None:
-        """Take in what was found of later runs."""
+        """Add the sums of later runs."""
         self.verdicts += other.verdicts
         for verdict, (largest, sentences) in other.worst.items():
             if verdict not in self.worst or largest > self.worst[verdict][0]:
@@ -65,7 +66,7 @@ class StressSums:
 
     @property
     def _largest(self) -> dict[str, float]:
-        """Return how far a change moves a metric's mean at most: of each case, and over all of them."""
+        """Return the largest change of each metric's mean, by case and over all cases."""
         largest: dict[str, float] = {}
         for of in self.moved.values():
             sums: dict[str, tuple[float, int]] = {}
@@ -79,7 +80,7 @@ class StressSums:
 
 
 def verdicts_of(stressed: Iterable[Stressed]) -> dict[str, Stressing]:
-    """Return the verdict on each estimator over its runs."""
+    """Compute the verdict on each estimator over its runs."""
     sums: dict[str, StressSums] = {}
     for each in stressed:
         sums.setdefault(each.estimator, StressSums(each.estimator)).add(each)

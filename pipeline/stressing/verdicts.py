@@ -1,4 +1,4 @@
-"""Judges what such changes did to a result: harmless, sensitive, discontinuous or chaotic."""
+"""Verdicts on the effects of such changes: harmless, sensitive, discontinuous or chaotic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,27 +19,27 @@ from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.judge import Judge
 
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
-HARMLESS = 0.1  # A below this
-MARGIN = 0.02  # of the metric, as compare's
-HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
-BENT = 1.2  # half the change does less, but not half as much: a quarter tells
-SQUARED = 4.2  # where it goes by the change's square; what shrinks by more has jumped
-ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
-PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
-SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift, 1; per second 2
+HARMLESS = 0.1  # upper limit of A
+MARGIN = 0.02  # relative change of the metric, as in compare
+HALVES = (1.9, 2.1)  # range of the effect's ratio to that of half the change, if it is proportional
+BENT = 1.2  # half the change does less, but not half as much: a quarter is tried
+SQUARED = 4.2  # upper limit of an effect that is quadratic in the change; a larger ratio is a jump
+ONE_SIGMA = 1.0  # A of a change without a half: beyond it, the results are different
+PER_PREDICTION = 1e-4  # relative change of a sigma by moved stamps from which half the change is tried
+SHRINKS = 1.5  # ratio of a sigma's change: 1 for noise per prediction, 2 for noise per second
 
 
 class Tried(NamedTuple):
-    """Holds what one change did to one run.
+    """The effect of one change on one run.
 
     Attributes:
         name: a key of `CHANGES`.
-        parting: of the estimate that it moves most; None where no estimate is a Gaussian.
-        moved: by (case, metric) how far a metric is from that of the unchanged replay.
-        beyond: how far the main metric moved, in words; empty where that is within the margin.
+        parting: the distance of the estimate with the largest change; None if no estimate is Gaussian.
+        moved: by (case, metric), the change of a metric from the unchanged replay.
+        beyond: the change of the main metric, in words; "" within the margin.
         why: why it was not tried.
-        failed: when and why the copy ends, where the unchanged replay does not; of what was not tried,
-            that one, where it ends before it has an estimate.
+        failed: when and why the copy ends although the unchanged replay does not; for a change that was
+            not tried, that of the unchanged replay if it ends before its first estimate.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Tried(NamedTuple):
 
     @property
     def far(self) -> str:
-        """Say how far the estimate moves, in words."""
+        """Describe how far the estimate moves."""
         if self.parting is None:
             return f"the metric moves: {self.beyond}" if self.beyond else "the metric stays"
         sizes = [(self.parting.metres, "m"), (self.parting.degrees, "deg")]
@@ -74,7 +74,7 @@ class Tried(NamedTuple):
 
     @property
     def is_wider(self) -> bool:
-        """Tell whether moved stamps change a covariance by more than noise per second mostly does."""
+        """Test whether moved stamps change a covariance by more than noise per second usually does."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -82,17 +82,17 @@ class Tried(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stressed:
-    """Holds what all changes did to one run, by one estimator.
+    """The effects of all changes on one run with one estimator.
 
     Attributes:
         source: the run.
         estimator: the label.
-        tried: each change, whole.
-        halves, quarters: those that were halved, and those of these that were halved again.
-        sensors: the stamps of each topic that was sensed.
-        estimates: those of the unchanged replay, by topic.
-        copies: those of each change, whole.
-        is_recursive: whether the estimator goes through time, from prediction to update.
+        tried: each change at full size.
+        halves, quarters: the changes that were halved, and those of them that were halved again.
+        sensors: the stamps of each sensor's topic.
+        estimates: the estimates of the unchanged replay, by topic.
+        copies: the estimates of each change at full size.
+        is_recursive: whether the estimator alternates predictions and updates.
     """
 
     source: MemorySource
@@ -107,7 +107,7 @@ class Stressed:
 
     @property
     def failed(self) -> str:
-        """Say when and why the unchanged replay ends before it has an estimate; else empty."""
+        """Return when and why the unchanged replay ends before its first estimate; "" otherwise."""
         said = [each.failed for each in self.tried.values() if each.why]
         return next(filter(None, said), "")
 
@@ -117,9 +117,9 @@ class Stressed:
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
-        """Tell whether a change without a half moves the estimate no farther than it may.
+        """Test whether a change without a half moves the estimate no further than it may.
 
-        It is less than a sigma, or, as a lost message moves it by chance, what the covariances say.
+        The limit is a sigma or, for lost messages, what the covariances allow by chance.
         """
         parting = self.tried[name].parting
         if name != DROPPED or parting is None:
@@ -128,16 +128,16 @@ class Stressed:
         return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
-        """Return how many times more a change does than half of it, in A; NaN where none was halved.
+        """Compute the ratio of a change's effect to that of half of it, in A; NaN if it was not halved.
 
-        Where half of the change was halved again, it is that which is compared.
+        If half of the change was halved again, these two are compared.
         """
         half, quarter = self.halves.get(name), self.quarters.get(name)
         more, less = (half, quarter) if half and quarter else (self.tried[name], half)
         return more.size / less.size if less and less.size > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
-        """Return what a change does."""
+        """Return the verdict on a change."""
         each = self.tried[name]
         if each.why:
             return "not tried"
@@ -157,18 +157,18 @@ class Stressed:
 
     @property
     def deciding(self) -> str:
-        """Return which change decides the worst verdict: of those that have it what moves most."""
+        """Return the change with the largest effect among those with the worst verdict."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
         return max(own, key=lambda name: (bool(self.tried[name].failed), self.tried[name].size))
 
     @property
     def is_per_prediction(self) -> bool:
-        """Tell whether a microsecond changes a covariance: one more prediction adds noise."""
+        """Test whether noise is added per prediction: a microsecond changes a covariance."""
         return self.is_recursive and self._jumps
 
     @property
     def _jumps(self) -> bool:
-        """Tell whether a microsecond changes a sigma, and half of one as much."""
+        """Test whether a microsecond changes a sigma, and half a microsecond equally."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -176,19 +176,19 @@ class Stressed:
 
     @property
     def is_redrawn(self) -> bool:
-        """Tell whether an ulp of the inputs changes a covariance too: it is not the stamps that do."""
+        """Test whether an ulp of the inputs changes a covariance, so stamps are not the cause."""
         ulp = self.tried["ulp"].parting
         return ulp is not None and ulp.spread > PER_PREDICTION
 
     @cached_property
     def undetermined(self) -> Undetermined | None:
-        """Return the direction that measurements do not determine, of the estimate that moves most."""
+        """Return the undetermined direction of the estimate that changes most."""
         moved = max(self.tried.values(), key=lambda each: each.largest).parting
         return None if moved is None else undetermined(self.estimates[moved.topic])
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each change."""
+        """Return a row per change."""
         found = []
         for name, each in self.tried.items():
             row: dict[str, Any] = {
@@ -214,7 +214,7 @@ class Stressed:
         return found
 
     def _message_at(self, stamp_ns: int) -> str:
-        """Return the topic whose message is the last one until then."""
+        """Return the topic of the last message up to a stamp."""
         last = {
             topic: int(stamps_ns[np.searchsorted(stamps_ns, stamp_ns, side="right") - 1])
             for topic, stamps_ns in self.sensors.items()
@@ -240,7 +240,7 @@ class Stressed:
         return f"{begin}; {self._shrinking(name)}"
 
     def _shrinking(self, name: str) -> str:
-        """Say what half of a change does, in words, and a quarter where that was tried."""
+        """Describe the effect of half of a change, and of a quarter if that was tried."""
         share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
         half = f"half the change does {share:.2g} of it"
         if name in self.quarters:
@@ -251,7 +251,7 @@ class Stressed:
 
     @property
     def sentences(self) -> list[str]:
-        """Return the verdict first, then what explains it."""
+        """Return the verdict, followed by explanations."""
         sentences = [self.sentence]
         if self.is_per_prediction:
             sentences.append(
@@ -285,11 +285,11 @@ def _largest(values: Any) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stress:
-    """Holds what changes did to runs, by estimators: one of `Stressed` for each run and estimator.
+    """The effects of changes on runs, for several estimators.
 
     Attributes:
-        stressed: one for each run and estimator.
-        gap_limit_s: over longer gaps the truth was not interpolated.
+        stressed: one `Stressed` per run and estimator.
+        gap_limit_s: the truth is not interpolated over longer gaps.
     """
 
     stressed: Sequence[Stressed]
@@ -307,11 +307,11 @@ class Stress:
         return list(dict.fromkeys(sentence for each in by_weight for sentence in each.sentences))
 
     def draw(self, save: str | Path) -> None:
-        """Write the timeline of the first run to the .rrd file `save`: copies fan out from estimates.
+        """Draw the first run's timeline to the .rrd file `save`, with copies fanning out from estimates.
 
-        Raises BadInput where the file cannot be written.
+        Raises BadInput if the file cannot be written.
         """
-        from fuselog.replay.timeline.fanning import Fan  # which takes long to import
+        from fuselog.replay.timeline.fanning import Fan  # takes long to import
         from fuselog.replay.timeline.show import Drawing
 
         check_files([(Path(save), TIMELINE)], {})
