@@ -15,8 +15,8 @@ ROUNDING = 1e-14
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
     """Compute NEES or NIS e' P^-1 e of errors (..., n); leading axes broadcast.
 
-    A component of infinite variance contributes nothing. The result is NaN if there are no components,
-    if an error or a covariance is NaN, or if a covariance is not positive definite.
+    A component of infinite variance is ignored. The result is NaN if there are no components, if an
+    error or a covariance is NaN, or if a covariance is not positive definite.
 
     Args:
         error: (..., n), in the units of the components.

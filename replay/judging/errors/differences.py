@@ -142,7 +142,7 @@ def _interval(
 ) -> tuple[float, float, Floats]:
     """Compute the 95 % interval of a statistic of the pairs, and its resamples."""
     runs = len(first)
-    from scipy.stats import bootstrap, norm, t  # which takes long to import
+    from scipy.stats import bootstrap, norm, t  # slow to import
 
     widened = np.sqrt(runs / (runs - 1)) * t.ppf(0.975, runs - 1)
     done = bootstrap(

@@ -302,7 +302,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 
     Raises BadInput if a trajectory has no stamps, or if its speed never changes.
     """
-    from scipy.optimize import minimize_scalar  # which takes long to import
+    from scipy.optimize import minimize_scalar  # slow to import
 
     trajectories = [estimate, truth]
     times: list[Floats] = [_stamps(each).astype(float) * 1e-9 for each in trajectories]
@@ -362,7 +362,7 @@ def _best_lags(estimate: Floats, truth: Floats) -> Integers:
 
     It is Pearson's correlation of the overlap, which is at least half of the shorter signal.
     """
-    from scipy.signal import correlate, correlation_lags  # which takes long to import
+    from scipy.signal import correlate, correlation_lags  # slow to import
 
     everywhere = np.ones_like(estimate), np.ones_like(truth)
     count = np.rint(correlate(everywhere[1], everywhere[0]))

@@ -262,7 +262,7 @@ class Held:
         return self.of.blocks(topics, order, block_messages)
 
     def whole(self) -> "Held":
-        """Return itself."""
+        """Return this source itself."""
         return self
 
 
@@ -298,7 +298,7 @@ class Sensed:
         return Held(self.source, {**self._lasting, **streams})
 
     def advance(self, time_ns: int) -> None:
-        """Read on up to a stamp."""
+        """Read further messages up to a stamp."""
         while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
             for topic, stream in block.items():
                 self._kept[topic].add(stream)

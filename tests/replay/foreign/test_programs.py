@@ -223,7 +223,7 @@ def test_of_two_truths_one_is_named() -> None:
     topics = {name: Topic(name, kind.full_name, "protobuf", (), {}, 1) for name, kind in kinds.items()}
     for named, sentence in (
         ("", "the log has the truths /a/truth, /b/truth; choose one with --set mine.truth=..."),
-        ("/c/truth", "truth = /c/truth: the log has none"),
+        ("/c/truth", "truth = /c/truth: the log has no such truth"),
         ("/b/truth", ""),
     ):
         estimator, values = configure("mine", program("x {log} {out}", truth=named))
