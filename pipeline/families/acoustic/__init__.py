@@ -1,4 +1,4 @@
-"""Studies sounds and shots: Osborne et al. 2014, recordings, sequences.
+"""Studies of sounds and shots: Osborne et al. 2014, recordings, sequences.
 
 Begin with `study`.
 """

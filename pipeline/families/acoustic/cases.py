@@ -1,4 +1,4 @@
-"""Runs the cases of shooter localization: one scenario at one noise, all modes, bounds."""
+"""Cases of shooter localization: one scenario at one noise level, with all modes and bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,14 +40,14 @@ Place = tuple[float, float]
 
 
 class Maps(Parameters):
-    """Describes figures 22 and 23.
+    """The maps of figures 22 and 23.
 
     Attributes:
         scenario: scenario with the sensors.
-        aims: what is aimed at (x, y), in m, by the label of an estimator.
-        low_m: least x and y of the grid of shooters.
-        high_m: greatest x and y of the grid of shooters.
-        step_m: distance of the grid's points.
+        aims: aim point (x, y), in m, by the label of an estimator.
+        low_m: smallest x and y of the grid of shooters.
+        high_m: largest x and y of the grid of shooters.
+        step_m: spacing of the grid.
     """
 
     scenario: str
@@ -58,13 +58,13 @@ class Maps(Parameters):
 
 
 class AcousticOptions(Parameters):
-    """States the paper's scenarios, how noisy they are, and the maps.
+    """The paper's scenarios, noise levels and maps.
 
     Attributes:
         scenarios: the paper's three scenarios, as files.
         multipliers: multiples of the angular noise.
-        modes: estimators that go at all multiples.
-        maps: Figures 22 and 23.
+        modes: estimators that run at all multiples; the others run only at 1 and the last multiple.
+        maps: maps of figures 22 and 23.
     """
 
     scenarios: Annotated[list[str], Field(min_length=3, max_length=3)]
@@ -83,14 +83,14 @@ class AcousticOptions(Parameters):
 
 @dataclass(frozen=True)
 class Mode:
-    """Holds what one estimator made of a case.
+    """Results of one estimator in a case.
 
     Attributes:
         components: names of the n parameters.
         bound: the CRLB (n, n) at the truth.
-        error: (repetitions, shots of one, n).
-        nees: of the shooter's position, (repetitions, shots of one).
-        converged: the share of solutions that were found.
+        error: errors (repetitions, shots of a repetition, n).
+        nees: NEES of the shooter's position, (repetitions, shots of a repetition).
+        converged: share of solutions that converged.
     """
 
     components: list[str]
@@ -101,7 +101,7 @@ class Mode:
 
     @property
     def bound_m(self) -> float:
-        """Return the root of the trace of the position's CRLB."""
+        """Return the square root of the trace of the position's CRLB."""
         return float(np.sqrt(np.trace(self.bound[:2, :2])))
 
     @property
@@ -111,7 +111,7 @@ class Mode:
 
     @property
     def distance_m(self) -> Floats:
-        """Return the distance of estimates from the truth, (repetitions, shots of one)."""
+        """Return the distances of estimates from the truth, (repetitions, shots of a repetition)."""
         return np.linalg.norm(self.error[..., :2], axis=-1)
 
     @property
@@ -132,12 +132,12 @@ class Mode:
 
     @property
     def area_ratio(self) -> float:
-        """Return the area of the estimates' 95 % ellipse by that of the CRLB."""
+        """Return the area of the estimates' 95 % ellipse divided by that of the CRLB."""
         return float(ellipse_area(self.covariance)) / self.area_m2
 
     @property
     def far_per_1000(self) -> float:
-        """Return the solutions in a thousand that are missing, or more than 50 m off."""
+        """Return the number per thousand of solutions that are missing or more than 50 m off."""
         return 1000.0 * float(np.mean(~(self.distance_m <= FAR_M)))
 
     @property
@@ -148,7 +148,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Case:
-    """Holds one scenario at one multiple of the angular noise, and its modes by estimators' labels."""
+    """One scenario at one multiple of the angular noise, and its modes by estimator label."""
 
     number: int
     multiplier: float
@@ -159,7 +159,7 @@ class Case:
 
 
 def run_case(experiment: Experiment, setting: Setting, number: int, multiplier: float) -> Case:
-    """Record a scenario, replay the modes that go at this noise, and bound them."""
+    """Record a scenario, replay the modes that run at this noise level, and compute their bounds."""
     options: AcousticOptions = setting.options
     name = options.scenarios[number - 1]
     stated = experiment.record.parameters if experiment.record else {}
@@ -212,7 +212,7 @@ def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
 
 
 def _heard(sources: list[MemorySource]) -> Detections:
-    """Gather what all sensors heard of all shots."""
+    """Collect the detections of all shots by all sensors."""
     numbers = range(1, len([topic for topic in sources[0].topics if topic.endswith("/detections")]) + 1)
     streams = [
         [gather([source.streams[f"/sensor{n}/{leaf}"] for source in sources]) for n in numbers]
@@ -245,7 +245,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Compute on a grid of shooters (x, y) the ellipse area of bearings only by that of a mode."""
+    """Compute the ellipse area of bearings only over that of a mode, on a grid of shooters (x, y)."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

@@ -1,4 +1,4 @@
-"""Draws the figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
+"""Figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
 
 from collections.abc import Callable, Sequence
 
@@ -33,7 +33,7 @@ def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[
 
 
 def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Chart:
-    """Draw the CRLB's 95 % ellipses, and those of the estimates, figures 6-14."""
+    """Draw the 95 % ellipses of the CRLB and of the estimates, figures 6-14."""
     panels = []
     for case in nominal:
         shooter = np.array(case.parameters.shooter_position_m)
@@ -51,7 +51,7 @@ def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Chart:
 
 
 def _range_errors(case: Case) -> Figure:
-    """Draw errors of local range estimates and the Gaussian of eq (25), of mean zero, figures 3-5."""
+    """Draw errors of local range estimates and the zero-mean Gaussian of eq (25), figures 3-5."""
     found = range_errors_m(case)
     figure = Figure(figsize=(11, 3), layout="constrained")
     for axes, (sensor, (error, sigma)) in zip(
@@ -71,7 +71,7 @@ def _sweep(
     value: Callable[[Mode], float],
     interval_runs: int | None,
 ) -> Chart:
-    """Draw a value by noise; with an interval for NEES, else with the CRLB, figures 15-20."""
+    """Draw a value over the noise, with an interval for NEES or the CRLB otherwise, figures 15-20."""
     numbers = sorted({case.number for case in cases})
     panels = []
     for number in numbers:
@@ -92,7 +92,7 @@ def _sweep(
 
 
 def _maps(options: AcousticOptions) -> Figure:
-    """Draw the ellipse area of bearings only over that of the mode, figures 22 and 23."""
+    """Draw the ellipse area of bearings only divided by that of the mode, figures 22 and 23."""
     aims = options.maps.aims
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, (label, aim) in zip(figure.subplots(1, len(aims)), aims.items(), strict=True):

@@ -1,7 +1,7 @@
-"""Studies sounds in recordings: arrivals by cross-correlation, places by them, covariances.
+"""Study of sounds in recordings: arrivals by cross-correlation, positions from them, covariances.
 
-Where truth or published differences are known, they are held to them. What a stated covariance is worth
-is tried on simulated recordings, over noise: there each of many sounds is somewhere else.
+Results are compared with the truth or with published differences if these are known. Stated covariances
+are tested on simulated recordings at several noise levels, with many sounds at different positions.
 """
 
 from typing import Annotated
@@ -25,23 +25,23 @@ from fuselog.replay.judging.errors.evaluation import Errors
 
 
 class Published(Parameters):
-    """States the differences that were published of a sound.
+    """Published arrival differences of a sound.
 
     Attributes:
-        delay_s: how much later than the first microphone the others heard it, in their numbers' order.
+        delay_s: delays of all microphones relative to the first, in the order of their numbers.
     """
 
     delay_s: Annotated[list[float], Field(min_length=2)]
 
 
 class Simulated(Parameters):
-    """Describes simulated recordings of the scenario `sound-source`.
+    """Simulated recordings of the scenario `sound-source`.
 
     Attributes:
-        runs: number of runs at each noise.
+        runs: number of runs at each noise level.
         seed: seed of the runs.
-        snr_db: signal-to-noise ratios; without any nothing is simulated.
-        parameters: what differs from the scenario's defaults, by name.
+        snr_db: signal-to-noise ratios; if empty, nothing is simulated.
+        parameters: changes to the scenario's default parameters, by name.
     """
 
     runs: PositiveInt = 100
@@ -51,10 +51,10 @@ class Simulated(Parameters):
 
 
 class Options(Parameters):
-    """States what is known of sounds, and what is simulated.
+    """Published differences of sounds, and simulated recordings.
 
     Attributes:
-        published: differences that were published, by the name of a sound.
+        published: published arrival differences, by the name of a sound.
         simulated: simulated recordings.
     """
 
@@ -102,7 +102,7 @@ def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> N
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:
-    """Return the differences of all sounds: later than at the first of its microphones, and how sure."""
+    """Tabulate the differences of all sounds relative to their first microphone, and their sigmas."""
     tables = []
     points = source.streams["/microphones"]
     places = pd.DataFrame(points["position_m"], points["landmark_id"].astype(int), ["x_m", "y_m", "z_m"])
@@ -131,7 +131,7 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
 
 
 def known_place(errors: Errors) -> dict[str, MetricValue]:
-    """Compute how far a sound of known place is from it, in how many coordinates, and NEES."""
+    """Compute the error of a sound at a known position, its number of coordinates, and its NEES."""
     axes = [errors.components.index(name) for name in ("x_m", "y_m", "z_m") if name in errors.components]
     away_m = np.linalg.norm(errors.error[:, axes], axis=1)
     found = {
@@ -143,7 +143,7 @@ def known_place(errors: Errors) -> dict[str, MetricValue]:
 
 
 def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
-    """Return the differences of every sound, and how far they are from those that were published."""
+    """Return the differences of every sound, and their deviations from the published ones."""
     delays = {name: rows["delay_s"].to_numpy() for name, rows in table.groupby("sound", sort=False)}
     found: dict[str, MetricValue] = {
         f"sound.delay_s.{name!s}": of.tolist() for name, of in delays.items()
@@ -162,10 +162,10 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
 
 
 def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
-    """Compute how well one place explains a sound's differences, and how many are more than needed.
+    """Compute how well one position explains a sound's differences, and the number of spare differences.
 
-    The sum of squared innovations, less those that the start leaves nothing of, has as many degrees of
-    freedom as there are differences beyond the coordinates.
+    The sum of squared innovations, except those that the start uses up, has as many degrees of freedom
+    as there are differences in excess of the coordinates.
     """
     heights_m = table["z_m"][table["sound"] == name]
     extra = len(squared) - (2 if np.ptp(heights_m) == 0.0 else 3)
@@ -174,7 +174,7 @@ def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, Met
 
 
 def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
-    """Simulate sounds: errors (m), NEES, and whether the 95 % region has the place in it."""
+    """Simulate sounds; tabulate errors (m), NEES, and whether the 95 % region contains the position."""
     tables = []
     for snr_db in asked.snr_db:
         parameters = {**asked.parameters, "snr_db": snr_db}
@@ -202,7 +202,7 @@ def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
 
 
 def _chart(simulated: pd.DataFrame) -> Chart:
-    """Draw how large errors are in how many of the simulated sounds, by noise."""
+    """Draw the cumulative distribution of errors of the simulated sounds, by noise level."""
     panel = Panel(x=Axis(label="error (m)", log=True), y=Axis(label="share of the sounds below it"))
     for snr_db, rows in simulated.groupby("snr_db", sort=False):
         error_m = np.sort(rows["error_m"])

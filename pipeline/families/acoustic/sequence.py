@@ -1,8 +1,9 @@
-"""Studies shots in sequence: what it is worth to take them as one problem, and robustly.
+"""Study of shots in sequence: the benefit of a joint estimate, and of robust estimation.
 
-Errors are those at the last report of each shot: of filters and smoothers where the shooter is by then,
-of single-shot solutions, which know of no motion, where the shot was fired. Estimators are compared by
-the mean over the runs of the logarithm of their RMSE: a run that is lost counts, but not for all others.
+Errors are those at the last report of each shot. For filters and smoothers, the truth is the shooter's
+position at that time; for single-shot solutions, which have no motion model, it is the position at which
+the shot was fired. Estimators are compared by the mean over runs of the log RMSE, so that a lost run
+counts without dominating.
 """
 
 from typing import Annotated, Any
@@ -27,10 +28,10 @@ SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
 
 class Options(Parameters):
-    """States the cases.
+    """The cases of the study.
 
     Attributes:
-        cases: what differs in the scenario, by the name of a case; the first has no faults.
+        cases: changes to the scenario's parameters, by the name of a case; the first has no faults.
     """
 
     cases: Annotated[dict[str, dict[str, float]], Field(min_length=1)] = {"clean": {}}
@@ -66,9 +67,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
-    """Return how far off each estimator is at every shot of every run, NaN where it has no estimate.
+    """Tabulate the error of each estimator at every shot of every run, NaN if it has no estimate.
 
-    `nees` is per component, of all that an estimator tells and the truth has.
+    `nees` is per component, for all components that the estimate and the truth have in common.
     """
     tables = []
     for label in labels:
@@ -82,7 +83,7 @@ def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
             error, nees = np.full((len(last_ns), 2), np.nan), np.full(len(last_ns), np.nan)
             error[there] = errors.error[own][rows[there], :2]
             nees[there] = errors.nees[own][rows[there]] / len(errors.components)
-            if "vx_mps" not in errors.components:  # knows of no motion
+            if "vx_mps" not in errors.components:  # the estimator has no motion model
                 error += positions(source, last_ns) - fired
             table = pd.DataFrame({"shot": np.arange(1, len(last_ns) + 1), "nees": nees})
             tables.append(table.assign(error_m=np.hypot(*error.T), run=run, estimator=label))
@@ -90,7 +91,7 @@ def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
 
 
 def shots_of(source: MemorySource) -> tuple[Floats, Any]:
-    """Return from where each shot that anybody heard was fired (shots, 2), and when last heard (ns)."""
+    """Return the firing positions (shots, 2) of shots that were heard, and when each was last heard."""
     detections = [stream for topic, stream in source.streams.items() if topic.endswith("/detections")]
     shot = np.concatenate([stream["shot_id"] for stream in detections]).astype(np.int64)
     heard_ns = np.concatenate([stream.publish_time_ns for stream in detections])
@@ -102,14 +103,14 @@ def shots_of(source: MemorySource) -> tuple[Floats, Any]:
 
 
 def positions(source: MemorySource, time_ns: Any) -> Floats:
-    """Return where the shooter is (n, 2)."""
+    """Return the shooter's positions (n, 2)."""
     truth = source.streams["/shooter/truth"]
     elapsed, known = time_ns - source.epoch_ns, truth.publish_time_ns - source.epoch_ns
     return np.stack([np.interp(elapsed, known, truth["state"][:, axis]) for axis in range(2)], axis=1)
 
 
 def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
-    """Compute every run's RMSE and mean NEES over the shots that were located, and their share."""
+    """Compute every run's RMSE and mean NEES over the located shots, and the share of located shots."""
     grouped = shots.groupby(["case", "estimator", "run"], sort=False)
     return pd.DataFrame(
         {
@@ -121,7 +122,7 @@ def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
 
 
 def log_ratio(runs: pd.DataFrame, case: str, label: str, other: str) -> Interval:
-    """Average the logarithm of the ratio of two estimators' RMSE, over runs that both located."""
+    """Compute the mean log ratio of two estimators' RMSE, over runs that both located."""
     rmse: Any = runs[runs["case"] == case].pivot_table("rmse_m", "run", "estimator")
     return mean_interval(np.log(rmse[label] / rmse[other]).dropna())
 
@@ -131,7 +132,7 @@ def _median(shots: pd.DataFrame, case: Any, label: Any) -> float:
 
 
 def _chart(shots: pd.DataFrame) -> Chart:
-    """Draw the median error over the runs, shot by shot, a panel for each case."""
+    """Draw the median error over the runs, shot by shot, one panel per case."""
     panels = []
     for case, of_case in shots.groupby("case", sort=False):
         axis = Axis(label="median error (m)", log=True)

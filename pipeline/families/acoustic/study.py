@@ -1,4 +1,4 @@
-"""Studies shooter localization: figures 3-23 of Osborne et al. 2014 with numbers."""
+"""Study of shooter localization: figures 3-23 of Osborne et al. 2014 with our numbers."""
 
 import hashlib
 from typing import Any
@@ -57,7 +57,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
-    """Tabulate NEES, RMSE, CRLB and stray solutions of every mode by noise, figures 15-21."""
+    """Tabulate NEES, RMSE, CRLB and outlying solutions of every mode by noise level, figures 15-21."""
     low, high = chi_square_interval(2, runs)
     rows = [
         (
@@ -130,7 +130,7 @@ def _table_of_ellipses(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate how the local range estimates are distributed, figures 3-5."""
+    """Tabulate the distributions of the local range estimates, figures 3-5."""
     rows = [
         (case.number, sensor, error.mean(), error.std(), sigma, skew(error))
         for case in _nominal(cases)
@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Tabulate how much smaller the ellipse is than that of bearings only, figures 22 and 23."""
+    """Tabulate the ellipse area of bearings only divided by that of a mode, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)
@@ -152,7 +152,7 @@ def _table_of_maps(maps: Maps) -> pd.DataFrame:
 
 
 def _metrics(cases: list[Case]) -> dict[str, Any]:
-    """Return the metrics of one scenario: at the paper's noise, and lists over all noises."""
+    """Compute the metrics of one scenario: at the paper's noise, and lists over all noise levels."""
     values: dict[str, Any] = {}
     name = f"scenario-{cases[0].number}"
     for case in _nominal(cases):
@@ -193,7 +193,7 @@ def _metrics(cases: list[Case]) -> dict[str, Any]:
 
 
 def _metrics_of_maps(maps: pd.DataFrame) -> dict[str, Any]:
-    """Find where an ellipse is smallest beside that of bearings only, how much, and the median."""
+    """Find the position with the largest ratio of ellipse areas, that ratio, and the median ratio."""
     values: dict[str, Any] = {}
     for label, rows in maps.groupby("mode", sort=False):
         best = rows.iloc[int(np.nanargmax(rows["ratio"]))]

@@ -1,10 +1,11 @@
-"""Studies verification in sequence: Wald's test of each probe, and Page's of the matcher.
+"""Study of sequential verification: Wald's test of each probe, and Page's test of the matcher.
 
-Log-likelihood ratios are calibrated on other users than they judge. Those of a matcher are drawn again,
-users as clusters: a replicate draws users with replacement, and all intervals are quantiles over the
-replicates. The data have one genuine score per user and matcher, so that further probes of one person
-are those of others: independent, or alike by an assumed correlation of normal scores. What is real in
-sequence is one person with matcher after matcher, and many impostors against one identity.
+Log-likelihood ratios are calibrated on other users than those they are applied to. A matcher's ratios
+are resampled by users as clusters: a replicate draws users with replacement, and all intervals are
+quantiles over the replicates. The data contain one genuine score per user and matcher, so further probes
+of a person are scores of other persons: independent, or correlated by an assumed correlation of normal
+scores. Sequences that are entirely real are one person with one matcher after another, and many
+impostors against one identity.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -46,26 +47,26 @@ WAYS = {
     "alike": "probes of one person alike",
     "matchers": "one person, matcher after matcher",
 }
-# The person scores as an impostor, impostors as the person, or genuine scores have fallen.
+# The person scores like an impostor, impostors score like the person, or genuine scores drop.
 FAULTS = ("misses", "accepts", "drifts")
 FIXED_PROBES = 50  # more than any matcher needs
-IMPOSTORS = 100_000  # so many that their tail is that of all
+IMPOSTORS = 100_000  # enough to represent the tail of all impostor scores
 
 
 class Options(Parameters):
-    """States the tests' rates of error, and how they are tried.
+    """The tests' error rates, and how the tests are evaluated.
 
     Attributes:
-        rates: pairs of stated rates of false accepts and false rejects.
+        rates: pairs of specified false accept and false reject rates.
         alike: correlation of the normal scores of one person's probes.
-        sequences: number of sequences of probes that are drawn.
-        replicates: how often users are drawn again.
-        most_probes: a sequence ends undecided after so many probes.
-        label_ratio: a matcher is watched by probes for which the other matchers' ratio is beyond this.
-        run_length: stated mean number of these until a false alarm.
-        watched: number of stretches of probes over which a matcher is watched.
-        watched_probes: probes in a stretch without a fault.
-        fault_probes: probes in a stretch with a fault.
+        sequences: number of sequences of probes to draw.
+        replicates: number of times that users are resampled.
+        most_probes: number of probes after which a sequence ends undecided.
+        label_ratio: ratio of the other matchers above which a probe is used to monitor a matcher.
+        run_length: specified mean number of such probes until a false alarm.
+        watched: number of series of probes in which a matcher is monitored.
+        watched_probes: probes in a series without a fault.
+        fault_probes: probes in a series with a fault.
     """
 
     rates: list[tuple[Share, Share]] = [(0.01, 0.01), (0.001, 0.01)]
@@ -81,20 +82,20 @@ class Options(Parameters):
 
 
 class Drawn(NamedTuple):
-    """Holds a matcher's ratios (users, users) by probe and gallery entry, a replicate's users (n,)."""
+    """A matcher's ratios (users, users) by probe and gallery entry, and a replicate's users (n,)."""
 
     ratios: Floats
     users: Integers
 
     def others(self, gallery: Integers, rng: np.random.Generator) -> Integers:
-        """Draw for each gallery entry (n,) a user that is another."""
+        """Draw a different user for each gallery entry (n,)."""
         probe = rng.choice(self.users, len(gallery))
         while (same := probe == gallery).any():
             probe[same] = rng.choice(self.users, int(same.sum()))
         return probe
 
     def impostors(self, count: int, rng: np.random.Generator) -> tuple[Integers, Integers]:
-        """Draw users of probes and of gallery entries (count,), never the same."""
+        """Draw users of probes and of gallery entries (count,), never the same user for both."""
         gallery = rng.choice(self.users, count)
         return self.others(gallery, rng), gallery
 
@@ -129,7 +130,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _matrix(fused: Fused) -> Floats:
-    """Return ratios (users, users) by probe and gallery entry; raises BadInput where some lack."""
+    """Return ratios (users, users) by probe and gallery entry; raise BadInput if pairs are missing."""
     if not (fused.is_ratio and fused.is_complete):
         raise BadInput(
             "study biometrics-sequential needs log-likelihood ratios of all pairs: give a score-mixture "
@@ -144,7 +145,7 @@ def _matrix(fused: Fused) -> Floats:
 def wald_tests(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Try Wald's test: rates of error and numbers of probes, by way, matcher and stated rates."""
+    """Evaluate Wald's test: error rates and numbers of probes, by way, matcher and specified rates."""
     count, most = options.sequences, options.most_probes
     for stated in options.rates:
         rates = Rates(*stated)
@@ -166,7 +167,7 @@ def wald_tests(
 def probes_of(
     way: str, drawn: Drawn, options: Options, rng: np.random.Generator
 ) -> tuple[RatioOf, RatioOf]:
-    """Return what gives the next probes' ratios of sequences: of persons, and of impostors."""
+    """Return functions that give the next probes' ratios of sequences: of persons, and of impostors."""
     genuine = np.diag(drawn.ratios)[drawn.users]
     if way == "alike":
         some = drawn.ratios[drawn.impostors(IMPOSTORS, rng)]
@@ -183,7 +184,7 @@ def probes_of(
 
 
 def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioOf:
-    """Draw probes whose ratios are distributed as these, and whose normal scores are correlated."""
+    """Return a function that draws correlated probes whose ratios have the given distribution."""
     ordered, share = np.sort(ratios), options.alike
     own = rng.normal(size=options.sequences)
 
@@ -195,13 +196,13 @@ def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioO
 
 
 def in_turn(ratios: Sequence[Floats]) -> RatioOf:
-    """Give the first probe of every sequence the ratio of the first matcher, and so on."""
+    """Return a function that gives every sequence the ratios of one matcher after another."""
     left = iter(ratios)
     return lambda going: next(left)[going]
 
 
 def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
-    """Compute shares of wrong decisions and of none, and how many probes a decision took."""
+    """Compute shares of wrong and missing decisions, and the mean numbers of probes per decision."""
     undecided = np.concatenate([genuine.probes, impostors.probes]) == 0
     return {
         "false_accept": float(impostors.accepted.mean()),
@@ -213,15 +214,15 @@ def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
 
 
 def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> float:
-    """Find the least number of independent probes whose summed ratios hold both rates of error.
+    """Find the smallest number of independent probes whose summed ratios meet both error rates.
 
     Args:
         ratios: (users, users), log-likelihood ratios by probe and gallery entry.
-        rates: the rates to hold.
-        rng: draws the probes.
+        rates: the error rates to meet.
+        rng: random numbers to draw the probes.
 
     Returns:
-        The number; NaN where `FIXED_PROBES` are not enough.
+        The number of probes; NaN if `FIXED_PROBES` are not enough.
     """
     drawn = Drawn(ratios, np.arange(len(ratios)))
     same, other = np.zeros(IMPOSTORS), np.zeros(IMPOSTORS)
@@ -236,9 +237,9 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
 def watched(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Count how many probes pass until the alarm, by fault and matcher; "none" is without a fault.
+    """Count the probes until the alarm, by fault and matcher; fault "none" is a matcher without a fault.
 
-    Half of the users are the reference, the others are watched.
+    Half of the users are the reference; the other half is monitored.
     """
     users = next(iter(drawn.values())).users
     is_reference = rng.permutation(int(users.max()) + 1) % 2 == 0
@@ -275,17 +276,17 @@ def watched(
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
-    """Draw probes and label them by the other matchers; those that these leave open are left out.
+    """Draw probes and label them by the other matchers; drop probes that these leave undecided.
 
     Args:
         drawn: the matcher's ratios, and the users.
         label: (users, users), the summed log-likelihood ratios of the other matchers.
-        least: beyond this such a ratio, of either sign, is a label.
-        count: how many are drawn, about half of them of the person.
-        rng: draws them.
+        least: smallest absolute ratio that gives a label.
+        count: number of probes to draw, about half of them genuine.
+        rng: random numbers to draw the probes.
 
     Returns:
-        The probes that have a label.
+        The labelled probes.
     """
     probe, gallery = drawn.impostors(count, rng)
     probe = np.where(rng.random(count) < 0.5, gallery, probe)
@@ -295,7 +296,7 @@ def labelled(
 
 
 def _intervals(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Compute the value of all users, and where it lies with 95 % over the replicates."""
+    """Compute the value for all users, and its 95 % interval over the replicates."""
     quantities = table.columns.drop([*by, "replicate"])
     rows = []
     for key, group in table.groupby(by, sort=False):
@@ -336,7 +337,7 @@ def _tell_tests(
 
 
 def _tell_watches(table: pd.DataFrame, outcome: Outcome) -> None:
-    """Add metrics of the watch over matchers."""
+    """Add metrics of the monitoring of matchers."""
     outcome.tables["watch"] = table
     for row in records(table):
         name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)
@@ -348,13 +349,13 @@ def _measure(row: Mapping[str, Any], key: str, scale: float, outcome: Outcome) -
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows of a table by the names of its columns."""
+    """Return the rows of a table as dictionaries."""
     rows: list[Any] = table.to_dict("records")
     return rows
 
 
 def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
-    """Choose the rows in which columns have these values."""
+    """Select the rows in which columns have the given values."""
     for name, value in of.items():
         table = table[table[name] == value]
     return table
@@ -369,7 +370,7 @@ def _case(rates: tuple[float, float]) -> str:
 
 
 def _chart_of_tests(table: pd.DataFrame, options: Options) -> Chart:
-    """Draw false accepts and mean numbers of probes by matcher, a series per way and rates."""
+    """Draw false accepts and mean numbers of probes by matcher, one series per way and rates."""
     panels = []
     for quantity, label in (
         ("false_accept", "false accepts (share)"),

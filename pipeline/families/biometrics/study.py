@@ -1,7 +1,7 @@
-"""Studies biometric score fusion: modality, method and process, verification of all pairs.
+"""Study of biometric score fusion: modality, method and process, verification of all pairs.
 
 Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
-seeds; those of all pairs get confidence intervals of drawing users again.
+seeds; those of all pairs get confidence intervals by resampling users.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ from fuselog.replay.families.biometrics.verification import (
 )
 from fuselog.replay.judging.errors.evaluation import split_topic
 
-# What Zheng & Blasch print of NIST BSSR1 set 1, in percent.
+# Results of Zheng & Blasch for NIST BSSR1 set 1, in percent.
 METHODS, MODALITIES = ("face", "finger"), ("matcher-1", "matcher-2")
 CASES = (*METHODS, *MODALITIES, "all")
 SINGLE = {"face-C": 89.17, "face-G": 84.33, "finger-left": 86.46, "finger-right": 92.65}
@@ -55,11 +55,11 @@ TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
 class BiometricsOptions(Parameters):
-    """States how often what is random is repeated.
+    """Numbers of repetitions of random steps.
 
     Attributes:
-        seeds: how often the cross validations are repeated.
-        replicates: how often users are drawn again.
+        seeds: number of repetitions of the cross-validations.
+        replicates: number of times that users are resampled.
     """
 
     seeds: PositiveInt = 5
@@ -96,7 +96,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _repeated(
     runner: Runner, sources: Sequence[MemorySource], first: Mapping[str, float]
 ) -> dict[str, float]:
-    """Compute means and deviations over the seeds of the fusions that draw a trimmed database."""
+    """Compute means and standard deviations over seeds, for fusions of a trimmed database."""
     drawn = {}
     for label, settings in runner.experiment.estimators.items():
         _, parameters = configure(label, settings)
@@ -117,7 +117,7 @@ def _repeated(
 
 
 def printed_metrics() -> dict[str, float]:
-    """Return the paper's rates, beside ours."""
+    """Return the paper's rates, for comparison with ours."""
     fused = {
         f"printed-{label}.rate_percent.{case}": rate
         for label, rates in PAPER_FUSED.items()
@@ -127,17 +127,17 @@ def printed_metrics() -> dict[str, float]:
 
 
 def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFrame:
-    """Tabulate each subset's rate and relative increase by each fusion beside the paper, tables 2-4.
+    """Tabulate each subset's rate and relative increase by each fusion next to the paper's, tables 2-4.
 
-    Rates of single matchers and of arithmetic fusion are of identification, as in the paper; the paper's
-    relative increases follow from its printed rates, the swapped ones put right.
+    Rates of single matchers and of arithmetic fusion are identification rates, as in the paper. The
+    paper's relative increases are computed from its printed rates, with the swapped rates corrected.
     """
     matchers = matchers_of(source.streams[TOPIC].metadata)
     rows = []
     for case, chosen in subsets_of(matchers).items():
         single = [values.get(f"single.{COUNT}.{matchers[index].name}", np.nan) for index in chosen]
         for key in values if len(chosen) > 1 else ():
-            label, quantity, of = (*key.split(".", 2), "")[:3]  # failures are of no case
+            label, quantity, of = (*key.split(".", 2), "")[:3]  # failures have no case
             has_rate = f"{label}.{RATE}.{case}" in values
             if of != case or quantity != (RATE if has_rate else COUNT):
                 continue
@@ -161,7 +161,7 @@ def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFr
 
 
 def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate the mean relative increase by fusing one modality, two, and all, table 5."""
+    """Tabulate the mean relative increase from fusing one modality, two, and all, table 5."""
     kinds = {case: "one modality" if case in METHODS else "two modalities" for case in CASES[:-1]}
     judged = factors[factors["fusion"].isin(PAPER_FUSED) & factors["subset"].isin(CASES)]
     kind = judged["subset"].map(kinds).fillna("all").rename("fused")
@@ -169,7 +169,7 @@ def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
 
 
 def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
-    """Compute 95 % intervals of GAR at FAR and EER of the first run, by drawing users again."""
+    """Compute 95 % intervals of GAR at FAR and EER of the first run, by resampling users."""
     names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
     rows = []
     for topic, fused in _complete(replayed).items():
@@ -181,7 +181,7 @@ def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
 
 
 def _complete(replayed: Replayed) -> dict[str, Fused]:
-    """Return the first run's fusions of all pairs, of single matchers and of all together."""
+    """Return the first run's fusions of all pairs, for single matchers and for all matchers."""
     found = {
         topic: fused_of(rows.of_run(0))
         for topic, rows in replayed.outputs.items()
@@ -207,7 +207,7 @@ def _counts(replayed: Replayed) -> dict[str, list[float]]:
 
 
 def distribution_figure(source: MemorySource) -> Figure:
-    """Draw histograms of genuine and impostor scores, a plot per matcher."""
+    """Draw histograms of genuine and impostor scores, one plot per matcher."""
     compared = comparisons_of(source.streams[TOPIC])
     same = np.eye(len(compared.scores), dtype=bool)
     figure = Figure(figsize=(8, 5), layout="constrained")
@@ -223,7 +223,7 @@ def distribution_figure(source: MemorySource) -> Figure:
 
 
 def curve_chart(replayed: Replayed, *, deviates: bool) -> Chart:
-    """Draw ROC, or with normal deviates on both axes the detection error trade-off."""
+    """Draw the ROC or, with normal deviates on both axes, the detection error trade-off."""
     series = []
     for topic, fused in _complete(replayed).items():
         found = roc(fused.score, fused.genuine)

@@ -1,4 +1,4 @@
-"""Watches matchers while they are used: labelled probes, planted faults, and Page's test of a change."""
+"""Monitoring of matchers in use: labelled probes, simulated faults, and Page's test for a change."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,23 +12,23 @@ DRIFT_SIGMA = 1.0
 
 
 class Labelled(NamedTuple):
-    """Holds probes of a matcher: its ratio (n,), and whether the other matchers say it is the person."""
+    """Probes of a matcher: its ratios (n,), and whether the other matchers label them as genuine."""
 
     ratio: Floats
     is_genuine: Booleans
 
 
 def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """Draw the ratios of a matcher with a fault.
+    """Simulate the ratios of a matcher with a fault.
 
     Args:
-        fault: one of "misses", "accepts" and "drifts"; any other is none.
+        fault: "misses", "accepts" or "drifts"; any other name means no fault.
         seen: n probes without the fault.
-        steady: the ratios of impostors and of persons before, each in rising order.
-        rng: draws what takes their place.
+        steady: ratios of impostors and of genuine probes without a fault, each in ascending order.
+        rng: random numbers to draw replacements.
 
     Returns:
-        (n,), the log-likelihood ratios of the same probes.
+        The log-likelihood ratios of the same probes, (n,).
     """
     others, own = steady
     match fault:
@@ -43,14 +43,14 @@ def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.
 
 
 def normal_scores(values: Floats, reference: Floats) -> Floats:
-    """Compute where values lie in a reference, as quantiles of the standard normal distribution.
+    """Compute the quantiles of values in a reference as standard normal scores.
 
     Args:
         values: (n,).
-        reference: (m,), in rising order; a tie counts as in its middle.
+        reference: (m,), in ascending order; ties count as half.
 
     Returns:
-        (n,).
+        The normal scores (n,).
     """
     rank = 0.5 * (
         np.searchsorted(reference, values, "left") + np.searchsorted(reference, values, "right")
@@ -59,15 +59,15 @@ def normal_scores(values: Floats, reference: Floats) -> Floats:
 
 
 def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
-    """Compute log-likelihood ratios of four changes, zero for probes that say nothing of them.
+    """Compute log-likelihood ratios of four changes, zero for probes that say nothing about a change.
 
     Args:
         seen: n probes.
-        steady: the ratios of impostors and of persons before, each in rising order.
+        steady: ratios of impostors and of genuine probes without a fault, each in ascending order.
 
     Returns:
-        (4, n): that the person's ratios become those of impostors, or fall by `DRIFT_SIGMA` of their
-        normal scores; that those of impostors become the person's, or rise so.
+        Ratios (4, n) of these changes: genuine ratios become those of impostors, or fall by
+        `DRIFT_SIGMA` in normal scores; ratios of impostors become genuine ones, or rise likewise.
     """
     others, own = (
         DRIFT_SIGMA * sign * normal_scores(seen.ratio, reference) - 0.5 * DRIFT_SIGMA**2

@@ -1,9 +1,9 @@
-"""Evaluates the Bingham filter beside modified Kalman filters: figures 4 and 5.
+"""Evaluation of the Bingham filter against modified Kalman filters: figures 4 and 5.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014, section 7. Every ensemble is recorded twice, with Bingham noise and
-with the Gaussian noise of the same spread, (57)-(60). An error is the angle between the axes, which is
-half the rotation between two orientations.
+with Gaussian noise of the same spread, (57)-(60). An error is the angle between the axes, which is half
+the rotation between two orientations.
 """
 
 from typing import Any
@@ -38,11 +38,11 @@ Floats = NDArray[np.float64]
 
 
 class BinghamOptions(Parameters):
-    """Names the estimator that is judged beside the others.
+    """The estimator to compare with the others, and the grid of the reference.
 
     Attributes:
-        estimator: label of the estimator that is judged.
-        grid_cells: cells of the reference filter on a grid.
+        estimator: label of the estimator to compare with the others.
+        grid_cells: number of cells of the reference filter on a grid.
     """
 
     estimator: str = "bingham"
@@ -81,7 +81,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _stated(experiment: Experiment) -> AxisParameters:
-    """Return the scenario's parameters; raises BadInput where it is none of axes or orientations."""
+    """Return the scenario's parameters; raise BadInput if it has neither axes nor orientations."""
     if not experiment.record:
         raise BadInput(f"experiment '{experiment.title}': names no scenario; give it in [record]")
     name, values, label = load_scenario(experiment.record.scenario)
@@ -94,7 +94,7 @@ def _stated(experiment: Experiment) -> AxisParameters:
 
 
 def _cases(stated: AxisParameters) -> dict[str, dict[str, Any]]:
-    """Return both kinds of noise; the Gaussian one has the covariance of the Bingham one."""
+    """Return both kinds of noise; the Gaussian noise has the covariance of the Bingham noise."""
     gaussian = {
         name: {
             "distribution": "gaussian",
@@ -108,7 +108,7 @@ def _cases(stated: AxisParameters) -> dict[str, dict[str, Any]]:
 def _errors_deg(
     replayed: Replayed, stated: AxisParameters, options: BinghamOptions, case: str
 ) -> dict[str, Floats]:
-    """Compute every estimator's angular RMSE of every run, (runs,)."""
+    """Compute the angular RMSE of every estimator by run, (runs,)."""
     runs = len(replayed.sources)
     is_axis = stated.dimension() == 2
     scale = np.degrees(1.0 if is_axis else 0.5)
@@ -119,7 +119,7 @@ def _errors_deg(
 
 
 def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> Floats:
-    """Compute what any filter can reach: Bayes' rule on a grid over the half circle."""
+    """Compute the errors that any filter can achieve, by Bayes' rule on a grid over the half circle."""
     logs = [source.read(["/truth", "/axis"]) for source in replayed.sources]
     truth = np.stack([log["/truth"]["state"] for log in logs])
     measured = np.concatenate([log["/axis"]["axis"] for log in logs])
@@ -136,7 +136,7 @@ def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> 
 
 
 def error_figure(errors_deg: dict[str, dict[str, Floats]]) -> Figure:
-    """Draw the runs' errors of every estimator, as figures 4 and 5 have them."""
+    """Draw the runs' errors of every estimator, as in figures 4 and 5."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     for axes, (case, found) in zip(
         figure.subplots(1, len(errors_deg), sharey=True), errors_deg.items(), strict=True

@@ -1,7 +1,7 @@
-"""Studies orientation from inertial samples: total error over each trial's movement.
+"""Study of orientation from inertial samples: total error over each trial's movement.
 
-BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. What counts are the samples that its authors
-marked as movement; an error is the whole angle from the true orientation to the estimated one.
+BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. Only the samples that its authors marked as
+movement are evaluated. An error is the total angle from the true to the estimated orientation.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.DataFrame:
-    """Tabulate by trial and estimator the total RMSE over movement (deg), and how many samples."""
+    """Tabulate the total RMSE over movement (deg) and the number of samples by trial and estimator."""
     rows = []
     for errors in found:
         moving = np.concatenate(
@@ -58,15 +58,15 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
 
 
 def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell at which stamps a trial is marked as movement; the topic speaks at every change.
+    """Test at which stamps a trial is marked as movement; the topic has a message at every change.
 
     Args:
         source: the log.
-        case: the trial, which begins the topic's name.
+        case: the trial, with which the topic's name begins.
         time_ns: (n,), the stamps.
 
     Returns:
-        (n,), what the last message at or before each stamp says; False before the first.
+        The value (n,) of the last message at or before each stamp; False before the first message.
     """
     stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
     row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1

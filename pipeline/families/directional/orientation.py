@@ -1,9 +1,9 @@
-"""Studies orientation by filters and the common methods, trial by trial of the BROAD benchmark.
+"""Study of orientation by filters and common methods, for each trial of the BROAD benchmark.
 
-Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021, section 4: what counts are the samples marked
-as movement; the error is the rotation from the true orientation to the estimated one in the axes of the
-earth, and its parts are heading, about up, and inclination, the least rotation that is left. Every trial
-is replayed once more with the field of a magnet added that is near the unit for some time.
+Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021, section 4: only samples marked as movement are
+evaluated. The error is the rotation from the true to the estimated orientation in the earth's axes; its
+parts are heading, about the vertical, and inclination, the smallest remaining rotation. Every trial is
+replayed a second time with the added field of a magnet that is near the unit for some time.
 """
 
 from collections.abc import Iterator, Mapping
@@ -36,17 +36,17 @@ from fuselog.replay.judging.intervals import mean_interval
 KINDS = ("undisturbed", "disturbed", "slow", "fast", "rotation", "translation", "combined")
 PARTS = ("total", "heading", "inclination")
 AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
-FEWEST_TRIALS = 3  # whose mean has an interval: as many of BROAD as the experiment's recording has
+FEWEST_TRIALS = 3  # for an interval of the mean: the experiment's recording has no more
 
 
 class OrientationOptions(Parameters):
-    """States the magnet that is added, and what counts as a disturbance.
+    """The added magnet, and the limit of a disturbance.
 
     Attributes:
         magnet_ut: field of the magnet in the unit's axes (x, y, z).
-        magnet_s: when it is near, spans of a trial.
-        limit_ut: a disturbance is where the field differs by more from that of the place.
-        estimator: label of the estimator that is compared with the others.
+        magnet_s: time spans of a trial in which the magnet is near.
+        limit_ut: difference from the local field above which the field is disturbed.
+        estimator: label of the estimator to compare with the others.
     """
 
     magnet_ut: tuple[float, float, float] = (20.0, -15.0, 15.0)
@@ -56,7 +56,7 @@ class OrientationOptions(Parameters):
 
 
 class ErrorAngles(NamedTuple):
-    """Holds errors (n,) in rad."""
+    """Errors (n,) in rad."""
 
     total: Floats
     heading: Floats
@@ -81,7 +81,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         recorded = runner.replay([source])
         near = with_magnet(source, name, options)
         disturbed = runner.replay([near])
-        if not number:  # the others can be imported again
+        if not number:  # keep only the first trial; the others can be imported again
             runner.keep([source], recorded.outputs)
             runner.draw([near], disturbed.outputs, WITH_MAGNET)
         for case, replayed in ((AS_RECORDED, recorded), (WITH_MAGNET, disturbed)):
@@ -109,7 +109,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def trials(experiment: Experiment, setting: Setting) -> Iterator[tuple[str, MemorySource]]:
-    """Yield the trials of a folder or the one of a file, one after another, by name."""
+    """Yield the trials of a folder, or the trial of a file, with their names."""
     assert experiment.import_ is not None
     assert setting.data is not None
     files = sorted(setting.data.glob("*.hdf5")) if setting.data.is_dir() else [setting.data]
@@ -121,7 +121,7 @@ def trials(experiment: Experiment, setting: Setting) -> Iterator[tuple[str, Memo
 
 
 def with_magnet(source: MemorySource, trial: str, options: OrientationOptions) -> MemorySource:
-    """Return the same trial with the field of a magnet that is near for some time."""
+    """Return the same trial with the added field of a magnet that is near for some time."""
     topic = f"/{trial}/inertial"
     stream = source.streams[topic]
     elapsed_s = (stream.publish_time_ns - source.epoch_ns) * 1e-9
@@ -142,7 +142,7 @@ def states_of(replayed: Replayed, trial: str) -> Iterator[tuple[str, Stream]]:
 
 
 def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, Any]]:
-    """Yield every estimator's RMSE over the movement of a trial, in deg, and what was not estimated."""
+    """Yield every estimator's RMSE over the movement of a trial, in deg, and its missing samples."""
     [source] = replayed.sources
     truth = source.streams[f"/{trial}/truth"]
     truth = truth.take(is_moving(source, trial, truth.publish_time_ns))
@@ -171,7 +171,7 @@ def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
         wanted_ns: (n,).
 
     Returns:
-        Rows (n,) of `time_ns`, and (n,) whether the wanted stamp is there; only then its row counts.
+        Rows (n,) of `time_ns`, and whether (n,) the wanted stamp exists, so that its row is valid.
     """
     row = np.searchsorted(time_ns, wanted_ns).clip(0, max(len(time_ns) - 1, 0))
     known = time_ns[row] == wanted_ns if len(time_ns) else np.zeros(len(wanted_ns), bool)
@@ -179,14 +179,14 @@ def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
 
 
 def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
-    """Compute the angle between the true orientation and the estimated one, and its two parts.
+    """Compute the angle between the true and the estimated orientation, and its two parts.
 
     Args:
         estimate: (n, 4), quaternions from the body's axes to the earth's.
-        truth: (n, 4), as those.
+        truth: (n, 4), likewise.
 
     Returns:
-        The whole angle, and the parts heading and inclination, (n,) each in rad, none negative.
+        The total angle, and its parts heading and inclination, (n,) each in rad, all nonnegative.
     """
     w, x, y, z = np.abs(compose(estimate, conjugate(truth)).T)
     return ErrorAngles(
@@ -199,7 +199,7 @@ def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
 def disturbed_spans(
     replayed: Replayed, trial: str, case: str, options: OrientationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Yield where estimators that know the field of the place find it disturbed."""
+    """Yield the spans in which estimators that know the local field find it disturbed."""
     [source] = replayed.sources
     for label, states in states_of(replayed, trial):
         if not set(COMPONENTS) <= set(states.components):
@@ -217,7 +217,7 @@ def disturbed_spans(
 
 
 def by_kind(table: pd.DataFrame) -> pd.DataFrame:
-    """Average over the trials of each kind of movement that there is, by estimator."""
+    """Average over the trials of each kind of movement, by estimator."""
     words = table["trial"].str.split("_")
     recorded = table["case"] == AS_RECORDED
     chosen = {AS_RECORDED: recorded, WITH_MAGNET: ~recorded}
@@ -233,7 +233,7 @@ def by_kind(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _compare(table: pd.DataFrame, own: str, outcome: Outcome) -> None:
-    """Measure how much more than one the others err, and it beside a magnet, over the trials."""
+    """Measure the excess errors of the other estimators, and the excess error due to a magnet."""
     totals = table.pivot_table(index="trial", columns=["case", "estimator"], values="total_deg")
     for case in (AS_RECORDED, WITH_MAGNET):
         for other in totals[case].columns.drop(own):
@@ -249,7 +249,7 @@ def _measure_disturbances(
     options: OrientationOptions,
     outcome: Outcome,
 ) -> None:
-    """Measure in undisturbed trials how long one is told, and how far off that of the magnet is."""
+    """Measure false disturbances in undisturbed trials, and the timing errors of the magnet's spans."""
     own = spans[spans["estimator"] == options.estimator]
     quiet = [name for name in sources if "undisturbed" in name.split("_")]
     if not quiet:
@@ -270,13 +270,13 @@ def _measure_disturbances(
 
 
 def _noticed_late(spans: pd.DataFrame, near: tuple[float, float]) -> float:
-    """Compute how far (s) the nearest span found is from that in which a magnet was near."""
+    """Compute how far (s) the nearest detected span is from the time span of the magnet."""
     off = np.maximum((spans["begin_s"] - near[0]).abs(), (spans["end_s"] - near[1]).abs())
     return float(off.min()) if len(off) else np.inf
 
 
 def _chart(kinds: pd.DataFrame) -> Chart:
-    """Mean RMSE of every estimator by kind of movement, a panel for each part."""
+    """Draw the mean RMSE of every estimator by kind of movement, one panel per part."""
     panels = [
         Panel(
             x=Axis(label="trials"),

@@ -1,9 +1,9 @@
-"""Studies estimation on the torus: what a coupling makes of the samples (figure 3), and a filter.
+"""Study of estimation on the torus: propagation of samples by a coupling (figure 3), and a filter.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. The
-propagation is numerics without a log; its truth is the population value, from Gauss-Hermite nodes in
-place of the paper's 10,000 samples. The filter is what the paper announces; a filter on a grid is its
-reference.
+propagation is a computation without a log; its truth is the population value, from Gauss-Hermite nodes
+instead of the paper's 10,000 samples. The filter is the one that the paper announces, with a grid filter
+as reference.
 """
 
 from typing import NamedTuple
@@ -36,14 +36,14 @@ Floats = NDArray[np.float64]
 
 
 class PropagationOptions(Parameters):
-    """States figure 3's sweep.
+    """The sweep of figure 3.
 
     Attributes:
         sigma_rad: standard deviations of the two angles, in rad.
         couplings_rad: couplings of the two angles, in rad.
         correlations: correlations of the two angles.
-        random_samples: number of random samples that are compared.
-        central_weights: weights of the central sample that are compared; the first is ours.
+        random_samples: number of random samples to compare with.
+        central_weights: weights of the central sample to compare; the first is ours.
     """
 
     sigma_rad: tuple[PositiveFloat, PositiveFloat] = (0.8, 1.3)
@@ -54,7 +54,7 @@ class PropagationOptions(Parameters):
 
 
 class MomentErrors(NamedTuple):
-    """Holds errors of mean and covariance, means over entries, ([runs,] correlations)."""
+    """Errors of mean and covariance, averaged over entries, ([runs,] correlations)."""
 
     mean: Floats
     covariance: Floats
@@ -63,9 +63,9 @@ class MomentErrors(NamedTuple):
 def propagation_errors(
     options: PropagationOptions, coupling_rad: float, runs: int, rng: np.random.Generator
 ) -> dict[str, MomentErrors]:
-    """Move samples once and refit them by mixed maximum likelihood, as the truth is.
+    """Propagate samples once and fit them by mixed maximum likelihood, like the truth.
 
-    Keys: `five-wW` for every central weight, W in percent, `ukf`, `random`.
+    Keys of the result: `five-wW` for every central weight, W in percent, `ukf`, `random`.
     """
     rho, sigma = np.array(options.correlations), np.array(options.sigma_rad)
     unit = np.stack([np.ones_like(rho), rho, rho, np.ones_like(rho)], axis=-1).reshape(-1, 2, 2)
@@ -96,7 +96,7 @@ def propagation_errors(
 
 
 def _gauss_hermite(order: int = 40) -> tuple[Floats, Floats]:
-    """Return nodes (n, 2) and weights (n,) of a standard normal in the plane."""
+    """Return nodes (n, 2) and weights (n,) of a standard normal distribution in the plane."""
     x, w = np.polynomial.hermite_e.hermegauss(order)
     nodes = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
     weights = np.outer(w, w).ravel() / w.sum() ** 2
@@ -159,7 +159,7 @@ def _rows(
 
 
 def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
-    """Draw errors over the correlation: a column per coupling, mean above and covariance below."""
+    """Draw errors over the correlation: one column per coupling, mean above and covariance below."""
     quantities = {
         "mean_error_rad": "error of the mean (rad)",
         "covariance_error_rad2": "error of the covariance (rad²)",
@@ -181,11 +181,11 @@ def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart
 
 
 class FilterOptions(Parameters):
-    """States the cases, and the filter on a grid.
+    """The cases of the study, and the grid filter.
 
     Attributes:
-        cases: what differs in the scenario's parameters, by the name of a case.
-        grid_cells: cells of the grid per angle.
+        cases: changes to the scenario's parameters, by the name of a case.
+        grid_cells: number of cells of the grid per angle.
     """
 
     cases: dict[str, dict[str, float]] = {}
@@ -193,7 +193,7 @@ class FilterOptions(Parameters):
 
 
 def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study the toroidal filter beside unscented ones; see `fuselog.pipeline.runs.experiment.Study`."""
+    """Compare the toroidal filter with unscented ones; see `fuselog.pipeline.runs.experiment.Study`."""
     options: FilterOptions = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []
@@ -215,7 +215,7 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
-    """Compute the RMSE per angle of every run (runs,) of Bayes' rule on a grid over the torus."""
+    """Compute the RMSE per angle of every run (runs,) by Bayes' rule on a grid over the torus."""
     logs = [source.read(["/truth", "/headings"]) for source in replayed.sources]
     stated = replayed.sources[0].run
     assert stated is not None

@@ -1,8 +1,8 @@
-"""Studies real angles on the torus: densities of a protein's dihedrals, predictions of the wind.
+"""Study of real angles on the torus: densities of a protein's dihedrals, predictions of the wind.
 
-What is fitted is judged on angles that the fit has not seen: dihedrals stretch by stretch of the chain,
-winds of the second half with noise and coupling that are most likely in the first. Neighbours resemble
-each other, so that intervals are Student's, of the means of blocks.
+Fits are evaluated on angles that they have not seen: dihedrals part by part of the chain, and winds in
+the second half with the noise and coupling that are most likely in the first half. Neighbours are
+correlated, so intervals are Student's intervals of block means.
 """
 
 from collections.abc import Callable, Mapping
@@ -52,7 +52,7 @@ _PRIOR = np.diag([0.1, 0.5]) ** 2
 _TURNS = 2.0 * np.pi * np.arange(-5, 6)
 
 
-# The simpler density that each is judged beside.
+# The simpler density that each density is compared with.
 SIMPLER = {
     "wrapped": "moments",
     "wrapped-mixture": "wrapped",
@@ -64,14 +64,14 @@ SIMPLER = {
 
 
 class Options(Parameters):
-    """States how dihedrals and wind are judged.
+    """How dihedrals and wind are evaluated.
 
     Attributes:
         folds: number of parts in which dihedrals are held out.
-        most_components: components that mixtures may have at most.
-        block_residues: residues in a block of the bootstrap that gives intervals.
-        block_hours: hours in such a block of the wind.
-        grid_cells: cells of the grid per angle.
+        most_components: largest number of components of mixtures.
+        block_residues: residues in a block, whose means give intervals.
+        block_hours: hours in a block of the wind.
+        grid_cells: number of cells of the grid per angle.
     """
 
     folds: PositiveInt = 10
@@ -82,14 +82,14 @@ class Options(Parameters):
 
 
 class Prediction(NamedTuple):
-    """Holds for every hour but the first the log density of what came, and its circular distance."""
+    """Log density and circular error of the prediction for every hour except the first."""
 
     log_density: Floats
     error_rad: Floats
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Fit and predict; see `fuselog.pipeline.runs.experiment.Study`."""
+    """Fit densities and predict winds; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     if experiment.estimators:
         raise BadInput("study torus-real has filters of its own: leave out estimators")
@@ -98,7 +98,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome(input_sha256=hash_streams([source]))
     dihedrals = np.asarray(source.in_order("/dihedrals", "publish_time")["value"])
     wind = np.asarray(source.in_order("/wind", "publish_time")["value"])[:, 0]
-    with threadpool_limits(1):  # fits this small only keep a second core spinning
+    with threadpool_limits(1):  # with such small fits, a second core would only spin
         _judge_fits(held_out(dihedrals, options, setting), options, outcome)
     half = len(wind) // 2
     found = {name: most_likely(wind[:half], run) for name, run in FILTERS.items()}
@@ -112,17 +112,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame:
-    """Compute the log density of every pair of angles by fits to the other stretches of the chain.
+    """Compute the log density of every pair of angles by fits to the other parts of the chain.
 
-    The number of a mixture's components is that which does best on stretches held out of the others.
+    The number of a mixture's components is the best one on parts held out of the training parts.
 
     Args:
         angles: (n, 2), in rad, in the order of the chain.
-        options: say how many stretches there are.
+        options: the number of parts.
         setting: shows the progress.
 
     Returns:
-        A row for each pair, a column for each density.
+        A table with a row for each pair and a column for each density.
     """
     stretches = np.array_split(np.arange(len(angles)), options.folds)
     found = np.full((len(angles), 7), np.nan)
@@ -146,7 +146,7 @@ def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame
 
 
 def _count_of(angles: Floats, options: Options) -> int:
-    """Find how many wrapped normals are most likely on stretches that they were not fitted to."""
+    """Find the number of wrapped normals that is most likely on held-out parts."""
     stretches = np.array_split(np.arange(len(angles)), 3)
     scores = []
     for count in range(1, options.most_components + 1):
@@ -200,11 +200,11 @@ def _judge_predictions(
 
 
 def interval(values: Floats | pd.Series, block: int) -> Interval:
-    """Compute the mean and its 95 % interval, by Student's distribution of the means of whole blocks.
+    """Compute the mean and its 95 % interval, by Student's distribution of block means.
 
     Args:
-        values: (n,), whose neighbours may be alike.
-        block: how many make a block; a last one that is not whole is left out.
+        values: (n,), whose neighbours may be correlated.
+        block: number of values in a block; an incomplete last block is dropped.
     """
     whole = np.asarray(values)[: len(values) // block * block]
     return mean_interval(whole.reshape(-1, block).mean(axis=1))
@@ -219,14 +219,14 @@ FILTERS: dict[str, Filter] = {
 def most_likely(
     wind: Floats, run: Callable[..., tuple[WrappedNormal, WrappedNormal]]
 ) -> dict[str, float]:
-    """Find the coupling and both sigmas that predict directions best.
+    """Find the coupling and the sigmas that predict directions best.
 
     Args:
         wind: (hours,), directions in rad.
         run: the filter.
 
     Returns:
-        Their values by their names as parameters.
+        Their values by parameter name.
     """
 
     def given(x: Floats) -> dict[str, float]:
@@ -252,12 +252,12 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Return every hour but the first as measurements: of the direction, not of its turn."""
+    """Return every hour except the first as measurements of the direction, without its turn."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
 def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> WrappedNormal:
-    """Predict direction and turn of every hour but the first, from those before it.
+    """Predict direction and turn of every hour except the first from the previous hours.
 
     Args:
         wind: (hours,), directions in rad; the filter begins at the first.
@@ -278,7 +278,7 @@ def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> 
 
 
 def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Prediction:
-    """Judge a filter's prediction of every hour but the first by what was measured.
+    """Evaluate a filter's prediction of every hour except the first against the measurement.
 
     Args:
         wind: (hours,), directions in rad.
@@ -301,12 +301,12 @@ def _of_normal(deviation: Floats, variance: Floats | float) -> Prediction:
 
 
 def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -> Prediction:
-    """Judge the predictions of Bayes' rule on a grid, as `predict` does those of a filter.
+    """Evaluate predictions by Bayes' rule on a grid, as `predict` does for a filter.
 
     Args:
         wind: (hours,), directions in rad.
         parameters: coupling and sigmas, by name.
-        cells: of the grid, per angle.
+        cells: number of cells of the grid per angle.
 
     Returns:
         The log densities and the errors in rad, (hours - 1,) each.
@@ -321,14 +321,14 @@ def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -
 
 
 def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
-    """Predict that every hour is like the one before.
+    """Predict that every hour equals the previous one.
 
     Args:
         wind: (hours,), directions in rad.
-        half: how many hours the width is fitted to, the first.
+        half: number of hours, from the first, to which the width is fitted.
 
     Returns:
-        Two predictions by name: up to a wrapped normal; and, now and then, any direction.
+        Two predictions by name: with wrapped normal noise only, and with occasional arbitrary jumps.
     """
     turn = np.diff(wind)
 
@@ -352,7 +352,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
 
 def _chart(table: pd.DataFrame, half: int) -> Chart:
-    """Draw how much more was said of the later hours than persistence says, summed up."""
+    """Draw the cumulative gain in log density over persistence, for the second half."""
     wide = table.pivot_table(index="hour", columns="predictor", values="log_density").loc[half:]
     gains = wide.sub(wide["persistence"], axis=0).cumsum()
     panel = Panel(x=Axis(label="hour"), y=Axis(label="log density above persistence, summed"))
@@ -362,7 +362,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
 
 
 def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
-    """Return a filter's predictions of every hour but the first, as estimates."""
+    """Return a filter's predictions of every hour except the first as estimates."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)
     return Ragged(stream, np.array([0, len(stream)]))

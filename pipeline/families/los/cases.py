@@ -1,4 +1,4 @@
-"""Runs the cases of lines of sight: one scenario under one condition, all schemes, bounds."""
+"""Cases of lines of sight: one scenario under one condition, with all schemes and bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -34,10 +34,10 @@ ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 
 
 class Condition(Parameters):
-    """Describes biases and noise.
+    """Biases and noise of a condition.
 
     Attributes:
-        bias_deg: multiple of the biases of the scenario files, which have 1 deg.
+        bias_deg: multiple of the biases in the scenario files, which are 1 deg.
         sigma_rad: standard deviation of azimuth and elevation.
     """
 
@@ -46,15 +46,15 @@ class Condition(Parameters):
 
 
 class Printed(Parameters):
-    """Holds what the paper prints; rows are scenarios, columns targets or biases.
+    """Results printed in the paper; rows are scenarios, columns targets or biases.
 
     Attributes:
         table_of_sensors: number of the table of the sensors' positions.
         table_of_positions: number of the table of position errors.
         table_of_biases: number of the table of biases' errors.
         table_of_means: number of the table of biases' mean errors.
-        position_scenario: number of the scenario that position errors are printed of, from 1.
-        runs: number of runs that the paper averages.
+        position_scenario: number of the scenario whose position errors are printed, from 1.
+        runs: number of runs that the paper averages over.
         sensor_position_m: positions of the sensors (x, y, z), by scenario.
         position_rmse_m: RMSE of the targets' positions, by scheme.
         bias_rmse_mrad: RMSE of the biases.
@@ -76,12 +76,12 @@ class Printed(Parameters):
 
 
 class LosOptions(Parameters):
-    """States scenarios and conditions.
+    """The scenarios and conditions, and the paper's results.
 
     Attributes:
         scenarios: scenario files, in the paper's order.
         conditions: biases and noise, by the name of a condition; the first is the paper's.
-        paper: what the paper prints.
+        paper: the paper's printed results.
     """
 
     scenarios: list[str]
@@ -99,14 +99,14 @@ class LosOptions(Parameters):
 
 @dataclass(frozen=True)
 class Case:
-    """Holds one scenario under one condition.
+    """One scenario under one condition.
 
     Attributes:
-        number: of the scenario, from 1.
-        scene, truth, bound: of scheme 3: what it knows, the true parameters (n,), CRLB (n, n) there.
-        error: scheme -> errors (repetitions, runs, its parameters).
-        nees, nees_at_estimate: of scheme 3, (repetitions, runs).
-        iterations, converged: scheme -> the most iterations of a search, the share that converged.
+        number: number of the scenario, from 1.
+        scene, truth, bound: known scene, true parameters (n,) and CRLB (n, n) of scheme 3.
+        error: errors (repetitions, runs, parameters) by scheme.
+        nees, nees_at_estimate: NEES of scheme 3, (repetitions, runs).
+        iterations, converged: largest number of iterations and share that converged, by scheme.
     """
 
     number: int
@@ -124,17 +124,17 @@ class Case:
 
     @property
     def targets(self) -> int:
-        """Count how many there are."""
+        """Return the number of targets."""
         return len(self.parameters.target_position_m)
 
     @property
     def sigma_mrad(self) -> Floats:
-        """Return the CRLB's deviations of the biases."""
+        """Return the CRLB standard deviations of the biases."""
         return 1e3 * np.sqrt(np.diagonal(self.bound))[3 * self.targets :]
 
     @property
     def bias_error_mrad(self) -> Floats:
-        """Return errors of the biases (repetitions, runs, biases)."""
+        """Return the errors of the biases (repetitions, runs, biases)."""
         return 1e3 * self.error[JOINT][..., 3 * self.targets :]
 
     @property
@@ -159,7 +159,7 @@ class Case:
         return dilution_of_precision(error_m, np.linalg.norm(offset, axis=2), self.scene.sigma_rad)
 
     def observability(self, scene: Scene | None = None, targets: Floats | None = None) -> Observability:
-        """Analyse scheme 3, or another scene or other targets (n, 3) with the same biases."""
+        """Analyse the observability of scheme 3, or of another scene or other targets (n, 3)."""
         scene = scene or self.scene
         places = np.array(self.parameters.target_position_m) if targets is None else targets
         bias = self.parameters.bias_rad.ravel()[scene.wanted]
@@ -168,7 +168,7 @@ class Case:
 
 
 def run_case(experiment: Experiment, setting: Setting, number: int, name: str, condition: str) -> Case:
-    """Record a scenario with and without its biases, replay all schemes, and bound them."""
+    """Record a scenario with and without its biases, replay all schemes, and compute their bounds."""
     options: LosOptions = setting.options
     chosen = options.conditions[condition]
     recorder, values, _ = load_scenario(name)
@@ -186,7 +186,7 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     runner = Runner(experiment.model_copy(update={"record": Record(scenario=name)}), setting)
 
     def replayed(over: Mapping[str, Any], *schemes: str) -> Replayed:
-        seed = experiment.seed + number - 1  # scenarios share no noise
+        seed = experiment.seed + number - 1  # scenarios have different noise
         sources = runner.obtain(merge(values, over), seed=seed)
         return runner.replay(sources, {scheme: experiment.estimators[scheme] for scheme in schemes})
 
@@ -206,7 +206,7 @@ def _judged(
     free: Replayed,
     biased: Replayed,
 ) -> Case:
-    """Judge the case that was replayed, with its bounds."""
+    """Evaluate a replayed case and compute its bounds."""
     scene = scene_of(parameters, configure(JOINT, experiment.estimators[JOINT])[1])
     bias = parameters.bias_rad.ravel()[scene.wanted]
     truth = np.concatenate([np.ravel(parameters.target_position_m), bias])
@@ -234,7 +234,7 @@ def _judged(
 
 
 def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
-    """Return what an estimator of biases knows of a scenario before the measurements."""
+    """Return what an estimator of biases knows about a scenario before the measurements."""
     sensors = np.array(parameters.sensor_position_m)
     sigma = np.full((len(sensors), 2), parameters.sigma_rad)
     known = known_biases(range(1, len(sensors) + 1), estimator)
@@ -242,13 +242,13 @@ def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
 
 
 def bias_names(case: Case) -> list[str]:
-    """Return the wanted biases as tables name them."""
+    """Return the names of the wanted biases in tables."""
     names = [f"{angle}{s + 1}" for s in range(len(case.scene.position_m)) for angle in ANGLES]
     return [name for name, wanted in zip(names, case.scene.wanted, strict=True) if wanted]
 
 
 def observabilities(case: Case) -> dict[str, Observability]:
-    """Return what can be told in variations of a case, by what varies."""
+    """Return the observability in variations of a case, by name of the variation."""
     wanted = case.scene._replace(known_bias_rad=np.full_like(case.scene.known_bias_rad, np.nan))
     first, last = case.scene.position_m[[0, -1]]
     share = np.linspace(0.0, 1.0, len(case.scene.position_m))[:, None]
@@ -268,7 +268,7 @@ def observabilities(case: Case) -> dict[str, Observability]:
 
 
 def one_bias_known(case: Case) -> Floats:
-    """Compute CRLB deviations in mrad of all biases (columns) when one of them (row) is known."""
+    """Compute CRLB standard deviations in mrad of all biases (columns) if one bias (row) is known."""
     scene = case.scene._replace(known_bias_rad=np.full_like(case.scene.known_bias_rad, np.nan))
     biases = case.parameters.bias_rad.ravel()
     truth = np.concatenate([np.ravel(case.parameters.target_position_m), biases])

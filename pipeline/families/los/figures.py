@@ -1,4 +1,4 @@
-"""Draws the figures of Belfadel et al. 2014 with our numbers: scenes, NEES, biases' NEES, GDOP."""
+"""Figures of Belfadel et al. 2014 with our numbers: scenes, NEES, biases' NEES, GDOP."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ def _scenes(cases: Sequence[Case]) -> Chart:
 
 
 def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
-    """Draw each repetition's mean NEES, CRLB at the truth and at the estimate, figures 7 and 16."""
+    """Draw each repetition's mean NEES by the CRLB at truth and at the estimate, figures 7 and 16."""
     panels = []
     for name, cases in by_condition.items():
         numbers = [case.number for case in cases]
@@ -67,7 +67,7 @@ def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
 
 
 def _component_nees(cases: Sequence[Case], runs: int) -> Chart:
-    """Draw the mean NEES of each bias, all repetitions together, figures 8 and 17."""
+    """Draw the mean NEES of each bias over all repetitions, figures 8 and 17."""
     nees = [case.component_nees.tolist() for case in cases]
     numbers = [str(case.number) for case in cases]
     x, series = groups(nees, bias_names(cases[0]), numbers, "scenario")

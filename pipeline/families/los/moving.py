@@ -1,8 +1,9 @@
-"""Studies moving lines of sight: which biases can be told, what would tell them, and how well.
+"""Study of moving lines of sight: which biases are observable, what makes them so, and how well.
 
-Sensors that fly straight on, side by side, leave one direction of the state open: all that they see may
-turn about the line between them if they roll with it, and targets that keep their velocities then keep
-others. A manoeuvre, a sensor beside the line and a target that is known are to close it, a case each.
+Sensors that fly straight side by side leave one direction of the state unobservable: the scene may
+rotate about the line between the sensors if they roll with it, and targets with constant velocities then
+have other velocities. A manoeuvre, a sensor off the line and a known target should make it observable,
+in one case each.
 """
 
 from collections.abc import Mapping
@@ -37,11 +38,11 @@ ALIGNED_S, LAST_S = 10.0, 10.0
 
 
 class Options(Parameters):
-    """States the cases, and how observability is told.
+    """The cases, and the runs whose observability is computed.
 
     Attributes:
-        cases: what differs in the scenario, by the name of a case.
-        observed_runs: number of runs of which observability is told.
+        cases: changes to the scenario's parameters, by the name of a case.
+        observed_runs: number of runs whose observability is computed.
     """
 
     cases: dict[str, dict[str, Any]]
@@ -68,7 +69,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         runner.keep(recorded, replayed.outputs, case, drawn=case if tables else "")
         weakest_of = weakest_directions(recorded[: options.observed_runs], shared)
         table = pd.concat([seconds_of(errors) for errors in replayed.errors]).assign(case=case)
-        table = table[table["second"] < int(scenario.duration_s)]  # later only by clocks that are ahead
+        table = table[
+            table["second"] < int(scenario.duration_s)
+        ]  # later stamps are due to clocks that are ahead
         outcome.tables[f"observability-{case}"] = weakest_of
         sigmas = prior_sigmas(scenario)
         direction = weakest({name: float(weakest_of[name].iloc[0]) for name in sigmas}, sigmas)
@@ -84,7 +87,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
-    """Return what is estimated beside the targets: all biases, and the clocks but for the first."""
+    """Return what is estimated besides the targets: all biases, and all clocks except the first."""
     numbers = range(1, len(parameters.sensor_position_m) + 1)
     biases = [name for number in numbers for name in bias_components(number)]
     clocks = [clock_component(number) for number in numbers[1:]]
@@ -97,10 +100,10 @@ def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
 
 
 def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -> pd.DataFrame:
-    """Find what each run's measurements tell least of: an eigenvalue, in priors, and its direction.
+    """Find the least observable direction of each run, and its eigenvalue relative to the prior.
 
-    Rounding leaves a singular information matrix an eigenvalue of either sign, up to the precision of
-    its largest one: the least eigenvalue is stated as no less than that.
+    Rounding gives a singular information matrix an eigenvalue of either sign, of up to the precision of
+    its largest eigenvalue. The smallest eigenvalue is therefore at least that precision.
     """
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})
@@ -112,7 +115,7 @@ def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -
 
 
 def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:
-    """Return what is known beforehand of every component, as a standard deviation."""
+    """Return the prior standard deviation of every component."""
     targets = {
         name: parameters.prior_sigma_m if name.endswith("_m") else parameters.prior_sigma_mps
         for target in range(1, TARGETS + 1)
@@ -122,10 +125,11 @@ def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:
 
 
 def seconds_of(errors: Errors) -> pd.DataFrame:
-    """Mean squares by run and second: of what errs, or for a bound of what errs at least.
+    """Compute mean squared errors by run and second; for a bound, the squared bound.
 
-    `common_roll_rad2` is of the mean roll of all sensors, a column of a bias's name of that alone; the
-    others are means over components. NaN where the estimator lacks them.
+    `common_roll_rad2` is for the mean roll of all sensors, a column named like a bias is for that bias,
+    and the others are means over components. Values are NaN if the estimator does not have the
+    components.
     """
     table: dict[str, Any] = {"run": errors.run, "second": errors.elapsed_s.astype(int)}
     for quantity, ending in (("target_m2", "_m"), ("bias_rad2", "_bias_rad"), ("clock_s2", "_clock_s")):
@@ -161,7 +165,7 @@ def _measure(
     sigmas: Mapping[str, float],
     outcome: Outcome,
 ) -> None:
-    """Measure errors at the end, and by intervals over the runs what they are worth."""
+    """Measure errors at the end of the runs, with intervals over the runs."""
     found, labels = outcome.metrics, set(table["estimator"])
     logs = np.log10(weakest_of["least_eigenvalue"])
     found[f"observability.least_eigenvalue.{case}"] = float(10.0 ** logs.mean())
@@ -202,7 +206,7 @@ def _aligned_nees(table: pd.DataFrame, label: str) -> Floats:
 
 
 def weakest(direction: Mapping[str, float], sigmas: Mapping[str, float]) -> str:
-    """Name the components with the largest parts in a direction, in units of the prior."""
+    """Name the components with the largest parts of a direction, in units of the prior."""
     parts = {name: share / sigmas[name] for name, share in direction.items()}
     largest = max(abs(part) for part in parts.values())
     return " ".join(
@@ -213,7 +217,7 @@ def weakest(direction: Mapping[str, float], sigmas: Mapping[str, float]) -> str:
 
 
 def _chart(every: pd.DataFrame) -> Chart:
-    """Draw over time common roll, all biases and NEES, a column for each case."""
+    """Draw the common roll, all biases and NEES over time, one column per case."""
     axes = {
         "common_roll_rad2": Axis(label="RMSE of the common roll (mrad)", log=True, limits=(0.1, 6.0)),
         "bias_rad2": Axis(label="RMSE of a bias (mrad)", log=True, limits=(0.1, 6.0)),

@@ -1,4 +1,4 @@
-"""Compares what is measured of lines of sight with what Belfadel et al. 2014 print."""
+"""Comparison of results for lines of sight with those that Belfadel et al. 2014 print."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ RULE = 0.15
 
 
 def metrics_of_print(paper: Printed) -> dict[str, Any]:
-    """Return how many of the printed pairs keep the paper's rules."""
+    """Return the number of printed pairs that satisfy the paper's rules."""
     sigma, rmse = np.array(paper.bias_sigma_mrad), np.array(paper.bias_rmse_mrad)
     small = np.abs(np.array(paper.bias_mean_mrad)) < 2.0 * sigma / np.sqrt(paper.runs)
     return {
@@ -31,7 +31,7 @@ def metrics_of_print(paper: Printed) -> dict[str, Any]:
 
 
 def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
-    """Compute deviations of biases by those printed, shares of the paper's rules kept, positions."""
+    """Compute biases' sigmas relative to printed ones, shares that satisfy the rules, and positions."""
     name, error = f"{case.condition}-{case.number}", case.bias_error_mrad
     runs, sigma = error.shape[1], case.sigma_mrad
     rule = RULE * np.sqrt(paper.runs / runs)
@@ -59,7 +59,7 @@ def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
-    """Return what can be told in variations of a scenario, and where its sensors stand."""
+    """Return the observability in variations of a scenario, and checks of its sensor positions."""
     number = case.number
     values: dict[str, Any] = {}
     for what, found in observabilities(case).items():
@@ -80,13 +80,13 @@ def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def steepest_deg(case: Case) -> float:
-    """Return the elevation of the steepest line of sight; near 90 deg azimuth is nearly singular."""
+    """Return the elevation of the steepest line of sight; azimuth is nearly singular near 90 deg."""
     elevation = np.degrees(optical.predict(case.scene, case.truth[None])[0, :, :, 1])
     return float(elevation.ravel()[np.abs(elevation).argmax()])
 
 
 def _share_from_print(case: Case, runs: int = 200) -> float:
-    """Compute how many noisy runs reach the estimate from the printed starting point."""
+    """Compute the share of noisy runs that reach the estimate from the printed starting point."""
     clean = optical.predict(case.scene, case.truth[None])
     noise = np.random.default_rng(case.number).normal(size=(runs, *clean.shape[1:]))
     measured = clean + case.scene.sigma_rad * noise

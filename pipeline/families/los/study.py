@@ -1,7 +1,7 @@
-"""Studies bias estimation from lines of sight: tables I-VIII, figures of Belfadel et al. 2014.
+"""Study of bias estimation from lines of sight: tables I-VIII, figures of Belfadel et al. 2014.
 
-Every scenario is recorded with and without biases under several conditions. The paper does not state
-those that its tables follow from, so each condition is judged on its own.
+Every scenario is recorded with and without biases under several conditions. The paper does not state the
+conditions of its tables, so each condition is evaluated separately.
 """
 
 import hashlib
@@ -83,7 +83,7 @@ def _table_of_sensors(cases: list[Case], paper: Printed) -> pd.DataFrame:
 
 
 def _table_of_positions(cases: list[Case], paper: Printed) -> pd.DataFrame:
-    """Tabulate for all scenarios the RMSE of each target by scheme, tables II and VI."""
+    """Tabulate the RMSE of each target by scenario and scheme, tables II and VI."""
     rows = []
     for case in cases:
         for scheme in (ALONE, BLIND, JOINT):
@@ -161,7 +161,7 @@ def _table_of_dilution(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate ranks by scheme 3: all biases wanted, other numbers of targets, sensors in a line."""
+    """Tabulate ranks for scheme 3: all biases wanted, other numbers of targets, sensors in a line."""
     rows = []
     for case in cases:
         if case.condition != cases[0].condition:
@@ -172,7 +172,7 @@ def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_one_bias_known(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate deviations in mrad of all biases (columns) by the one that is known (rows)."""
+    """Tabulate standard deviations in mrad of all biases (columns) by the known bias (rows)."""
     parts = []
     for case in cases:
         if case.condition == cases[0].condition:

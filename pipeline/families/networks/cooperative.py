@@ -1,6 +1,6 @@
-"""Studies cooperative localization: accuracy and consistency of robots that share estimates.
+"""Study of cooperative localization: accuracy and consistency of robots that share estimates.
 
-Its paper, Jin, Lee, Hashimoto, DIND networks, has no numbers of real robots.
+The paper, Jin, Lee, Hashimoto, DIND networks, has no numbers for real robots.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,14 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def by_robot(metrics: Mapping[str, MetricValue], estimator: str, quantity: str) -> dict[str, float]:
-    """Return one estimator's values of a metric by case; those that are numbers."""
+    """Return one estimator's numeric values of a metric, by case."""
     start = f"{estimator}.{quantity}."
     found = {key.removeprefix(start): value for key, value in metrics.items() if key.startswith(start)}
     return {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
 
 
 def mode_chart(metrics: Mapping[str, MetricValue], estimators: Sequence[str]) -> Chart:
-    """Draw RMSE and NEES of every robot's position, estimator by estimator."""
+    """Draw RMSE and NEES of every robot's position, by estimator."""
     panels = []
     for quantity, label in (
         ("position_rmse_m", "RMSE of the position (m)"),

@@ -1,9 +1,9 @@
-"""Studies robots that share estimates under stress, on recorded logs.
+"""Study of robots that share estimates under stress, on recorded logs.
 
-When a robot sees another, both get a message. Here some of these sightings are taken out of the log: all
-but one in an interval, a random half, those of a robot that leaves; or a robot is sure of a wrong start.
-The estimators fuse at once, so messages that are late are left to `network-stress`. Intervals are over
-the robots; that of the lie leaves out the robot that lies.
+When a robot sees another, both get a message. The study removes some of these sightings from the log:
+all except one per interval, a random half, or those of a robot that leaves. In another case, a robot has
+an overconfident wrong prior. The estimators fuse immediately, so late messages are left to
+`network-stress`. Intervals are over the robots; for the wrong prior, they exclude the robot that has it.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,17 +31,17 @@ Booleans = NDArray[np.bool_]
 
 MESSAGE_BYTES = 8 * (1 + 3 + 6)  # stamp, pose, triangle of its covariance
 SEED = 1
-FEWEST_ROBOTS = 4  # of which the mean NEES has an interval: a recording has no more that do not lie
+FEWEST_ROBOTS = 4  # for an interval of the mean NEES: a recording has no more correct robots
 
 
 class CooperativeStressOptions(Parameters):
-    """States what the robots are put under.
+    """The stress on the robots.
 
     Attributes:
-        intervals_s: least times between two meetings of two robots at which they share, in s.
-        leaving: number of the robot that is gone for the middle third.
+        intervals_s: shortest times between two sightings in which two robots share estimates, in s.
+        leaving: number of the robot that is absent in the middle third.
         liar: number of the robot whose prior is wrong.
-        lie_m: by how much its prior is wrong along x.
+        lie_m: error of its prior along x.
     """
 
     intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)
@@ -50,7 +50,7 @@ class CooperativeStressOptions(Parameters):
     lie_m: PositiveFloat = 2.0
 
 
-# Which sightings of robots are kept: of a stream, the robot that sees, and which rows are such.
+# (stream, robot that sees, rows that are sightings of robots) -> rows to keep.
 Keep = Callable[[Stream, int, Booleans], Booleans]
 
 
@@ -90,7 +90,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int]:
-    """List a log's robots; raises BadInput where one that is to leave or to lie is none of them."""
+    """List a log's robots; raise BadInput if the robot to leave or to lie is not among them."""
     topics = [topic.removeprefix("/robot").partition("/") for topic in source.streams]
     numbers = sorted(int(number) for number, _, leaf in topics if leaf == "range_bearing")
     for name in ("leaving", "liar"):
@@ -103,7 +103,7 @@ def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int
 
 
 def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemorySource:
-    """Leave some of the sightings of robots out of the log."""
+    """Remove some of the sightings of robots from the log."""
     streams = dict(source.streams)
     for number in numbers:
         stream = streams[f"/robot{number}/range_bearing"]
@@ -113,7 +113,7 @@ def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemoryS
 
 
 def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Booleans:
-    """Choose at most one sighting of each robot in an interval."""
+    """Select at most one sighting of each robot per interval."""
     kept = np.zeros(len(stream), bool)
     for target in np.unique(stream["target_id"][fellow]):
         last_ns = -np.inf
@@ -124,12 +124,12 @@ def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Boo
 
 
 def _half(generator: np.random.Generator, stream: Stream, _: int, __: Booleans) -> Booleans:
-    """Choose a random half."""
+    """Select a random half."""
     return generator.uniform(size=len(stream)) < 0.5
 
 
 def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Booleans:
-    """Choose those in which the leaving robot has no part, in the middle third of the log."""
+    """Select the sightings without the leaving robot in the middle third of the log, and all others."""
     times = stream.publish_time_ns
     first, second = times[0] + (times[-1] - times[0]) * np.array([1, 2]) // 3
     is_away = (times >= first) & (times < second)
@@ -137,7 +137,7 @@ def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Boole
 
 
 def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySource:
-    """Make one robot of the log as sure as ever of a start that is wrong."""
+    """Shift one robot's prior without changing its covariance."""
     prior = source.streams[f"/robot{options.liar}/prior"]
     mean = prior["mean"].copy()
     mean[:, 0] += options.lie_m
@@ -146,7 +146,7 @@ def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySou
 
 
 def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence[int]) -> pd.DataFrame:
-    """Tabulate RMSE and NEES of the position by estimator and robot, and what it sends a second."""
+    """Tabulate RMSE and NEES of the position and bytes sent per second, by estimator and robot."""
     sightings, span_s = 0, 0.0
     for source in sources:
         seen = [source.streams[f"/robot{number}/range_bearing"] for number in numbers]
@@ -164,7 +164,7 @@ def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence
                 "robot": errors.case.partition("/")[0],
                 "position_rmse_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
                 "position_nees": float(np.mean(nees)),
-                # a sighting is a message to either of the two
+                # a sighting is a message to each of the two robots
                 "bytes_per_s": 2 * sightings * MESSAGE_BYTES / span_s / len(numbers),
             }
         )
@@ -172,7 +172,7 @@ def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Draw errors and NEES, means over the robots, over what a robot sends a second."""
+    """Draw mean errors and NEES of the robots over the bytes that a robot sends per second."""
     chosen = table[table["case"].str.startswith("once") | (table["case"] == "calm")]
     means = chosen.groupby(["estimator", "case", "bytes_per_s"], sort=False).mean(numeric_only=True)
     panels = []

@@ -1,8 +1,8 @@
-"""Studies several inertial units on one body, whose clocks are off: what more units give.
+"""Study of several inertial units with clock offsets on one body: the benefit of more units.
 
-Each recording is replayed with one unit, with the mean of all, and with a filter for each whose
-estimates covariance intersection fuses, since all filters have the same fixes. Stamps of the units are
-moved by an offset that is known, that is ignored, or that has the greatest likelihood.
+Each recording is replayed with one unit, with the mean of all units, and with one filter per unit, whose
+estimates are fused by covariance intersection, since all filters use the same fixes. The stamps of the
+units are corrected by a known offset, by the most likely offset, or not at all.
 """
 
 import re
@@ -39,12 +39,12 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.engine.vectors.tangent import difference
 from fuselog.replay.families.networks.covariance_intersection import fuse
 
-# Position, velocity and orientation, which all filters estimate; the biases are those of their units.
+# Position, velocity and orientation, which all filters have in common; biases belong to their units.
 POSE, POSE_TANGENT = 10, 9
 POSE_KINDS = ("linear",) * 6 + ("quaternion",) * 4
-# So much of the logarithm of the generalised variance may be left to gain.
+# Largest remaining gain of the logarithm of the generalized variance.
 _CI_TOLERANCE = 1e-3
-FARTHEST_S = 5.0  # as wide a search for an offset goes on
+FARTHEST_S = 5.0  # width at which the search for an offset ends
 ONE, MEAN, INTERSECTION = "one", "mean", "intersection"
 KNOWN, ESTIMATED, IGNORED = "known", "estimated", "ignored"
 PRIOR_SIGMA = np.concatenate(
@@ -53,18 +53,18 @@ PRIOR_SIGMA = np.concatenate(
 
 
 class QuadInertialOptions(Parameters):
-    """States what is known of the recordings.
+    """Known properties of the recordings, and the search for clock offsets.
 
     Attributes:
         filter: label of the filter.
         smoother: label of the smoother.
-        offsets_s: what is to be added to the stamps of the units, in s, by the recording's folder; of
-            others it is what has the greatest likelihood.
-        search_s: least and greatest offset that are tried at first, and the step, in s; where one of
-            them is best, others beyond it are.
-        truth_sigma_m: standard deviation of the truth's positions where they stand for fixes in that
+        offsets_s: offset to add to the stamps of the units, in s, by the recording's folder; the most
+            likely offset for other folders.
+        search_s: smallest and largest offset of the first search, and its step, in s; the search is
+            extended if the best offset is at an end.
+        truth_sigma_m: standard deviation of the truth's positions if these are used as fixes in that
             search.
-        scored_from_s: from when on errors count.
+        scored_from_s: time from which errors are evaluated.
     """
 
     filter: str = "ekf"
@@ -76,11 +76,11 @@ class QuadInertialOptions(Parameters):
 
 
 class Flight(NamedTuple):
-    """Holds a recording: its name, its truth, its fixes, and each unit's samples.
+    """A recording: its name, truth, fixes, and each unit's samples.
 
     Attributes:
-        time_ns: (n,) of the truth.
-        state: (n, 10) position, velocity by differences of it, orientation.
+        time_ns: stamps of the truth (n,).
+        state: (n, 10), position, velocity by finite differences, orientation.
         units: inertial samples, in the order of their topics.
     """
 
@@ -142,7 +142,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _flights(experiment: Experiment, setting: Setting) -> list[Flight]:
-    """Read all recordings at --data or below; their fixes' seed is the number in the folder's name."""
+    """Read all recordings at or below --data; the seed of fixes is the number in the folder's name."""
     assert setting.data is not None
     assert experiment.import_ is not None
     source, values = experiment.import_.source, experiment.import_.parameters
@@ -155,7 +155,7 @@ def _flights(experiment: Experiment, setting: Setting) -> list[Flight]:
 
 
 def flight_of(name: str, source: MemorySource) -> Flight:
-    """Read a recording of the mapping `quadrotor`; raises BadInput where it has no units or truth."""
+    """Read a recording of the mapping `quadrotor`; raise BadInput if it has no units or no truth."""
     topics = sorted(topic for topic in source.topics if re.fullmatch(r"/imu\w+/inertial", topic))
     if not topics or not {"/truth", "/fix"} <= source.topics.keys():
         raise BadInput(
@@ -170,7 +170,7 @@ def flight_of(name: str, source: MemorySource) -> Flight:
 
 
 def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None = None) -> MemorySource:
-    """Move the stamps of one unit, and begin the recording at the first fix that the unit covers."""
+    """Make a log of one unit with shifted stamps that begins at the first fix that the unit covers."""
     fix = flight.fix if fix is None else fix
     moved = np.int64(round(1e9 * offset_s))
     unit_ns = samples.publish_time_ns + moved
@@ -190,7 +190,7 @@ def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None 
 
 
 def mean_of(units: Sequence[Stream]) -> Stream:
-    """Average all units at the times of the first; samples of one stamp are averaged before."""
+    """Average all units at the times of the first, after averaging samples with equal stamps."""
     first = units[0]
     columns = {}
     for name in ("specific_force_mps2", "turn_rate_radps"):
@@ -215,7 +215,7 @@ def _offsets(
 ) -> dict[str, float]:
     """Find the offset of the first unit of each recording that explains positions best.
 
-    The positions are those of the truth, at all its times, or the fixes.
+    The positions are those of the truth at all its stamps, or the fixes.
     """
     return {
         flight.name: _offset(
@@ -234,10 +234,10 @@ def _offset(
     estimator: Mapping[str, Mapping[str, Any]],
     search_s: tuple[float, float, float],
 ) -> float:
-    """Find the first unit's offset that explains fixes best; beyond an end it is sought further."""
+    """Find the first unit's offset that explains fixes best; extend the search if it is at an end."""
     (low, high, step), [label] = search_s, estimator
     tried = np.arange(low, high + 0.5 * step, step)
-    # the same fixes for all offsets: likelihoods of other data cannot be compared
+    # use the same fixes for all offsets: likelihoods of different data are not comparable
     unit_ns = flight.units[0].publish_time_ns
     begin_ns, end_ns = unit_ns[0] + round(1e9 * max(high, 0)), unit_ns[-1] + round(1e9 * min(low, 0))
     inside = fix.take((fix.publish_time_ns >= begin_ns) & (fix.publish_time_ns <= end_ns))
@@ -253,7 +253,7 @@ def _offset(
 
 
 def _highest(places: Floats, values: Floats) -> float:
-    """Find where the parabola through the greatest of equidistant values and its neighbours peaks."""
+    """Find the peak of the parabola through the largest of equidistant values and its neighbours."""
     best = int(np.argmax(values))
     if best in (0, len(values) - 1):
         return float(places[best])
@@ -283,7 +283,7 @@ def _judged(
     runs: Mapping[tuple[str, str, str], int],
     options: QuadInertialOptions,
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the errors with one unit, with the mean of all, and with all filters fused."""
+    """Yield the errors with one unit, with the mean of all units, and with all filters fused."""
     estimates = outputs[f"/estimates/{label}/state"]
     innovation = outputs[f"/estimates/{label}/innovation"]
     late_ns = flight.time_ns[0] + round(1e9 * options.scored_from_s)
@@ -308,9 +308,9 @@ def _poses(states: Stream) -> tuple[Integers, Floats]:
 
 
 def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
-    """Fuse poses (n, 10) of several filters by covariance intersection, at the stamps all have.
+    """Fuse poses (n, 10) of several filters by covariance intersection, at their common stamps.
 
-    Their orientations differ by so little that the tangent space of the first serves for all.
+    The orientations are so close to each other that the tangent space of the first serves for all.
     """
     time_ns = units[0].publish_time_ns
     for each in units[1:]:
@@ -323,7 +323,7 @@ def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
         for each, row in zip(units, rows, strict=True)
     ]
     apart = np.stack([difference(pose, poses[0], POSE_KINDS) for pose in poses], axis=1)
-    # weights that are nearly alike make no difference, and take long to tell apart
+    # nearly equal weights give the same result, and a fine tolerance takes long
     change = fuse("ci-determinant", apart, np.stack(covariances, axis=1), tolerance=_CI_TOLERANCE).mean
     turn = Rotation.from_rotvec(change[:, 6:]).as_quat(scalar_first=True)
     return time_ns, np.hstack([poses[0][:, :6] + change[:, :6], compose(poses[0][:, 6:], turn)])
@@ -333,13 +333,13 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
     """Compute the RMSE of a flight's poses at the stamps of the truth.
 
     Args:
-        flight: has the truth.
+        flight: the recording with the truth.
         time_ns: (m,), the stamps of the poses.
         pose: (m, 10), position in m, velocity in m/s, orientation as a quaternion.
-        late_ns: stamps before are left out.
+        late_ns: stamp from which errors are evaluated.
 
     Returns:
-        By name: of position, horizontal position, velocity, and heading in deg.
+        RMSE by name: position, horizontal position, velocity, and heading in deg.
     """
     _, own, true = np.intersect1d(time_ns, flight.time_ns, return_indices=True)
     late = flight.time_ns[true] >= late_ns
@@ -355,7 +355,7 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
 
 
 def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
-    """Draw position and heading by recording, for the units and offsets of the smoother."""
+    """Draw position and heading errors by recording, for the units and offsets of the smoother."""
     rows = table[table["estimator"] == options.smoother]
     panels = []
     for name, label in (

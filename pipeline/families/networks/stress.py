@@ -1,8 +1,8 @@
-"""Studies networks under stress: what lateness, absence, lies and silence cost CI.
+"""Study of networks under stress: the cost of delays, absence, false estimates and silence for CI.
 
 Each run gives one mean NEES and one mean squared error over its nodes after `settle_s`; intervals are
-over the runs. The claims are ours, and were set before their numbers were seen: a filter of n states
-counts as consistent where the mean NEES is, with 95 %, not above n by more than 10 %, as in the study of
+over the runs. The claims are ours and were made before their numbers were known: a filter with n states
+is consistent if its mean NEES exceeds n by at most 10 %, with 95 % confidence, as in the study of
 networks.
 """
 
@@ -30,18 +30,17 @@ INTERVAL, NEWS = "at most once in an interval", "when it has news"
 
 
 class StressOptions(Parameters):
-    """States what the network is put under.
+    """The stress on the network.
 
     Attributes:
-        settle_s: errors count from so long after the beginning on.
-        cases: what differs in the scenario, by the name of a case.
-        intervals_s: least times between two messages of a node that are tried, in s.
-        divergences: differences from its last message, in nats, from which on a node sends, that are
-            tried.
-        liar: number of the node that lies.
-        lie_after_s: from when on it lies.
-        lies_m: what it adds to its estimates, in m; all are tried.
-        gate_probability: honest estimates pass the gate with at least this probability.
+        settle_s: time from the beginning after which errors are evaluated.
+        cases: changes to the scenario's parameters, by the name of a case.
+        intervals_s: shortest times between two messages of a node to try, in s.
+        divergences: differences from its last message, in nats, at which a node sends, to try.
+        liar: number of the node that sends false estimates.
+        lie_after_s: time after which it sends false estimates.
+        lies_m: offsets that it adds to its estimates to try, in m.
+        gate_probability: consistent estimates pass the gate with at least this probability.
     """
 
     settle_s: NonNegativeFloat = 1.0
@@ -102,13 +101,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _measure(rows: pd.DataFrame, key: str, outcome: Outcome) -> None:
-    """Measure the mean NEES and the RMSE of rows by run; `key` has a place for the quantity."""
+    """Measure mean NEES and RMSE by run; `key` has a placeholder for the quantity."""
     outcome.measure(key.format("nees"), mean_interval(rows["nees"]))
     outcome.metrics[key.format("position_rmse_m")] = float(np.sqrt(rows["squared_m2"].mean()))
 
 
 def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure the RMSE of sending news by that of sending in intervals at equal bandwidth."""
+    """Measure the RMSE of sending news relative to sending at intervals, at equal bandwidth."""
     by_interval, by_news = (rows[rows["policy"] == policy] for policy in (INTERVAL, NEWS))
     grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
     for limit, own in by_news.groupby("limit", sort=False):
@@ -123,7 +122,7 @@ def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> pd.DataFrame:
-    """Mean NEES and squared error of the position, by estimator and run; of all nodes but one."""
+    """Compute mean NEES and squared position error by estimator and run, over all nodes except one."""
     parts = []
     for errors in replayed.errors:
         if errors.case != f"node{without}":
@@ -142,7 +141,7 @@ def summarised(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 
 def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Tabulate errors and bytes a second and node, by run, estimator and rule of when to send."""
+    """Tabulate errors and bytes per second and node, by run, estimator and sending policy."""
     policies = [(INTERVAL, "send_interval_s", value) for value in options.intervals_s]
     policies += [("when it has news", "send_divergence", value) for value in options.divergences]
     parts = []
@@ -160,7 +159,7 @@ def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataF
 
 
 def _bytes_per_s(replayed: Replayed, estimator: str) -> float:
-    """Compute what a node sends a second, on the average."""
+    """Compute the mean number of bytes that a node sends per second."""
     first = replayed.sources[0]
     begin_ns, end_ns = first.extent("publish_time")
     sent = _of(replayed.outputs, estimator, "/sent")
@@ -175,7 +174,7 @@ def _of(outputs: Mapping[str, Ragged], estimator: str, leaf: str) -> list[Ragged
 
 
 def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Tabulate honest nodes' errors while one lies, by run, size of the lie, and gate or none."""
+    """Tabulate the other nodes' errors while one lies, by run, offset, and with or without a gate."""
     parts = []
     own = runner.experiment.estimators[CI]
     for lie_m in (0.0, *options.lies_m):
@@ -192,7 +191,7 @@ def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFra
 
 
 def _refused(replayed: Replayed, options: StressOptions) -> dict[str, dict[int, float]]:
-    """Compute what shares of the liar's and the others' messages honest nodes refuse, by run."""
+    """Compute the shares of the liar's and of the other nodes' messages that are rejected, by run."""
     [refused] = _of(replayed.outputs, "gated", "/refused")
     shares: dict[str, dict[int, float]] = {"liar_refused": {}, "honest_refused": {}}
     for run, source in enumerate(replayed.sources):
@@ -212,7 +211,7 @@ STATES = 4
 
 
 def _bandwidth_chart(table: pd.DataFrame) -> Chart:
-    """Draw error and NEES over what a node sends a second."""
+    """Draw error and NEES over the bytes that a node sends per second."""
     panels = []
     for quantity, label in (
         ("position_rmse_m", "RMSE of the position (m)"),
@@ -230,7 +229,7 @@ def _bandwidth_chart(table: pd.DataFrame) -> Chart:
 
 
 def _lie_chart(table: pd.DataFrame) -> Chart:
-    """Draw error and NEES of the honest nodes, and what is refused, over the size of the lie."""
+    """Draw error and NEES of the other nodes, and the share of rejected messages, over the offset."""
     labels = {
         "position_rmse_m": "RMSE of honest nodes (m)",
         "nees": "mean NEES of honest nodes",

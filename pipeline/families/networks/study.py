@@ -1,8 +1,9 @@
-"""Studies sensor networks: what each fusion rule costs in accuracy, consistency and bytes.
+"""Study of sensor networks: the cost of each fusion rule in accuracy, consistency and bytes.
 
-Claims: Jin, Lee, Hashimoto, DIND networks. RMSE, over all runs and steps, and NEES are those after
-`settle_s`, when every node has measured; ratios are the nodes' mean RMSE over that of one filter with
-all sensors. Over all steps ratios are larger: at first a node knows little but its own measurement.
+Claims: Jin, Lee, Hashimoto, DIND networks. RMSE (over all runs and steps) and NEES are those after
+`settle_s`, when every node has measured. Ratios are the nodes' mean RMSE over the RMSE of one filter
+with all sensors. Over all steps, ratios are larger, because a node initially knows little more than its
+own measurement.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,12 +34,12 @@ CI = "ci-trace"
 
 
 class NetworkOptions(Parameters):
-    """States what the study looks at besides the experiment's own runs.
+    """Additional settings of the study.
 
     Attributes:
-        settle_s: errors count from so long after the beginning on.
-        losses: probabilities of losing a message that are tried.
-        loss_rules: labels of the estimators that are tried at each of them.
+        settle_s: time from the beginning after which errors are evaluated.
+        losses: probabilities of message loss to try.
+        loss_rules: labels of the estimators to try at each of them.
     """
 
     settle_s: NonNegativeFloat = 1.0
@@ -73,7 +74,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _after(errors: Errors, settle_s: float) -> Errors:
-    """Take the errors from `settle_s` after the epoch on; raises BadInput where there are none."""
+    """Select the errors from `settle_s` after the epoch on; raise BadInput if there are none."""
     kept = errors.elapsed_s > settle_s + 1e-9
     if not kept.any():
         raise BadInput(
@@ -85,7 +86,7 @@ def _after(errors: Errors, settle_s: float) -> Errors:
 
 
 def network_table(found: Sequence[Errors]) -> pd.DataFrame:
-    """Tabulate by estimator the first node's RMSE, the nodes' mean by the centralised one's, NEES."""
+    """Tabulate the first node's RMSE, the mean RMSE relative to the centralised filter, and NEES."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for errors in found:
         squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
@@ -106,7 +107,7 @@ def network_table(found: Sequence[Errors]) -> pd.DataFrame:
 
 
 def _loads(experiment: Experiment, sources: Sequence[MemorySource]) -> dict[str, float | None]:
-    """Count the bytes that a directed link carries per run: what is sent, lost or not."""
+    """Count the bytes per run on a directed link, including lost messages."""
     links = gather([source.streams["/links"] for source in sources])
     run = run_of_rows(links.offsets)
     ends = np.stack([run, links["sender_id"], links["receiver_id"]])
@@ -126,7 +127,7 @@ def _rule(label: str, values: Mapping[str, Any]) -> str:
 
 
 def _by_loss(runner: Runner, options: NetworkOptions, settled: Replayed) -> pd.DataFrame:
-    """Tabulate NEES and ratio of some rules over the share of messages that are lost."""
+    """Tabulate NEES and RMSE ratio of some rules over the share of lost messages."""
     experiment = runner.experiment
     labels = [label for label in experiment.estimators if label in options.loss_rules]
     chosen = {
@@ -159,9 +160,9 @@ def _loss_chart(table: pd.DataFrame) -> Chart:
 
 
 def traces_of_equation_17() -> dict[str, float]:
-    """Compute for independent errors the trace of (17) as printed, and of the fused error's covariance.
+    """Compute the trace of (17) as printed and of the fused error's covariance, for independent errors.
 
-    The print equates P_c^-1 with the bracket that belongs between two factors P.
+    The paper equates P_c^-1 with the bracket, which belongs between two factors P.
     """
     stated = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
     fused = fuse(CI, np.zeros((2, 2)), stated)

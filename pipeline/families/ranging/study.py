@@ -1,4 +1,4 @@
-"""Shares what studies of ranges need: recordings in a folder, their replay, errors by the truth."""
+"""Common parts of studies of ranges: recordings in a folder, their replay, errors against the truth."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,10 +22,10 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """States delays that the data do not.
+    """Delays that the data do not state.
 
     Attributes:
-        range_delay_s: ranges are taken to be older than stamped by so much, beside an estimator's own
+        range_delay_s: age of ranges at their stamps, in addition to an estimator's own
             `range_delay_s`.
     """
 
@@ -33,7 +33,7 @@ class RangingOptions(Parameters):
 
 
 class Recording(NamedTuple):
-    """Names one recording, its place, and the files beside it that belong to it."""
+    """One recording: its name, its path, and additional files that belong to it."""
 
     name: str
     path: Path
@@ -41,7 +41,7 @@ class Recording(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """Holds a recording with the outputs of every estimator, by the last parts of their topics."""
+    """A recording with the outputs of every estimator, by the last part of their topics."""
 
     recording: Recording
     source: MemorySource
@@ -49,7 +49,7 @@ class Replayed(NamedTuple):
 
 
 def recordings(setting: Setting, pattern: str) -> list[Path]:
-    """Find the files of this name in the data's folder or below; raises BadInput where none is."""
+    """Find the files with this name in or below the data's folder; raise BadInput if there are none."""
     assert setting.data is not None
     found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
     if not found:
@@ -61,7 +61,7 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
 
 
 def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -> Iterator[Replayed]:
-    """Yield the recordings one by one; logs are kept of all, the timeline of the first."""
+    """Yield the recordings one by one; keep all logs, and draw the timeline of the first."""
     assert experiment.import_ is not None
     delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
     estimators = dict(experiment.estimators)
@@ -83,7 +83,7 @@ def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -
 
 
 class Reference(NamedTuple):
-    """Holds the truth: stamps in order (n,), and components (n, d); those of angles do not wrap."""
+    """The truth: ordered stamps (n,), and components (n, d) with unwrapped angles."""
 
     time_ns: Integers
     state: Floats
@@ -96,14 +96,14 @@ class Reference(NamedTuple):
 
 
 def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
-    """Return the mean NIS of single ranges within a span."""
+    """Compute the mean NIS of single ranges within a time span."""
     stamps = innovations.publish_time_ns
     inside = (stamps >= begin_ns) & (stamps <= end_ns)
     return float(np.mean(innovations["normalised_innovation_squared"][inside]))
 
 
 def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
-    """Tabulate figures by estimator and recording, and compute metrics of them."""
+    """Tabulate results by estimator and recording, and make metrics of them."""
     table = pd.DataFrame(rows)
     outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
     for row in rows:
@@ -119,11 +119,11 @@ def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
 
 
 def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:
-    """Draw every estimator's errors over time, of one recording.
+    """Draw every estimator's errors over time, for one recording.
 
     Args:
-        errors: by estimator stamps in ns and errors, (n,) each.
-        label: of the axis of the errors, with their unit.
+        errors: stamps in ns and errors, (n,) each, by estimator.
+        label: label of the error axis, with the unit.
     """
     begin_ns = min(int(time_ns[0]) for time_ns, _ in errors.values() if len(time_ns))
     panel = Panel(x=Axis(label="time (s)"), y=Axis(label=label, log=True))

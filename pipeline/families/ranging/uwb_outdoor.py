@@ -1,8 +1,8 @@
-"""Studies positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
+"""Study of positions from ranges outdoors: uwb_outdoor, compared with published tracks.
 
-Published errors are those of a part of each path, which begins and ends where it enters a place. The
-truth is linear between its rows, but for those at another height than the others by half a metre.
-Published tracks are scored at their stamps, ours at the rows of the truth.
+Published errors are for a part of each path, which begins and ends when the path enters given regions.
+The truth is interpolated linearly between its rows, without rows whose height differs by half a metre.
+Published tracks are evaluated at their stamps, ours at the rows of the truth.
 """
 
 import re
@@ -34,13 +34,13 @@ PUBLISHED = ("LS", "ESKF")
 
 
 class Place(Parameters):
-    """Bounds a part of the plane, where a window begins or ends.
+    """A region of the plane in which a window begins or ends.
 
     Attributes:
-        x_above_m: least x; None for any.
-        x_below_m: greatest x; None for any.
-        y_above_m: least y; None for any.
-        y_below_m: greatest y; None for any.
+        x_above_m: smallest x; None for no limit.
+        x_below_m: largest x; None for no limit.
+        y_above_m: smallest y; None for no limit.
+        y_below_m: largest y; None for no limit.
     """
 
     x_above_m: float | None = None
@@ -49,19 +49,19 @@ class Place(Parameters):
     y_below_m: float | None = None
 
     def holds(self, position: Floats) -> Booleans:
-        """Return which positions (n, 2) lie there."""
+        """Test which positions (n, 2) are in the region."""
         above = np.array([self.x_above_m, self.y_above_m], float)
         below = np.array([self.x_below_m, self.y_below_m], float)
-        outside = (position <= above) | (position > below)  # nothing is outside a limit that is none
+        outside = (position <= above) | (position > below)  # comparisons with None (NaN) are false
         return np.asarray((np.isfinite(position) & ~outside).all(axis=1))
 
 
 class Window(Parameters):
-    """Describes the part of a path that is scored.
+    """The part of a path that is evaluated.
 
     Attributes:
-        begin: where it begins: the first time that the path is there.
-        end: where it ends: the first time after that.
+        begin: region in which the window begins, the first time that the path is there.
+        end: region in which it ends, the first time after that.
     """
 
     begin: Place = Place()
@@ -69,12 +69,12 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """States the windows, and what errors are held to.
+    """The windows, and the selection of the truth.
 
     Attributes:
-        windows: the part of a path that is scored, by the name of a folder that a recording lies in;
-            without one all of it is.
-        level_m: how far from the path's median height a row of the truth may lie.
+        windows: the part of a path to evaluate, by the name of a folder that contains the recording;
+            the whole path if there is none.
+        level_m: largest distance of a row of the truth from the path's median height.
     """
 
     windows: dict[str, Window] = {}
@@ -132,7 +132,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[Reference, int, int]:
-    """Return the truth x, y, z, and between which stamps to score; raises BadInput for no overlap."""
+    """Return the truth x, y, z, and the stamps to evaluate between; raise BadInput if there are none."""
     stream = of.source.streams["/truth"]
     time_ns, state = stream.publish_time_ns, stream["state"][:, :3]
     begin, end = 0, len(time_ns) - 1
@@ -153,7 +153,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
 def published_rmse(
     of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
 ) -> tuple[float, float]:
-    """Return the error in the plane, and in space, of a published track within the window."""
+    """Compute the errors in the plane and in space of a published track within the window."""
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
@@ -161,7 +161,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """Return the errors that a recording comes with, by their names; none without such a file."""
+    """Read the errors that come with a recording, by name; empty if there is no such file."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

@@ -1,4 +1,4 @@
-"""Studies samples and the systems of the S2KF paper; begin with `reactor`.
+"""Studies of sampling and of the systems in the S2KF paper; begin with `reactor`.
 
-The samplings themselves are in `fuselog.replay.inference.sampling`.
+The sampling schemes are in `fuselog.replay.inference.sampling`.
 """

@@ -1,7 +1,7 @@
-"""Studies samplings of N(0, I): how near they are to it, what LCD sets cost, how they look.
+"""Study of samplings of N(0, I): their distance to it, the cost of LCD sets, and their look.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section V, Figs. 1 and 5. No filter runs here: the logs hold the sample sets.
+section V, Figs. 1 and 5. No filter runs here; the logs contain the sample sets.
 """
 
 import hashlib
@@ -36,12 +36,12 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
 
 class LcdOptions(Parameters):
-    """States the sets to optimise, and samplings to draw.
+    """The sets to optimize, and the samplings to draw.
 
     Attributes:
-        sizes: dimension and count of each set to optimise.
-        starts: number of starts of each optimisation.
-        contained: dimensions in which the sigma points of the UKF are compared with an optimised set.
+        sizes: dimension and count of each set to optimize.
+        starts: number of starts of each optimization.
+        contained: dimensions in which the sigma points of the UKF are compared with an optimized set.
         drawn: names of the samplings to draw.
     """
 
@@ -54,7 +54,7 @@ class LcdOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: LcdOptions = setting.options
-    optimised(2, 3, 1, experiment.seed)  # compiles, so that the first set's time is its own
+    optimised(2, 3, 1, experiment.seed)  # compile first, so that the first set's time has no compilation
     rows = [
         optimised(dimension, count, options.starts, experiment.seed)
         for dimension, count in setting.progress(options.sizes, "optimising", len(options.sizes))
@@ -65,7 +65,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome(tables={"sets": sets}, figures={"samplings": sample_figure(drawn, distances)})
     for row in sets.to_dict("records"):
         case = f"n{row['dimension']}-l{row['count']}"
-        for name in sets.columns[2:].drop("cpu_per_start_s"):  # no two runs take the same time
+        for name in sets.columns[2:].drop("cpu_per_start_s"):  # the time differs between runs
             outcome.metrics[f"lcd.{name}.{case}"] = float(row[name])
     outcome.metrics |= {f"{name}.distance.drawn": value for name, value in distances.items()}
     for dimension in options.contained:
@@ -77,7 +77,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
-    """Find the best set of some starts: D / pi^(N/2), the covariance's eigenvalues, and its cost."""
+    """Find the best set of several starts: D / pi^(N/2), eigenvalues of the covariance, and cost."""
     begin = process_time()
     points = lcd_samples(dimension, count, np.random.default_rng(seed), starts=starts)
     seconds = process_time() - begin
@@ -94,15 +94,15 @@ def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, f
 
 
 def draw(name: str, seed: int) -> Samples:
-    """Return one set in the plane."""
+    """Draw one set in the plane."""
     return parse_sampling(name).at(2).draw(np.random.default_rng(seed), ())
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """Return how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
+    """Compute how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
 
-    The largest difference between their sorted distances from one another and from the origin, which
-    no rotation changes.
+    This is the largest difference between their sorted distances from each other and from the origin,
+    which no rotation changes.
     """
     points = lcd_samples(dimension, 2 * dimension + 1, np.random.default_rng(seed), starts=starts)
     wanted = _invariants(unscented(dimension).points)
@@ -117,7 +117,7 @@ def _invariants(points: np.ndarray) -> np.ndarray:
 
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:
-    """Draw the sets with the circle that holds 95 %, areas of points their weights, Fig. 1."""
+    """Draw the sets with the circle that contains 95 %, with point areas as weights, Fig. 1."""
     figure = Figure(figsize=(2.6 * len(drawn), 3.2), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 100)
     radius = np.sqrt(chi2.ppf(0.95, 2))
@@ -132,7 +132,7 @@ def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Fig
 
 
 def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) -> str:
-    """Write the sets as a log and its timeline; return a hash of all samples."""
+    """Write the sets as a log with its timeline; return a hash of all samples."""
     digest = hashlib.sha256()
     streams = []
     for name, (points, weights) in drawn.items():

@@ -1,6 +1,6 @@
-"""Takes bounds of a robot's errors from the other robots of its log: their truth says theirs.
+"""Bounds of a robot's errors from the other robots of its log, whose truth gives their errors.
 
-So nothing is chosen by the truth of the robot that is judged. Channels state what is found.
+So no bound depends on the truth of the evaluated robot. The bounds are written to the channels.
 """
 
 from collections.abc import Sequence
@@ -23,19 +23,19 @@ from fuselog.replay.families.sets.regions.moving_sets import Growth, odometry_of
 
 Floats = NDArray[np.float64]
 
-# Spans over which odometry is compared with the truth; those up to SHORT_S make the bound's offset.
+# Time spans over which odometry is compared with the truth; those up to SHORT_S give the bound's offset.
 SPANS_S = (0.25, 1.0, 2.0, 5.0, 10.0, 20.0)
 SHORT_S = 2.0
 SPAN_STEP_S = 0.5
 
 
 class BoundOptions(Parameters):
-    """States how bounds follow from errors.
+    """How bounds follow from errors.
 
     Attributes:
-        margin: odometry's bound is its largest error times this.
-        bearing_quantile: a bearing's bound is what this share of errors stays below, since a
-            misidentified landmark is off by any angle.
+        margin: factor from odometry's largest error to its bound.
+        bearing_quantile: quantile of bearing errors that is the bound, since a misidentified landmark
+            may give any error.
     """
 
     margin: PositiveFloat = 1.2
@@ -44,7 +44,7 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """Holds one robot's errors: bearings and differences (n,); odometry, largest by span (spans, 2)."""
+    """One robot's errors: bearings and differences (n,); odometry, largest by time span (spans, 2)."""
 
     bearing_rad: Floats
     relative_rad: Floats
@@ -54,9 +54,9 @@ class RobotErrors:
 def state_bounds(
     sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
 ) -> list[MemorySource]:
-    """State in each robot's channels the bounds that the others keep in all runs.
+    """Write the bounds of the other robots' errors, over all runs, to each robot's channels.
 
-    Raises BadInput where fewer than two robots have odometry, bearings and truth.
+    Raises BadInput if fewer than two robots have odometry, bearings and truth.
     """
     leaves = ("odometry", "range_bearing", "truth")
     first = sources[0].streams
@@ -90,7 +90,7 @@ def state_bounds(
 def _bounds(
     others: Sequence[RobotErrors], options: BoundOptions
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return what the channels of odometry and of bearings state."""
+    """Return the bounds for the channels of odometry and of bearings."""
     largest = options.margin * np.max([errors.odometry for errors in others], axis=0)
     spans_s = np.array(SPANS_S)
     offset = largest[spans_s <= SHORT_S].max(axis=0)
@@ -107,7 +107,7 @@ def _bounds(
 
 
 def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> RobotErrors:
-    """Return how far one robot's bearings and odometry were off, where its truth is known."""
+    """Compute one robot's errors of bearings and odometry while its truth is known."""
     seen, truth = source.streams[f"{prefix}/range_bearing"], source.streams[f"{prefix}/truth"]
     landmarks, driven = source.streams["/landmarks"], source.streams[f"{prefix}/odometry"]
     error, look = _bearing_errors(seen, landmarks, truth, gap_limit_s)
@@ -130,7 +130,7 @@ def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> Robot
 def _bearing_errors(
     seen: Stream, landmarks: Stream, truth: Stream, gap_limit_s: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Compute errors (n,) of bearings to mapped landmarks where truth is known, and their stamps."""
+    """Compute errors (n,) of bearings to mapped landmarks while the truth is known, and their stamps."""
     numbers = landmarks["landmark_id"]
     order = np.argsort(numbers)
     row = np.searchsorted(numbers, seen["target_id"], sorter=order).clip(max=len(numbers) - 1)

@@ -1,4 +1,4 @@
-"""Studies trackers: vessels, ferries, targets that cross; begin with `study`.
+"""Studies of trackers: vessels, ferries, crossing targets; begin with `study`.
 
-Writes tracks for the MOT Challenge, too.
+The package also writes tracks for the MOT Challenge.
 """

@@ -1,8 +1,8 @@
-"""Studies Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
+"""Study of Autoferry scenarios: the benefit of each sensor for tracks of vessels, and of associations.
 
-Quays, marks and other craft have no reference: GOSPA leaves out what is farther than 50 m from both
-vessels. Trackers are replayed in the order of the stamps, and some of them again in the order of
-arrival, with each way to take late scans.
+Quays, marks and other craft have no reference: GOSPA ignores everything farther than 50 m from both
+vessels. Trackers are replayed in stamp order, and some also in order of arrival, with each policy for
+late scans.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ from fuselog.replay.families.tracking.judging.errors import Judged, instants_of,
 
 
 class AutoferryOptions(Parameters):
-    """States what is compared, and which ways to treat late scans are tried.
+    """The comparisons, and the policies for late scans.
 
     Attributes:
-        compared: pairs of estimators whose figures are compared, the first with the second.
-        late: ways to treat late scans that are tried in the order of arrival.
-        late_estimators: labels of the estimators that are replayed so; those that are not run are left
-            out.
+        compared: pairs of estimators to compare, the first with the second.
+        late: policies for late scans to try in order of arrival.
+        late_estimators: labels of the estimators that are replayed with these; estimators that the
+            experiment does not run are ignored.
     """
 
     compared: list[tuple[str, str]] = []
@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """Find the scenarios in the data's folder by the numbers in their names, or the folder itself."""
+    """Find the scenarios in the data's folder by number, or the folder itself."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []
@@ -99,10 +99,10 @@ def _late_table(
     in_order: Mapping[str, Ragged],
     runs: Mapping[str, Judged],
 ) -> pd.DataFrame:
-    """Tabulate by estimator, way to take late scans, and scenario.
+    """Tabulate by estimator, policy for late scans, and scenario.
 
-    `from_in_order_m` is how far the tracks after the last late scan are from those in order, at most;
-    infinite where they are not the same tracks.
+    `from_in_order_m` is the largest distance between the tracks after the last late scan and those in
+    stamp order; infinite if the tracks differ.
     """
     tables = []
     known = experiment.estimators
@@ -123,7 +123,7 @@ def _late_table(
 
 
 def _last_late_ns(source: MemorySource) -> int:
-    """Return when the last late scan of a run arrived; 0 where none is late."""
+    """Return when the last late scan of a run arrived; 0 if none is late."""
     arrivals = [
         stream.log_time_ns[stream.log_time_ns > stream.publish_time_ns]
         for topic, stream in source.streams.items()
@@ -135,7 +135,7 @@ def _last_late_ns(source: MemorySource) -> int:
 def _farthest(
     in_order: Mapping[str, Ragged], outputs: Mapping[str, Ragged], label: str, run: int, from_ns: int
 ) -> float:
-    """Compute how far tracks of two replays are apart at most, from a time on."""
+    """Compute the largest distance between the tracks of two replays, from a time on."""
     sizes, tracks = sets_of(in_order, label, run)
     stamps = np.unique(sizes.publish_time_ns)
     stamps = stamps[stamps >= from_ns]

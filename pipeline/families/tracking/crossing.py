@@ -1,7 +1,7 @@
-"""Studies simulated targets that cross: what associations are worth in clutter.
+"""Study of simulated crossing targets: the benefit of associations in clutter.
 
-Every case has a rate of clutter and a probability of detection; the targets of a run and their true ways
-are the same in all cases.
+Every case has a clutter rate and a detection probability; the targets of a run and their true
+trajectories are the same in all cases.
 """
 
 from itertools import product
@@ -21,12 +21,12 @@ from fuselog.replay.judging.intervals import mean_interval
 
 
 class CrossingOptions(Parameters):
-    """States the cases, and what is compared.
+    """The cases and the comparisons.
 
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.
         detection_probability: probabilities of detection.
-        compared: pairs of estimators whose figures are compared, the first with the second.
+        compared: pairs of estimators to compare, the first with the second.
     """
 
     clutter_per_scan: tuple[float, ...] = (10.0, 50.0, 100.0)
@@ -63,7 +63,7 @@ def _case(clutter_per_scan: float, detection_probability: float) -> str:
 
 
 def _chart(every: pd.DataFrame) -> Chart:
-    """Draw GOSPA over clutter, with 95 % intervals over runs: a panel by detection probability."""
+    """Draw GOSPA over clutter with 95 % intervals over runs, one panel per detection probability."""
     panels = []
     for probability, of_panel in every.groupby("detection_probability", sort=False):
         panel = Panel(
@@ -82,7 +82,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
-    """Measure by how much the differences in GOSPA grow from the least clutter to the most."""
+    """Measure the growth of differences in GOSPA from the least to the most clutter."""
     for probability, rows in every.groupby("detection_probability", sort=False):
         by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
         for label, other in pairs:

@@ -1,11 +1,11 @@
-"""Writes tracks and truths as lines of the MOT Challenge, which TrackEval reads.
+"""Export of tracks and truths in the format of the MOT Challenge, which TrackEval reads.
 
-A frame is every half second from the run's epoch on, the first one has number 1. Tracks are predicted to
-it, truths interpolated. A target has no extent: its box begins where it is, in metres, and has no width
-and no height. TrackEval's similarity of points is that of its Euclidean distance, not overlap.
+Frames are every half second from the run's epoch on; the first has number 1. Tracks are predicted to a
+frame, truths interpolated. A target has no extent: its box begins at its position, in metres, and has
+zero width and height. Use TrackEval's similarity by Euclidean distance of points, not by overlap.
 
     frame,id,x,y,0,0,1,-1,-1,-1      a track
-    frame,id,x,y,0,0,1,1,1           a truth; the last three: it counts, class 1, wholly visible
+    frame,id,x,y,0,0,1,1,1           a truth; the last three: it counts, class 1, fully visible
 
 Dendorfer et al., "MOTChallenge: a benchmark for single-camera multiple target tracking", IJCV 129, 2021.
 """
@@ -26,10 +26,10 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """Return by file name the topics and lines: a file of each tracker's tracks, one of all truths.
+    """Return topics and lines by file name: a file of each tracker's tracks, and one of all truths.
 
-    `topics` are those wanted, or none for all. Raises BadInput where one is not there or holds neither
-    tracks nor truths in the plane, or there are none at all.
+    `topics` are the wanted topics, or empty for all. Raises BadInput if a topic does not exist or has
+    neither tracks nor truths in the plane, or if there are none.
     """
     unknown = [topic for topic in topics if topic not in log.topics]
     if unknown:
@@ -75,7 +75,7 @@ def _is_point(topic: Topic) -> bool:
 
 
 def _frames(epoch_ns: int, last_ns: int) -> Integers:
-    """Return the stamps of all frames until the last stamp."""
+    """Return the stamps of all frames up to the last stamp."""
     return np.arange(epoch_ns, last_ns + 1, PERIOD_NS)
 
 

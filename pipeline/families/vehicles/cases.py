@@ -1,4 +1,4 @@
-"""Runs cooperative vehicles in several cases: each estimator's errors, by run and by step."""
+"""Cases of cooperative vehicles: each estimator's errors, by run and by step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -24,20 +24,20 @@ from fuselog.replay.judging.errors.label_errors import (
 
 Floats = NDArray[np.float64]
 
-# What a message's parts take, in bytes.
+# Sizes of a message's parts, in bytes.
 POSITION_BYTES, IDENTITY_BYTES, NUMBER_BYTES = 16, 4, 8
-# State and covariance of a vehicle, the latter without its mirror image.
+# State of a vehicle and the lower triangle of its covariance.
 TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """States the cases, and what they are compared with.
+    """The cases and the estimators to compare with.
 
     Attributes:
-        cases: what differs in the scenario's parameters, by the name of a case.
+        cases: changes to the scenario's parameters, by the name of a case.
         reference: label of the Kalman filter.
         few: parameters of estimators that are too slow for all runs, by label.
-        few_runs: number of runs of the first case that these get.
+        few_runs: number of runs of the first case for these estimators.
     """
 
     cases: dict[str, dict[str, Any]] = {"deterministic": {}}
@@ -47,10 +47,10 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Holds total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+    """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
 
-    By step the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps); `failed` counts runs that
-    did not reach the end. Sets have no labels: NaN.
+    By step: the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps). `failed` counts runs that
+    did not reach the end. For sets, which have no labels, errors with fixed labels are NaN.
     """
 
     fixed: Floats
@@ -67,7 +67,7 @@ class Scores(NamedTuple):
 
 
 class Case(NamedTuple):
-    """Holds one case: its runs, each estimator's scores by label, and bytes that each sends per step."""
+    """One case: its runs, each estimator's scores by label, and the bytes that each sends per step."""
 
     name: str
     sources: Sequence[MemorySource]
@@ -76,14 +76,14 @@ class Case(NamedTuple):
 
     @property
     def parameters(self) -> VehiclesParameters:
-        """Return what was recorded."""
+        """Return the parameters of the recording."""
         stated = self.sources[0].run
         assert stated is not None
         return VehiclesParameters.model_validate(stated.parameters)
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
-    """Read the stamps (runs, steps) after the start, and true places (runs, steps, vehicles, 2)."""
+    """Read the stamps (runs, steps) after the start, and true positions (runs, steps, vehicles, 2)."""
     numbers = vehicle_numbers(sources[0].topics)
     topics = [f"/vehicle{number}/truth" for number in numbers]
     read = [source.read(topics) for source in sources]
@@ -92,15 +92,15 @@ def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
 
 
 def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np.int64]) -> Floats:
-    """Take an estimator's places of all vehicles at the truth's stamps.
+    """Return an estimator's positions of all vehicles at the truth's stamps.
 
     Args:
-        outputs: by topic.
-        label: the estimator's.
+        outputs: outputs by topic.
+        label: label of the estimator.
         times_ns: (runs, steps), the truth's stamps.
 
     Returns:
-        (runs, steps, vehicles, 2), in m; NaN where there is none.
+        Positions (runs, steps, vehicles, 2), in m; NaN if there is no estimate.
     """
     topics = [topic for topic in outputs if topic.startswith(f"/estimates/{label}/vehicle")]
     states = [topic for topic in topics if topic.endswith("/state")]
@@ -115,10 +115,10 @@ def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np
 
 
 def score(estimates: Floats, truths: Floats) -> Scores:
-    """Compute the total errors of estimated places.
+    """Compute the total errors of estimated positions.
 
     Args:
-        estimates: (runs, steps, vehicles, 2), in m; NaN where there is none.
+        estimates: (runs, steps, vehicles, 2), in m; NaN if there is no estimate.
         truths: (runs, steps, vehicles, 2), in m.
     """
     return _scores(
@@ -129,7 +129,7 @@ def score(estimates: Floats, truths: Floats) -> Scores:
 
 
 def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
-    """Sum up squared errors and GOSPA by run and step."""
+    """Sum squared errors and GOSPA by run and step."""
     failed = int(np.isnan(assigned).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
 
@@ -137,11 +137,11 @@ def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
 def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
     """Compute the total errors of a set estimate.
 
-    A vehicle without an element of its own takes the nearest.
+    A vehicle without its own element is assigned the nearest one.
 
     Args:
-        outputs: by topic.
-        found: the judged set estimate, which has GOSPA.
+        outputs: outputs by topic.
+        found: the evaluated set estimate, which has GOSPA.
         truths: (runs, steps, vehicles, 2), in m.
     """
     topic = f"/estimates/{found.estimator}/{found.case}"
@@ -165,7 +165,7 @@ def scores_of(
     labels: Iterable[str],
     others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
-    """Return the scores of all estimators of the runs; those of sets by the network's fixes."""
+    """Compute the scores of all estimators; for sets, those of the network's fixes."""
     times_ns, truths = truths_of(sources)
     sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
@@ -180,10 +180,10 @@ def scores_of(
 def bytes_per_step(
     sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
-    """Return what the members of the network send per scan of the network, on average, by estimator.
+    """Compute the mean number of bytes sent per scan of the network, by estimator.
 
-    Fixes with identity where the association must be known, without else; of the infrastructure
-    sensor nothing, its one number, or its detections.
+    Fixes have an identity only if the association must be known. The infrastructure sensor sends
+    nothing, its one number, or its detections.
     """
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]

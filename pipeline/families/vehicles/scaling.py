@@ -1,8 +1,8 @@
-"""Studies how time and error of vehicles' filters grow with the number of vehicles.
+"""Study of how time and error of vehicles' filters grow with the number of vehicles.
 
-Vehicles start anywhere in a square: one that grows with their number, so that they stay as far apart, or
-one so small that any fix may be of any vehicle. Where a method's time grows faster than any power, it is
-told by the factor for every further vehicle; else by the power.
+Vehicles start anywhere in a square: one that grows with their number, so that their density is constant,
+or one so small that any fix may be of any vehicle. Growth is described by a factor per vehicle for
+exponential methods, and by a power otherwise.
 """
 
 import time
@@ -28,12 +28,12 @@ TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
-    """States up to how many vehicles a method goes, and how its work should grow.
+    """The largest number of vehicles of a method, and the expected growth of its work.
 
     Attributes:
         most: largest number of vehicles.
         place: whether vehicles start apart, or together in one square.
-        growth: how its work should grow with the number of vehicles.
+        growth: expected growth of its work with the number of vehicles.
     """
 
     most: PositiveInt
@@ -42,13 +42,13 @@ class Swept(Parameters):
 
 
 class ScalingOptions(Parameters):
-    """States the numbers of vehicles, and where they are.
+    """The numbers of vehicles, and where they start.
 
     Attributes:
         vehicles: numbers of vehicles.
-        area_per_vehicle_m2: area per vehicle where they start apart.
-        together_m: side of the square where they start together.
-        methods: how far each method goes, by label.
+        area_per_vehicle_m2: area per vehicle if they start apart.
+        together_m: side of the square if they start together.
+        methods: range of each method, by label.
     """
 
     vehicles: tuple[PositiveInt, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 20, 35, 50)
@@ -58,7 +58,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """States how time grows over the greater half of the numbers: power of N, and factor per vehicle."""
+    """Growth of time over the larger half of the numbers: power of N, and factor per vehicle."""
 
     power: float
     factor: float
@@ -110,9 +110,9 @@ def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> 
 def _timed(
     sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
 ) -> tuple[float, float, int]:
-    """Measure a step's CPU ms, the assigned RMSE of a vehicle's place in m, and how many runs fail."""
+    """Measure a step's CPU time in ms, the assigned RMSE of a vehicle in m, and the failed runs."""
     chosen = {label: estimators[label]}
-    replay_in_memory(sources[:1], chosen)  # compiles
+    replay_in_memory(sources[:1], chosen)  # compile first
     begin = time.process_time()
     outputs = replay_in_memory(sources, chosen)
     taken = time.process_time() - begin
@@ -126,9 +126,9 @@ def _timed(
 
 
 def growth_of(table: pd.DataFrame) -> Growth:
-    """Fit to the greater half of the numbers of vehicles, where the work hides what is constant.
+    """Fit the growth to the larger half of the numbers of vehicles, for which constant costs are small.
 
-    Steps too short for the clock, which measure 0, are left out.
+    Steps too short for the clock, with a measured time of 0, are ignored.
     """
     own = table[(table["vehicles"] >= table["vehicles"].median()) & (table["step_ms"] > 0)]
     if len(own) < 2:
