@@ -1,7 +1,8 @@
-"""Describes the motion of a body as its topics say it: places, velocities, wheels, turns.
+"""The motion of a body according to its topics: positions, velocities, wheels, turns.
 
-All are columns over time in seconds since the log's first stamp. What holds from one message to the
-next, or lies between two samples, is integrated: a window's distance and turn need no common stamps.
+All values are columns over time in seconds since the log's first stamp. Values are integrated, whether
+they hold until the next message or are samples, so the distance and turn of a window need no common
+stamps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,18 +15,18 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.geodesy import local_metres
 
 Floats = NDArray[np.float64]
-FEWEST = 20  # messages, below which nothing is said of a topic
+FEWEST = 20  # messages; topics with fewer are not checked
 
 
 @dataclass(frozen=True)
 class Series:
-    """Holds one quantity of a topic over time.
+    """One quantity of a topic over time.
 
     Attributes:
-        topic, field: where it stands.
+        topic, field: where the quantity comes from.
         times_s: stamps (n,), which increase.
         values: (n,) or (n, m).
-        holds: whether a value holds until the next; else it is a sample.
+        holds: whether a value holds until the next one; otherwise it is a sample.
     """
 
     topic: str
@@ -46,7 +47,7 @@ class Series:
         return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
 
     def moved(self, by_s: float, gain: float = 0.0) -> "Series":
-        """Return the series as it is where its stamps are not late, and its clock does not gain."""
+        """Return the series with stamps corrected for a delay, and for a clock that gains."""
         first_s = self.times_s[0]
         times_s = self.times_s - gain * (self.times_s - first_s) - by_s
         return Series(self.topic, self.field, times_s, self.values, self.holds)
@@ -54,9 +55,9 @@ class Series:
 
 @dataclass(frozen=True)
 class PlaceSeries(Series):
-    """Holds places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
+    """Positions (n, 2) east and north, or along x and y, with their stated variances (n,).
 
-    `is_flat` says that they are metres and not latitudes, so that they may have a scale.
+    `is_flat` says that they are in metres and not latitudes, so they may have a scale error.
     """
 
     variances_m2: Floats = field(default_factory=lambda: np.empty(0))
@@ -65,17 +66,17 @@ class PlaceSeries(Series):
 
 @dataclass
 class Body:
-    """Holds what topics say of one body.
+    """The topics of one body.
 
     Attributes:
-        fixes: its places.
-        velocities: in the frame of the places (n, 2).
-        speeds: forward, as wheels have them.
+        fixes: positions.
+        velocities: velocities in the frame of the positions (n, 2).
+        speeds: forward speeds, as from wheels.
         turns: turn rates about the vertical.
         rates: turn rates (n, 3) about the body's axes.
         forces: specific forces (n, 3).
-        orientations: unit quaternions (n, 4), measured ones.
-        references: those of the truth.
+        orientations: measured unit quaternions (n, 4).
+        references: unit quaternions (n, 4) of the truth.
     """
 
     fixes: list[PlaceSeries] = field(default_factory=list)
@@ -95,9 +96,10 @@ class Body:
 
 
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
-    """Return the bodies that topics are of: one per namespace, or one where no role comes twice.
+    """Group topics by body: one per namespace, or a single one if no role occurs twice.
 
-    A namespace within another has what that has as well: a unit `/imu2/inertial` moves as `/fix` says.
+    A namespace within another also has the topics of that one: a unit `/imu2/inertial` moves as `/fix`
+    says.
     """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
@@ -116,7 +118,7 @@ def bodies(streams: Mapping[str, Stream]) -> list[Body]:
 
 
 def _add(body: Body, stream: Stream, first_ns: int) -> None:
-    """Take up what a topic says of the body."""
+    """Add a topic to a body."""
     name, topic = stream.schema.full_name, stream.topic
     order = np.argsort(stream.publish_time_ns, kind="stable")
     stamps_ns = stream.publish_time_ns[order]
@@ -171,7 +173,7 @@ _TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
 def _fixes(
     places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True
 ) -> PlaceSeries:
-    """Return places with the mean of the two variances that they state, NaN where they state none."""
+    """Return positions with the mean of their two stated variances, NaN if there are none."""
     column = stream.columns.get("covariance_m2")
     variances = np.full(len(places.times_s), np.nan)
     if column is not None and len(places.times_s) == len(rows) and column.shape[1]:
@@ -190,7 +192,7 @@ def _fixes(
 
 
 def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> PlaceSeries:
-    """Return places about their middle."""
+    """Return geodetic positions relative to their median."""
     values = local_metres(stream["latitude_deg"][rows], stream["longitude_deg"][rows])
     known = np.isfinite(values).all(axis=1)
     places = Series(stream.topic, "latitude_deg", times_s[known], values[known])

@@ -1,4 +1,4 @@
-"""Checks single columns: values that freeze, are rounded, or end where the sensor's range does."""
+"""Checks of single columns: values that freeze, are rounded, or are clipped at the sensor's range."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -11,30 +11,31 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
 
 Floats = NDArray[np.float64]
-LONG, TIMES = 10, 10.0  # rows, and times the usual run, that a value may stay
-NEXT = 2.5  # steps of what is rounded, within which a value is the next
-MOVING = 0.5  # of the rows of a span, in which another column changes
-LOOKED_AT = 20_000  # rows by which a resolution is told
-LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
+LONG, TIMES = 10, 10.0  # rows, and times the usual run, for which a value may stay the same
+NEXT = 2.5  # grid steps within which a value is a neighbour
+MOVING = 0.5  # share of the rows of a span in which another column changes
+LOOKED_AT = 20_000  # rows from which a resolution is determined
+LEVELS, CHANGES = 3, 0.05  # least number of values of a rounded column, and least share of changes
 SHARE, ROWS, NEAR = 1e-3, 5, 5e-3
-# Of an end at which values are clipped: its share of the rows, how many times more often it comes than
-# other values do, the number of values, how many times it is reached, and the share of the other rows
-# that differ.
+# For an end at which values are clipped: its share of the rows, how many times more frequent it is than
+# other values, the number of values, how many times it is reached, and the share of the other rows that
+# differ.
 CLIPPED, MORE_OFTEN, MANY_LEVELS, RUNS, MEASURED = 5e-3, 5.0, 20, 3, 0.9
-# Of a code among values: times the usual step, part of its step that others differ by, and how often.
+# For a code among values: its step in usual steps, the share of it by which others differ, and its
+# count.
 ALONE, ALIKE, OFTEN = 20.0, 0.2, 3
 RANGES = {
     "turn_rate_radps": np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0]),
     "specific_force_mps2": 9.80665 * np.array([2.0, 4.0, 8.0, 16.0, 32.0]),
 }
 COUNTS = 2**15
-_DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # exact zeros of these are standstills
+_DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # where exact zeros mean standstill
 
 
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a value that stays for far longer than the column's do, while others of the topic move.
+    """Find a value that stays far longer than usual in its column, while other columns change.
 
-    What is rounded, and goes on within two steps of where it stood, has rested and was not frozen.
+    A rounded column that continues within two grid steps of the value was at rest, and not frozen.
     """
     entries = list(_entries(stream))
     for field, name, column in entries:
@@ -44,7 +45,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         if len(edges) < 2 or len(column) < FEWEST:
             continue
         runs = np.diff(np.append(edges, len(column)))
-        usual = float(np.quantile(runs, 0.99))  # what is rounded, or slow, stays now and then
+        usual = float(np.quantile(runs, 0.99))  # rounded or slow columns stay sometimes
         if runs.max() > max(LONG, TIMES * usual):
             runs[_rests(column, edges)] = 0
         begin, length = int(edges[np.argmax(runs)]), int(runs.max())
@@ -66,7 +67,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find one number that comes again and again, far from the messages before and after it."""
+    """Find a number that recurs, far from the messages before and after it."""
     entries = [(*each, np.inf) for each in _entries(stream) if each[0] not in RANGES]
     if stream.schema.full_name == schemas.ORIENTATION.full_name:
         entries = [("quaternion", "the heading in rad", heading(stream["quaternion"]), np.pi)]
@@ -85,7 +86,9 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             continue
         code = float(found[np.argmax(counts)])
         others = values[values != code]
-        is_pulse = usual == 0.0 and abs(code) < 2.0 * np.abs(others).max()  # of what mostly rests
+        is_pulse = (
+            usual == 0.0 and abs(code) < 2.0 * np.abs(others).max()
+        )  # of a column that mostly rests
         if is_pulse or counts.max() < 0.5 * (len(values) - len(others)):
             continue
         yield Finding(
@@ -100,7 +103,7 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _apart(steps: Floats, half_turn: float) -> Floats:
-    """Return the sizes of steps, of angles the shorter way round."""
+    """Return the sizes of steps; for angles, the shorter way round."""
     sizes = np.abs(steps)
     return sizes if half_turn == np.inf else np.minimum(sizes, 2 * half_turn - sizes)
 
@@ -129,9 +132,9 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find columns that stand at the end of a usual range, or clipped at an end that is theirs alone.
+    """Find columns at the end of a usual range, or clipped at a value of their own.
 
-    What rests at its end rests in all of its columns; exact zeros are standstills.
+    A body at rest has constant values in all of its columns; exact zeros are standstills.
     """
     entries = list(_entries(stream, is_regular=False))
     for field, name, column in entries:
@@ -166,7 +169,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> bool:
-    """Tell whether an inertial value is the last of a usual range, or of 16 bits."""
+    """Test whether an inertial value is the end of a usual range, or of 16 bits."""
     ranges = RANGES.get(field)
     if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
         return False
@@ -178,7 +181,7 @@ def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> 
 def _is_clipped(
     is_there: NDArray[np.bool_], levels: int, usual: float, others: Sequence[Floats]
 ) -> bool:
-    """Tell whether an end comes far more often than other values do, while other columns move."""
+    """Test whether an end is far more frequent than other values, while other columns change."""
     if levels < MANY_LEVELS or is_there.sum() <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
         return False
     runs = int(is_there[0]) + int(np.sum(np.diff(is_there.astype(np.int8)) > 0))
@@ -187,7 +190,7 @@ def _is_clipped(
 
 
 def resolution(values: Floats) -> float:
-    """Return the grid that all values lie on; zero where there is none."""
+    """Determine the grid on which all values are; zero if there is none."""
     levels = np.unique(values)
     if len(levels) < LEVELS or len(levels) > len(values) / 2:
         return 0.0
@@ -197,13 +200,13 @@ def resolution(values: Floats) -> float:
     if step < 1e-9 * largest:
         return 0.0
     places = (levels - levels[0]) / step
-    # a step is known to the rounding of the numbers, which adds up over the places
+    # a step is known to the rounding of the numbers, which accumulates over the grid
     tolerance = 0.01 + 4e-16 * largest / step * places
     return step if (np.abs(places - np.rint(places)) < tolerance).all() else 0.0
 
 
 def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of every measured component; of regular topics, or all."""
+    """Yield field, name and values (n,) of every component, for regular topics or all measured ones."""
     if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:
@@ -218,7 +221,7 @@ def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, 
 
 
 def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which runs of equal values are a grid's, whose neighbours are within its next steps."""
+    """Test which runs of equal values are due to a grid, with neighbours within its next steps."""
     steps = np.abs(np.diff(column[edges]))
     farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
     levels = np.unique(column[np.isfinite(column)])

@@ -1,4 +1,4 @@
-"""Checks covariances: matrices that none can be, and numbers that stand for unknown."""
+"""Checks of covariances: impossible matrices, and numbers that stand for unknown."""
 
 from collections.abc import Iterator, Mapping
 from math import isqrt
@@ -9,22 +9,20 @@ from numpy.typing import NDArray
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
 
-TOLERANCE = 1e-6  # of the largest entry
+TOLERANCE = 1e-6  # relative to the largest entry
 SINGULAR, SINGULAR_BELOW = "singular", 1e-12  # the least eigenvalue of its correlations
-# Of what has no such component, as a planar robot's height, zero may stand for it.
+# Zero may stand for a component that does not exist, such as a planar robot's height.
 _PARTIAL = {schemas.POSE.full_name, schemas.TWIST.full_name}
 
 
 def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find covariances that are -1, zero, negative, not symmetric, indefinite, singular, one number."""
+    """Find covariances that are -1, zero, negative, not symmetric, indefinite, singular, or constant."""
     for entry in stream.schema:
         column = stream.columns[entry.name].reshape(len(stream), -1)
         if "variance" not in entry.name or not column.shape[1]:
             continue
         is_new = np.ones(len(column), bool)
-        is_new[1:] = (column[1:] != column[:-1]).any(
-            axis=1
-        )  # of equal ones in a row the first tells all
+        is_new[1:] = (column[1:] != column[:-1]).any(axis=1)  # the first of equal ones suffices
         rows = np.flatnonzero(is_new & np.isfinite(column).all(axis=1))
         is_partial = stream.schema.full_name in _PARTIAL
         is_prior = stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
@@ -60,8 +58,8 @@ def _faults(
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield each fault with the rows (n,) that have it, the plainest first.
 
-    `is_partial` says that zero may stand for a component that there is none, or that is known exactly,
-    `is_exact` that it may so for all.
+    `is_partial` says that zero may stand for a component that does not exist or is known exactly,
+    `is_exact` that it may do so for all.
     """
     width = values.shape[1]
     size = isqrt(width)
@@ -70,7 +68,7 @@ def _faults(
     yield "-1, which stands for unknown", np.equal(diagonal[:, 0], -1.0)
     yield "negative on its diagonal", np.less(diagonal.min(axis=1), 0.0)
     zero = np.equal(diagonal, 0.0)
-    if not is_exact:  # of a place that is stated once zero says that it is exact
+    if not is_exact:  # for a position that is stated once, zero means exact
         yield "zero", np.greater_equal(zero.sum(axis=1), zero.shape[1] if is_partial else 1)
     if not is_matrix:
         return
@@ -83,5 +81,5 @@ def _faults(
     yield "indefinite", np.linalg.eigvalsh(matrices)[:, 0] < -TOLERANCE * scale
     deviations = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     correlations = matrices / (deviations[:, :, None] * deviations[:, None, :])
-    correlations[:, range(size), range(size)] = 1.0  # what has no variance is singular for itself alone
+    correlations[:, range(size), range(size)] = 1.0  # a component without variance is not singular
     yield SINGULAR, np.linalg.eigvalsh(correlations)[:, 0] < SINGULAR_BELOW

@@ -1,11 +1,11 @@
-"""Defines what a check finds: where, a sentence with its evidence, how severe it is, and its fix."""
+"""The result of a check: where, a sentence with the evidence, the severity, and the fix."""
 
 import warnings
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 Kind = Literal[
-    # Of a log: what it says without a filter.
+    # Of a log, found without a filter.
     "stamps",
     "lost messages",
     "gap",
@@ -50,7 +50,7 @@ Kind = Literal[
     "unused",
     "gates",
 ]
-# What the release before called them: in lint's findings, in a diagnosis' sentences, in alarms.
+# Names of the previous release: in lint's findings, in sentences of a diagnosis, in warnings.
 _OLD = {
     "words": "sentence",
     "mended": "sentence",
@@ -67,20 +67,20 @@ Severity = Literal["fact", "likely", "hint"]  # counted in the data; far from ch
 
 @dataclass(frozen=True)
 class Finding:
-    """Represents one thing that is wrong with a log, with a filter, or with what it estimates.
+    """One fault of a log, of a filter, or of its estimates.
 
     Attributes:
-        kind: what is wrong.
-        where: the topic or parameter; of a judged replay the estimator.
-        part: the field of the topic; of a judged replay the case.
-        value: by how much, in the words of the evidence: a factor, seconds, radians or a share; of a
-            judged replay how many times a number is beyond what a consistent filter leaves.
+        kind: kind of fault.
+        where: topic or parameter; for a judged replay the estimator.
+        part: field of the topic; for a judged replay the case.
+        value: size of the fault, as in the evidence: a factor, seconds, radians or a share; for a judged
+            replay the ratio of a number to the bound for a consistent filter.
         evidence: a sentence.
-        setting: what `--set` takes to undo it in a replay, such as `/fix.delay_s=0.3`; empty if nothing
-            does.
-        otherwise: what else to do, such as a line of the import's mapping.
+        setting: value for `--set` that corrects the fault in a replay, such as `/fix.delay_s=0.3`; empty
+            if there is none.
+        otherwise: another correction, such as a line of the import's mapping.
         severity: whether it is a fact, likely, or only a hint.
-        time_ns: when it began, if it began at some time.
+        time_ns: when it began, if known.
     """
 
     kind: Kind
@@ -95,19 +95,19 @@ class Finding:
 
     @property
     def fix(self) -> str:
-        """Return what to do, in words; empty if nothing is known."""
+        """Describe the correction; empty if none is known."""
         return " or ".join(filter(None, (self.setting and f"--set {self.setting}", self.otherwise)))
 
     @property
     def sentence(self) -> str:
-        """Return the evidence, with what to do."""
+        """Join the evidence and the correction."""
         return "; ".join(filter(None, (self.evidence, self.fix)))
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> object:
-            """Return what the release before called so, with a FutureWarning."""
-            if name == "cause":  # only what a likelihood names has one
+            """Return the attribute for a name of the previous release, with a FutureWarning."""
+            if name == "cause":  # only findings of a likelihood have one
                 return None
             if name not in _OLD:
                 raise AttributeError(f"'{type(self).__name__}' has no '{name}'")
@@ -120,10 +120,10 @@ class Finding:
 
     @property
     def as_json(self) -> dict[str, Any]:
-        """Return it as `--json` prints it, with the fix in words."""
+        """Return the finding as `--json` prints it, with the fix in words."""
         return {**asdict(self), "fix": self.fix}
 
 
 def digits(value: float) -> float:
-    """Return a number in four digits, as a setting states it."""
+    """Round a number to four digits, as a setting states it."""
     return float(f"{value:.4g}")

@@ -1,4 +1,4 @@
-"""Checks inertial samples: halves that were never measured, and which axis is up."""
+"""Checks of inertial samples: quantities that were never measured, and the axis that points up."""
 
 from collections.abc import Iterator, Mapping
 
@@ -16,7 +16,7 @@ MEASURED = {
     "turn_rate_radps": "turn rates",
     "magnetic_field_ut": "magnetic fields",
 }
-# Of the axis that is up, and its sign: roll, pitch, yaw that turn it to z.
+# For each axis that points up, and its sign: roll, pitch, yaw that rotate it to z.
 UPRIGHT = {
     (0, 1): (0, -90, 0),
     (0, -1): (0, 90, 0),
@@ -27,7 +27,7 @@ UPRIGHT = {
 
 
 def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose forces, turn rates or fields are exactly zero throughout, as no sensor's are."""
+    """Find units whose forces, turn rates or fields are exactly zero throughout, unlike any sensor's."""
     if stream.schema.full_name not in UNITS or len(stream) < FEWEST:
         return
     for field, what in MEASURED.items():
@@ -45,7 +45,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose z axis is not up at rest; not beside orientations, which may say so."""
+    """Find units whose z axis is not up at rest, in logs without orientations to explain it."""
     if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
         return
     if any(_turns(each) for each in streams.values()):
@@ -86,5 +86,5 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _turns(stream: Stream) -> bool:
-    """Tell whether a topic says how a body is turned in space."""
+    """Test whether a topic states how a body is oriented in space."""
     return "quaternion" in stream.columns or "quaternion" in stream.metadata.get("kinds", "")

@@ -1,4 +1,4 @@
-"""Checks for what cannot be: infinite values, stamps years apart, topics without a common time."""
+"""Checks for impossible data: infinite values, stamps years apart, topics without a common time."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,11 +10,11 @@ from fuselog.recorders.checks.losses import FEWEST
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.impossible import TIMELESS, YEAR_NS, impossible
 
-TINIEST = float(np.finfo(np.float64).tiny)  # of the numbers that have all digits
+TINIEST = float(np.finfo(np.float64).tiny)  # the smallest number with full precision
 
 
 def beyond(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find values that are infinite, or far beyond what their unit can be."""
+    """Find values that are infinite, or far beyond the limit of their unit."""
     for each in impossible(stream):
         yield _finding(
             stream,
@@ -27,7 +27,7 @@ def beyond(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def integers(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find numbers smaller than any that has all its digits, as integers whose bits are misread."""
+    """Find numbers too small for full precision, as when the bits of integers are read as doubles."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or column.dtype.kind != "f":
@@ -48,7 +48,7 @@ def integers(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps that are years from those of most messages, which are in `span_ns`."""
+    """Find stamps that are years away from those of most messages, which are in `span_ns`."""
     if span_ns is None or stream.schema.full_name in TIMELESS:
         return
     stamps_ns = stream.publish_time_ns
@@ -95,7 +95,7 @@ def apart(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def restated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a landmark, or a point of a body, that is stated at several places."""
+    """Find a landmark, or a point of a body, that is stated at several positions."""
     number = _NUMBERS.get(stream.schema.full_name)
     if number is None or len(stream) < 2:
         return

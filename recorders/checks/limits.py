@@ -1,4 +1,4 @@
-"""Checks physical limits: heights, positions, speeds between fixes, turns, and dates."""
+"""Checks of physical limits: heights, positions, speeds between fixes, turns, and dates."""
 
 from collections.abc import Iterator, Mapping
 
@@ -15,7 +15,7 @@ FEWEST = 10
 HIGHEST_M, LOWEST_M = 50_000.0, -12_000.0
 ZERO_DEG = 0.01  # around latitude and longitude 0, where there is only sea
 FASTEST_MPS, FARTHEST_M = 1500.0, 1000.0
-ZIGZAG = 5.0  # by how much a step is longer than two together
+ZIGZAG = 5.0  # ratio of a step to the displacement over two steps
 SIDEWAYS_MPS2, SLOWEST_MPS = 10.0, 1.0
 LEGS, BENT_RAD = 10, 0.5
 EARLIEST_NS, LATEST_NS = 31_536_000 * 10**9, 946_684_800 * 10**9  # 1971 and 2000
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 
 def heights(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find altitudes that no receiver has, as of mm read as m."""
+    """Find impossible altitudes, as when mm are read as m."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     known = stream["altitude_m"][np.isfinite(stream["altitude_m"])]
@@ -44,14 +44,14 @@ def heights(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find fixes that are all close to latitude and longitude 0, as of degrees scaled once too often."""
+    """Find fixes that are all close to latitude and longitude 0, as when degrees are scaled twice."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     latitude, longitude = (np.abs(stream[name]) for name in ("latitude_deg", "longitude_deg"))
     if len(stream) < FEWEST or max(np.nanmedian(latitude), np.nanmedian(longitude)) > ZERO_DEG:
         return
     if np.all(latitude == 0) and np.all(longitude == 0):
-        return  # told as places without a fix
+        return  # reported as positions without a fix
     yield _found(
         stream,
         "latitude_deg",
@@ -64,7 +64,7 @@ def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find steps between fixes that nothing is fast enough for, and fixes that go to and fro."""
+    """Find impossibly fast steps between fixes, and fixes that alternate between two positions."""
     if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
         return
     order = np.argsort(stream.publish_time_ns, kind="stable")
@@ -103,14 +103,14 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _noise_m(places: Floats) -> float:
-    """Return how far fixes scatter about a straight line of every second one."""
+    """Estimate the scatter of fixes about straight lines, from every second fix."""
     every = places[::2]
     bend = every[2:] - 2.0 * every[1:-1] + every[:-2]
     return float(np.median(np.linalg.norm(bend, axis=1)) / np.sqrt(6.0)) if len(bend) else np.inf
 
 
 def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find headings that turn faster than the speed of the fixes allows, as of another unit."""
+    """Find headings that turn faster than the speed of the fixes allows, as in a wrong unit."""
     if stream.schema.full_name != schemas.ORIENTATION.full_name or len(stream) < FEWEST:
         return
     speed = max((_speed(other) for other in streams.values()), default=0.0)
@@ -143,7 +143,7 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _bent(stream: Stream) -> float:
-    """Return between which courses (rad) the legs of fixes are, 0 for another topic."""
+    """Return the range of courses (rad) of the legs between fixes; 0 for other topics."""
     if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
         return 0.0
     places = _places(stream)[np.linspace(0, len(stream) - 1, LEGS + 1).astype(int)]
@@ -152,7 +152,7 @@ def _bent(stream: Stream) -> float:
 
 
 def _speed(stream: Stream) -> float:
-    """Return the median speed of fixes in m/s, 0 for another topic."""
+    """Return the median speed of fixes in m/s; 0 for other topics."""
     if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
         return 0.0
     moved = np.linalg.norm(np.diff(_places(stream), axis=0), axis=1)
@@ -162,7 +162,7 @@ def _speed(stream: Stream) -> float:
 
 
 def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps before 2000 that do not count from 1970, days that leap by months, and zones."""
+    """Find stamps before 2000 that do not count from 1970, days in steps of months, and zones."""
     first_ns, last_ns = int(stream.publish_time_ns.min()), int(stream.publish_time_ns.max())
     if EARLIEST_NS < first_ns < LATEST_NS:
         yield _stamps(
@@ -200,12 +200,12 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _day(time_ns: int | NDArray[np.int64]) -> NDArray[np.datetime64]:
-    """Return the days of stamps in UTC."""
+    """Convert stamps to days in UTC."""
     return np.asarray(time_ns).astype("datetime64[ns]").astype("datetime64[D]")
 
 
 def _places(stream: Stream) -> Floats:
-    """Return places (n, 2) in m."""
+    """Return positions (n, 2) in m."""
     if stream.schema.full_name == schemas.POSITION_FIX.full_name:
         return np.asarray(stream["position_m"][:, :2])
     return local_metres(stream["latitude_deg"], stream["longitude_deg"])

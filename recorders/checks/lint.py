@@ -1,4 +1,4 @@
-"""Asks the checks of a log in their table, portion by portion, so that memory is bounded."""
+"""The checks of a log in tables, applied portion by portion so that memory is bounded."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
@@ -25,12 +25,12 @@ from fuselog.recorders.log import Stream
 from fuselog.recorders.log.impossible import main_span, possible
 from fuselog.recorders.log.streams import concatenate
 
-MOST = 1 << 19  # messages of a portion
+MOST = 1 << 19  # messages in a portion
 BLOCK = 1 << 16
 
-OfTopic = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]  # a topic, beside all of them
+OfTopic = Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]  # a topic, with all topics
 OfMotion = Callable[[BodyMotion], Iterator[Finding]]  # topics of one body, compared in pairs
-# The checks by what they look at, in the order in which findings are named.
+# The checks by the data that they use, in the order in which findings are listed.
 OF_ALL_MESSAGES: tuple[OfTopic, ...] = (impossible.beyond, impossible.integers)
 OF_STAMPS: tuple[OfTopic, ...] = (losses.losses, losses.silences, losses.repeats)
 OF_MOTION: tuple[OfMotion, ...] = (
@@ -80,7 +80,7 @@ OF_TOPIC: tuple[OfTopic, ...] = (
 
 
 def compared(streams: Mapping[str, Stream]) -> list[Finding]:
-    """Return what topics say of their stamps, and compared with others of the same body."""
+    """Check stamps of topics, and compare topics of the same body in pairs."""
     found = list(_asked(OF_STAMPS, streams))
     for body in bodies(streams):
         motion = BodyMotion(body)
@@ -96,19 +96,19 @@ def lint(
     span_ns: tuple[int, int] | None = None,
     portions: int | None = None,
 ) -> list[Finding]:
-    """Return what is wrong with a log, of blocks that follow one another in time; hints stand last.
+    """Check a log, given as blocks that follow one another in time; hints come last.
 
-    Every portion of some `MOST` messages is checked by itself, and what is found in several is said
-    once, of the first. Topics are compared in pairs in the first portion alone.
+    Every portion of about `MOST` messages is checked separately, and a finding in several portions is
+    reported once, for the first. Topics are compared in pairs only in the first portion.
 
     Args:
-        blocks: streams by topic; estimates are not looked at.
-        span_ns: of most messages of the log, if others are years from them; see `main_span_of`. Without
-            it, of most of each portion.
-        portions: how many portions to look at; all without it.
+        blocks: streams by topic; estimates are ignored.
+        span_ns: span of most messages of the log, if others are years away, see `main_span_of`; by
+            default that of each portion.
+        portions: number of portions to check; by default all.
 
     Returns:
-        The findings, the worst first; none of a log without a fault: thresholds are far from chance.
+        The findings, the worst first; empty for a log without faults: thresholds are far from chance.
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
     for index, whole in enumerate(islice(_portions(blocks), portions)):
@@ -116,7 +116,7 @@ def lint(
         cleared = {topic: possible(stream, most_ns)[0] for topic, stream in whole.items()}
         streams = {topic: stream for topic, stream in cleared.items() if len(stream)}
         of_stamps = compared(streams) if not index else list(_asked(OF_STAMPS, streams))
-        # what is left out for its values is not lost
+        # messages left out because of their values are not lost
         of_stamps = [
             each
             for each in of_stamps
@@ -142,7 +142,7 @@ def _asked(
 
 
 def _portions(blocks: Iterable[Mapping[str, Stream]]) -> Iterator[dict[str, Stream]]:
-    """Join blocks until they have `MOST` messages, without estimates and topics that are empty."""
+    """Join blocks until they have `MOST` messages, without estimates and empty topics."""
     parts: dict[str, list[Stream]] = {}
     count = 0
     for block in blocks:

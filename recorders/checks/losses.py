@@ -1,4 +1,4 @@
-"""Checks stamps, topic by topic: messages that are lost or there twice, silences, clocks that drift."""
+"""Checks of stamps, topic by topic: lost and duplicate messages, silences, clocks that drift."""
 
 from collections.abc import Iterator, Mapping
 
@@ -9,18 +9,17 @@ from fuselog.recorders.checks.finding import Finding, digits
 from fuselog.recorders.log import Stream, schemas
 
 FEWEST = 50
-LOST, GAPS = 0.1, 0.01  # of the messages
-REGULAR, TOLERANCE = 0.8, 0.2  # of the steps that are a multiple of the usual one, and by how near
-FACT = 1e-3  # of a clock's rate
+LOST, GAPS = 0.1, 0.01  # share of the messages
+REGULAR = 0.8  # share of the steps that are multiples of the usual one
+TOLERANCE = 0.2  # deviation of a step from a multiple
+FACT = 1e-3  # deviation of a clock's rate
 LONG_S = 10.0
 SILENT = 20.0  # usual steps
-PAUSES = 0.95  # of the steps
+PAUSES = 0.95  # quantile of the steps
 FEWEST_BURSTS = 20
-RARE = (
-    1e-3  # expected number of steps as long, below which a sensor saw nothing rather than lost messages
-)
-MOST_LOST = 0.6  # where more lacks, the stamps are of a clock's ticks, and no rate
-# What comes regularly: what sees targets is silent where there are none.
+RARE = 1e-3  # expected number of equally long steps: fewer mean that a sensor saw nothing
+MOST_LOST = 0.6  # if more are missing, stamps are ticks of a clock without a rate
+# Topics that should be regular; sensors of targets are silent without targets.
 REGULARS = {
     each.full_name
     for each in (
@@ -39,7 +38,7 @@ REGULARS = {
 
 
 def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find messages missing from a regular row of stamps, except in silences and stated outages."""
+    """Find messages missing from a regular sequence of stamps, except in silences and stated outages."""
     begin_ns, steps_s = _steps(stream, streams)
     if len(steps_s) < FEWEST:
         return
@@ -51,7 +50,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     is_gap = steps_s > 1.5 * np.median(steps_s)
     is_gap |= is_regular & (multiples > 1) & (np.median(multiples) > 1)
     is_sure = stream.schema.full_name in REGULARS
-    if not is_sure:  # messages lost one by one explain no step as long as when nothing is seen
+    if not is_sure:  # independently lost messages cannot explain the steps in which nothing is seen
         is_likely = len(steps_s) * np.mean(is_gap) ** np.maximum(multiples - 1.0, 0.0) >= RARE
         begin_ns, steps_s, is_regular, is_gap = (
             each[is_likely] for each in (begin_ns, steps_s, is_regular, is_gap)
@@ -79,7 +78,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find the longest silence, except of what sees targets and in outages that the log states."""
+    """Find the longest silence, except of sensors of targets and in outages that the log states."""
     begin_ns, steps_s = _steps(stream, streams)
     if len(steps_s) < FEWEST or "target_id" in stream.columns:
         return
@@ -101,7 +100,7 @@ def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]
 
 
 def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find measurements that are there twice; events may be alike, and what one scan detects."""
+    """Find duplicate measurements; events, and detections of one scan, may be equal."""
     if "scan_id" in stream.columns or not is_measured(stream):
         return
     same = np.diff(stream.publish_time_ns) == 0
@@ -124,7 +123,7 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def is_measured(stream: Stream) -> bool:
-    """Tell whether messages are measurements and not the truth, or events without numbers."""
+    """Test whether messages are measurements, and not the truth or events without numbers."""
     is_number = any(each.kind in ("real", "vector") for each in stream.schema)
     return is_number and stream.schema.full_name != schemas.TRUTH_STATE.full_name
 
@@ -132,7 +131,7 @@ def is_measured(stream: Stream) -> bool:
 def _steps(
     stream: Stream, streams: Mapping[str, Stream]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return where the steps of measurements begin, and their seconds, outside of outages."""
+    """Return the beginnings of steps between measurements, and their lengths in s, without outages."""
     stamps_ns = np.unique(stream.publish_time_ns) if is_measured(stream) else np.empty(0, np.int64)
     steps_s = np.diff(stamps_ns) * 1e-9
     begin_ns = stamps_ns[:-1]
@@ -145,7 +144,7 @@ def _steps(
 
 
 def _pause_s(steps_s: NDArray[np.float64]) -> float:
-    """Return the usual step, or the pause between bursts, as of ranges to many anchors."""
+    """Return the usual step, or the pause between bursts, such as ranges to many anchors."""
     return float(np.quantile(steps_s, PAUSES))
 
 
@@ -154,13 +153,13 @@ def _since(stream: Stream, time_ns: int) -> str:
 
 
 def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
-    """Tell whether gaps come after as many messages each time, as between bursts of a sensor."""
+    """Test whether gaps separate bursts with equal numbers of messages."""
     counts = np.diff(np.flatnonzero(is_gap))
     return len(counts) >= FEWEST_BURSTS and bool(np.mean(counts == np.median(counts)) > REGULAR)
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find topics' clocks that run otherwise than the recorder's: all alike, as simulated, or one."""
+    """Find clocks of topics that differ from the recorder's: all alike, as in simulations, or one."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }
@@ -192,7 +191,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """Return how long 1 s of a topic's stamps lasts for the recorder; None where that cannot be told."""
+    """Return how long 1 s of a topic's stamps lasts for the recorder; None if this is uncertain."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

@@ -1,4 +1,4 @@
-"""Checks magnetic fields: their unit, and iron on board, by the circle of a full turn."""
+"""Checks of magnetic fields: unit, and iron on board, by the circle of a full turn."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -14,15 +14,15 @@ FIELD = "magnetic_field_ut"
 FEWEST = 50
 EARTH_UT = (22.0, 67.0)
 UNITS_UT = {"G": 100.0, "T": 1e6, "mT": 1e3, "mG": 0.1, "nT": 1e-3}
-SECTORS = 12  # of a turn, each of which has to be seen
-FLAT = 0.05  # of the second spread, that the third may be of a turn about one axis
-ROUNDING = 1e-6  # of the radius: less is no offset
+SECTORS = 12  # sectors of a turn, which all have to be covered
+FLAT = 0.05  # largest ratio of the third spread to the second, in a turn about one axis
+ROUNDING = 1e-6  # relative to the radius: smaller offsets are ignored
 HARD, SOFT = 0.2, 1.1  # the centre in radii; the ratio of the axes
-SCATTER = 0.1  # about the ellipse, of the radius
+SCATTER = 0.1  # about the ellipse, relative to the radius
 
 
 def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find fields that are the Earth's in another unit, or in none."""
+    """Find fields that are the Earth's field in another unit, or in none."""
     field = _field(stream)
     if field is None:
         return
@@ -82,7 +82,7 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 class Ellipse(NamedTuple):
-    """Describes what a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
+    """The path of a field in a turn: its centre (3,), mean radius and ratio of axes."""
 
     centre: Floats
     radius: float
@@ -90,7 +90,7 @@ class Ellipse(NamedTuple):
 
 
 def ellipse(field: Floats) -> Ellipse | None:
-    """Fit the ellipse of a full turn about one axis, by least squares; None where no turn is whole."""
+    """Fit the ellipse of a full turn about one axis, by least squares; None without a full turn."""
     mean = field.mean(axis=0)
     spreads, axes = np.linalg.eigh(np.cov((field - mean).T))
     if spreads[1] <= 0.0 or spreads[0] > FLAT * spreads[1]:
@@ -119,7 +119,7 @@ def ellipse(field: Floats) -> Ellipse | None:
 
 
 def _field(stream: Stream) -> Floats | None:
-    """Return the fields (n, 3) that are known, where they are enough."""
+    """Return the known fields (n, 3), or None if there are too few."""
     known = {schemas.INERTIAL_SAMPLE.full_name, schemas.MAGNETIC_FIELD.full_name}
     if stream.schema.full_name not in known or stream[FIELD].shape[1] != 3:
         return None

@@ -1,6 +1,6 @@
-"""Compares a body's topics in pairs: what lags behind what, by which factor or angle they differ.
+"""Comparisons of a body's topics in pairs: their lags, and the factors or angles between them.
 
-Lags come first: what is 18 s late turns the other way.
+Lags come first: a topic that is 18 s late seems to turn in the wrong direction.
 """
 
 from collections.abc import Iterator
@@ -28,19 +28,19 @@ from fuselog.recorders.models.orientation import heading
 from fuselog.recorders.models.planar import wrap_angle
 
 LEAST_LAG_S = 0.15
-LONG_S = 1.0  # a lag that no body makes whose course is not where it heads
-CHORD = 1.3  # of the variance that `noise_of` finds: what noise adds to the square of a chord
-ALIKE, PLAIN = 0.8, 0.95  # correlations; the latter where the course need not be the heading
+LONG_S = 1.0  # a lag too long to be due to a course that differs from the heading
+CHORD = 1.3  # ratio of what noise adds to a squared chord to the variance from `noise_of`
+ALIKE, PLAIN = 0.8, 0.95  # correlations; the second if the course may differ from the heading
 
 
 class Slope(NamedTuple):
-    """States what one topic says of windows, as a multiple of what another says.
+    """What one topic says of windows, as a multiple of what another says.
 
     Attributes:
         value: the multiple, by least squares through zero.
-        likeness: the correlation about zero; zero if the multiple is that of few windows only.
-        spread: how much single windows differ from that, of its size; infinite if it is of few.
-        windows: how many there are.
+        likeness: correlation about zero; zero if a few windows determine the multiple.
+        spread: relative difference of single windows from it; infinite if a few windows determine it.
+        windows: number of windows.
     """
 
     value: float
@@ -50,20 +50,20 @@ class Slope(NamedTuple):
 
     @property
     def sign(self) -> int:
-        """Return 1 or -1, or 0 where the two are not alike."""
+        """Return 1 or -1, or 0 if the topics do not correlate."""
         is_clear = self.windows >= FEWEST and abs(self.likeness) > ALIKE
         return int(np.sign(self.value)) if is_clear else 0
 
 
 def slope(x: Floats, y: Floats) -> Slope:
-    """Compute the slope of y on x through zero, over windows where both are known.
+    """Compute the slope of y on x through zero, over windows in which both are known.
 
     Args:
-        x: (k,), NaN where it is not known.
-        y: (k,), as x.
+        x: (k,), NaN if unknown.
+        y: (k,), NaN if unknown.
 
     Returns:
-        The slope; its value is NaN where fewer than `FEWEST` windows are known, or x or y is zero.
+        The slope; its value is NaN if fewer than `FEWEST` windows are known, or x or y is zero.
     """
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
@@ -81,12 +81,11 @@ def slope(x: Floats, y: Floats) -> Slope:
 def usual_slope(x: Floats, y: Floats) -> float:
     """Compute the slope of y on x through zero by least absolute deviations.
 
-    It is the median of y / x under the weights |x| (Laplace), so that few windows, however far off, do
-    not decide it.
+    It is the median of y / x with the weights |x| (Laplace), so that a few outliers do not determine it.
 
     Args:
-        x: (k,), known.
-        y: (k,), known.
+        x: (k,), finite.
+        y: (k,), finite.
 
     Returns:
         The slope; NaN if all x are zero.
@@ -101,17 +100,17 @@ def usual_slope(x: Floats, y: Floats) -> float:
 
 
 def _agree(value: float, usual: float) -> bool:
-    """Tell whether least squares and most windows say about the same."""
+    """Test whether least squares and the usual slope agree approximately."""
     return bool(ALIKE * abs(value) <= np.sign(value) * usual <= abs(value) / ALIKE)
 
 
 def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Compute by what angle a turn rate says that one turns in windows.
+    """Compute the angle of turns in windows according to a turn rate.
 
     Args:
         source: the turn rate in rad/s.
-        begin_s: (k,), where the windows begin.
-        end_s: (k,), where they end.
+        begin_s: (k,), beginnings of the windows, in s.
+        end_s: (k,), ends of the windows, in s.
 
     Returns:
         (k,), in rad; NaN beyond the rate's stamps.
@@ -120,7 +119,7 @@ def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 class Lag(NamedTuple):
-    """Holds one topic beside another that it was compared with, which is later by the lag."""
+    """A topic, another one that it was compared with, and how much later that one is."""
 
     source: str
     against: str
@@ -128,17 +127,17 @@ class Lag(NamedTuple):
 
 
 class BodyMotion:
-    """Holds a body, and what comparing its topics in pairs tells."""
+    """A body, and the results of comparing its topics in pairs."""
 
     def __init__(self, body: Body) -> None:
         self.body = body
         self.places = places_of(body)
         self.courses = courses(body)
-        self.turn_span_s = 1.0 if body.velocities else 2.0  # places need longer ones
+        self.turn_span_s = 1.0 if body.velocities else 2.0  # positions need longer ones
 
     @cached_property
     def speed_lags(self) -> list[Lag]:
-        """Return the lags of speeds and velocities, beside places."""
+        """Compute the lags of speeds and velocities behind positions."""
         if self.places is None or (windows := distances(self.places, 1.0)) is None:
             return []
         return list(self._lags(windows, self.places.topic))
@@ -151,7 +150,7 @@ class BodyMotion:
 
     @cached_property
     def turn_lags(self) -> list[Lag]:
-        """Return the lags of turn rates, beside courses."""
+        """Compute the lags of turn rates behind courses."""
         if self.courses is None:
             return []
         windows = turned(self.courses, 1.0)
@@ -164,9 +163,9 @@ class BodyMotion:
 
     @cached_property
     def delays_s(self) -> dict[str, float]:
-        """Return how late each topic's stamps are beside the most of them, where that is sure.
+        """Compute how late each topic's stamps are compared with most topics, if this is certain.
 
-        Of two topics the later one is late: messages come late, and never early.
+        Of two topics, the later one is late: messages are late, never early.
         """
         late_s: dict[str, float] = {}
         if self.places is not None and self.speed_lags:
@@ -175,7 +174,7 @@ class BodyMotion:
                 late_s[each.source] = -_sure_lag_s(each.timing)
         for each in self.turn_lags:
             if each.source in late_s:
-                continue  # its speeds tell more
+                continue  # its speeds are more informative
             late_s.setdefault(each.against, 0.0)
             own_s = late_s[each.against] - _sure_lag_s(each.timing)
             nearest_s = min(late_s.values(), key=lambda other_s: abs(own_s - other_s))
@@ -190,7 +189,7 @@ class BodyMotion:
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
     def goes_where_it_points(self, lag: Lag) -> bool:
-        """Tell whether forces in the body's axes are those of its course: then course is heading."""
+        """Test by forces in the body's axes whether the course is the heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
                 found = self.forces(force.moved(-lag.timing.lag_s))
@@ -199,11 +198,11 @@ class BodyMotion:
 
     @cached_property
     def gains(self) -> dict[str, float]:
-        """Return how many seconds a second the clocks of topics gain beside that of the places."""
+        """Return the gain in s/s of topics' clocks relative to that of the positions."""
         return {each.source: each.timing.gain for each in self.speed_lags if each.timing.gain}
 
     def aligned(self, source: Series) -> Series:
-        """Return a topic on the clock of the places, or of the courses where it has no other."""
+        """Shift a topic to the clock of the positions, or of the courses."""
         for each in (*self.speed_lags, *self.turn_lags):
             if each.source == source.topic:
                 late_s = self.delays_s.get(each.source, 0.0) - self.delays_s.get(each.against, 0.0)
@@ -213,13 +212,13 @@ class BodyMotion:
         return source
 
     def timed(self, source: Series) -> Series:
-        """Return a topic on the clock that most topics have."""
+        """Shift a topic to the clock that most topics have."""
         if source.topic in self.gains:
             return self.aligned(source)
         return source.moved(self.delays_s.get(source.topic, 0.0))
 
     def likened(self, source: Series) -> Series:
-        """Return a turn rate on the clock by which it is most like the course, be it a delay or not."""
+        """Shift a turn rate to the clock at which it agrees best with the course, delay or not."""
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
@@ -229,7 +228,7 @@ class BodyMotion:
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
-        """Return how far places move for each metre of a speed or velocity."""
+        """Compute how far positions move for each metre of a speed or velocity."""
         if self.places is None or source.topic == self.places.topic:
             return None
         if (moved := clear_moves(self.places)) is None:
@@ -238,7 +237,7 @@ class BodyMotion:
         found = slope(
             travelled(aligned, moved.begin_s, moved.end_s), np.linalg.norm(moved.values, axis=1)
         )
-        # windows were chosen by how far places moved: all of them have to say the same
+        # the windows were selected by the motion of positions, so all windows have to agree
         every = chords(self.places, float(np.median(moved.end_s - moved.begin_s)))
         distances = travelled(aligned, every.begin_s, every.end_s)
         known = np.isfinite(distances)
@@ -247,10 +246,10 @@ class BodyMotion:
         return found if _agree(found.value, usual) else found._replace(likeness=0.0, spread=np.inf)
 
     def turn(self, source: Series) -> Slope | None:
-        """Return how much the course turns for each radian of a turn rate.
+        """Compute how much the course turns for each radian of a turn rate.
 
-        One that is like the course as it is needs no lag: half a period of a winding road is none. If
-        several lags fit better than none, of which some turn it round, its sign is not known.
+        If it correlates with the course as it is, no lag is needed: half a period of a winding road is
+        not a lag. If several lags fit better, some with opposite signs, the sign is unknown.
         """
         if self.courses is None:
             return None
@@ -264,13 +263,13 @@ class BodyMotion:
         return ratio if is_known else None
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
-        """Return how much a heading turns for each radian of a turn rate."""
+        """Compute how much a heading turns for each radian of a turn rate."""
         angles = Series("", "", orientation.times_s, heading(orientation.values))
         windows = turned(angles, self.turn_span_s)
         return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
 
     def heading_course(self, orientation: Series) -> Slope | None:
-        """Return how much a heading turns for each radian of the course."""
+        """Compute how much a heading turns for each radian of the course."""
         if self.courses is None:
             return None
         windows = turned(self.timed(self.courses), self.turn_span_s)
@@ -278,7 +277,7 @@ class BodyMotion:
         return slope(windows.values, end - begin)
 
     def heading_offsets(self, orientation: Series) -> Floats:
-        """Return by how much headings (k,) exceed the course where the body moves clearly, also back."""
+        """Compute headings (k,) minus course while the body moves clearly, forward or backward."""
         if self.courses is None:
             return np.empty(0)
         course = self.timed(self.courses)
@@ -290,7 +289,7 @@ class BodyMotion:
         return wrap_angle(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
-        """Compute how horizontal forces fit changes of the velocity; None where these tell nothing."""
+        """Compute how horizontal forces fit changes of the velocity; None if this is impossible."""
         if not self.body.velocities or self.courses is None:
             return None
         velocity = self.body.velocities[0]
@@ -323,19 +322,19 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 
     Args:
         orientation: quaternions (n, 4).
-        times_s: (k,), the other times.
+        times_s: (k,), the other times, in s.
 
     Returns:
-        (k,), in rad, not wrapped; NaN beyond the first and the last.
+        (k,), in rad, not wrapped; NaN before the first and after the last.
     """
     angle = np.unwrap(heading(orientation.values))
     return np.interp(times_s, orientation.times_s, angle, left=np.nan, right=np.nan)
 
 
 class Forces(NamedTuple):
-    """States by what angle (rad) horizontal forces are to be turned to be those of the course.
+    """The angle (rad) that rotates horizontal forces to those of the course.
 
-    `fit` is how well they then do, up to 1, and `mirrored` how well their mirror image would.
+    `fit` is how well they then match, up to 1, and `mirrored` how well their mirror image would.
     """
 
     angle_rad: float
@@ -344,13 +343,13 @@ class Forces(NamedTuple):
 
 
 def _hold_s(source: Series) -> float:
-    """Return what may be how a topic is meant: half a step held, or the mean of the step before."""
+    """Return the delay that the definition of a topic may imply: half a step, or a full one."""
     step_s = float(np.median(np.diff(source.times_s)))
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 
 
 def _sure_lag_s(lag: Timing) -> float:
-    """Return the lag where it is one; a clock that gains has none."""
+    """Return the lag if it is certain, else zero; a clock that gains has no lag."""
     is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
     is_sure = lag.is_alone and lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
     return lag.lag_s if is_lag and is_sure else 0.0

@@ -1,4 +1,4 @@
-"""Checks names: frames by REP 103, units there twice by REP 145, topics alone in their namespace."""
+"""Checks of names: frames by REP 103, duplicate units by REP 145, topics alone in their namespace."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,7 @@ SUFFIX = re.compile(r"_(ned|frd)$", re.IGNORECASE)
 
 
 def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find frames that their own name says to be NED or FRD, where REP 103 has ENU and FLU."""
+    """Find frames named NED or FRD, unlike the ENU and FLU of REP 103."""
     for key in ("frame_id", "child_frame_id"):
         found = SUFFIX.search(stream.metadata.get(key, ""))
         if found:
@@ -33,7 +33,7 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find inertial units that are there raw and, by REP 145, again with an orientation."""
+    """Find inertial units that are recorded raw and, by REP 145, again with an orientation."""
     raw = streams.get(stream.topic.replace("/data", "/data_raw"))
     is_unit = stream.schema.full_name == schemas.INERTIAL_SAMPLE.full_name
     if not is_unit or raw is None or raw is stream or raw.schema is not stream.schema:
@@ -51,7 +51,7 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find of two topics of one message the one alone in its namespace, which replay may leave out."""
+    """Find a topic alone in its namespace that duplicates another one, so that replay may ignore it."""
     sensed = [each for each in streams.values() if each.schema.full_name in REGULARS]
     alike = [each for each in sensed if each.schema.full_name == stream.schema.full_name]
     if stream.schema.full_name not in REGULARS or len(alike) != 2:

@@ -1,4 +1,4 @@
-"""Checks places: latitudes and longitudes that are none, or exchanged, and heights."""
+"""Checks of positions: impossible or swapped latitudes and longitudes, and heights."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -11,18 +11,18 @@ from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.checks.motion import BodyMotion, Slope
 from fuselog.recorders.log import Stream, schemas
 
-GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
+GEOID_M = (5.0, 110.0)  # usual difference of heights above the ellipsoid and the sea
 STEADY_M = 5.0
 INTEGER = 1e6
 BETTER = 3.0
-CLEAR = 0.02  # of a spread, above which an exchange is worth trying
+CLEAR = 0.02  # spread above which a swap is tried
 SCALE = (0.9, 1.1)
 CLIMB_M, MIRRORED = 2.0, -0.9
 FEWEST = 20
-LEAP_M, CLIMB_MPS = 15.0, 100.0  # what climbs faster has an engine for it
-ABRUPT, CLIMB_MPS2 = 0.1, 30.0  # of a leap between fixes that climb by so little of it
-ALIKE = 0.03  # of a metre of the wheels
-# What degrees are that were read in another unit, by what they are read as.
+LEAP_M, CLIMB_MPS = 15.0, 100.0  # faster climbs are not usual
+ABRUPT, CLIMB_MPS2 = 0.1, 30.0  # share of a leap by which neighbouring fixes climb at most
+ALIKE = 0.03  # per metre of the wheels
+# How degrees change if they were read in another unit.
 _READ_AS: dict[str, Callable[[NDArray], NDArray]] = {
     "semicircles read as 1e-7 deg": lambda degrees: degrees * 1e7 * 180 / 2**31,
     "1e-7 deg read as semicircles": lambda degrees: degrees * 1e-7 * 2**31 / 180,
@@ -33,7 +33,7 @@ _READ_AS: dict[str, Callable[[NDArray], NDArray]] = {
 
 
 def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes and longitudes beyond their range, in integers, or at 0, 0."""
+    """Find latitudes and longitudes beyond their range, as integers, or at 0, 0."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     latitude, longitude = stream["latitude_deg"], stream["longitude_deg"]
@@ -75,7 +75,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes that are longitudes, by how far the wheels come."""
+    """Find swapped latitudes and longitudes, by the distance according to the wheels."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     if np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]])) > 90.0:
@@ -103,7 +103,7 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
 
 
 def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find altitudes that leap as nothing climbs, such as where they change what they are above."""
+    """Find altitudes that leap faster than anything climbs, as when their reference changes."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     rows = np.flatnonzero(np.isfinite(stream["altitude_m"]))
@@ -131,7 +131,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes and longitudes in another unit, by which fixes move as far as the wheels say."""
+    """Find latitudes and longitudes in another unit, by the distance according to the wheels."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     as_is = _wheels(streams, stream)
@@ -161,7 +161,7 @@ def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find heights above the sea beside ones above the ellipsoid, and a z that points down."""
+    """Find heights above the sea next to others above the ellipsoid, and a z axis that points down."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     if not np.isfinite(stream["altitude_m"]).all():

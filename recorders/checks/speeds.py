@@ -1,4 +1,4 @@
-"""Checks when topics speak, and how far they say that a body comes."""
+"""Checks of the timing of topics, and of the distances that they imply."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -11,20 +11,20 @@ from fuselog.recorders.checks.motion import LONG_S, BodyMotion
 from fuselog.recorders.checks.windows import JUMP, jumps, travelled
 from fuselog.recorders.units import mistaken
 
-NEAR = 0.05  # of a factor
-SCALE = (0.8, 1.25)  # what a metre of a speed may move places by
+NEAR = 0.05  # tolerance of a factor
+SCALE = (0.8, 1.25)  # acceptable motion of positions per metre of a speed
 SPREAD = 0.25
 LEAP_S = {18.0: "GPS time runs 18 s ahead of UTC since 2017"}
 LEAP_TOLERANCE_S = 0.6
-LEAPED = 2.0  # of what a speed moves between nearly all fixes: beyond it, the body may have moved
-REST = 0.05  # of the larger speeds
+LEAPED = 2.0  # times the motion between nearly all fixes: beyond it, the body may have moved
+REST = 0.05  # share of the larger speeds
 FEWEST_AT_REST = 10
-TAIL_SIGMAS = 3.2905  # beyond which, to each side, a Gaussian is in .0005 of all cases
-LEAST_RATIO = 1.5  # of variances, a difference that matters
+TAIL_SIGMAS = 3.2905  # exceeded on each side by a Gaussian in 0.0005 of all cases
+LEAST_RATIO = 1.5  # of variances: a difference that matters
 
 
 def leaps(motion: BodyMotion) -> Iterator[Finding]:
-    """Find places that jump while a speed says that the body moves as usual."""
+    """Find positions that jump while a speed says that the body moves as usual."""
     sources = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         steps_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)
@@ -56,7 +56,7 @@ def leaps(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def delays(motion: BodyMotion) -> Iterator[Finding]:
-    """Find topics that are later than others of the same body, by how speeds and turns lag."""
+    """Find topics that are later than others of the same body, by the lags of speeds and turns."""
     for topic, late_s in motion.delays_s.items():
         if not late_s:
             continue
@@ -65,7 +65,7 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
             for each in (*motion.speed_lags, *motion.turn_lags)
             if topic in (each.source, each.against)
         )
-        # a lever arm or slip lets the course change before or after the heading
+        # with a lever arm or slip, the course may change before or after the heading
         slips = lag in motion.turn_lags and not motion.goes_where_it_points(lag)
         spread_s = max(lag.timing.spread_s, LONG_S if slips else 0.0)
         leap_s = next((s for s in LEAP_S if abs(abs(late_s) - s) < LEAP_TOLERANCE_S), None)
@@ -84,7 +84,7 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def clocks(motion: BodyMotion) -> Iterator[Finding]:
-    """Find clocks that gain on others, by how speeds drift apart."""
+    """Find clocks that gain on others, by speeds that drift apart."""
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
         yield Finding(
@@ -99,7 +99,7 @@ def clocks(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def factors(motion: BodyMotion) -> Iterator[Finding]:
-    """Find speeds in other units, by how far places move."""
+    """Find speeds in other units, by how far positions move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
         ratio = motion.speed(source)
         if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:
@@ -134,7 +134,7 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rest(motion: BodyMotion) -> Iterator[Finding]:
-    """Find variances of fixes that their scatter at rest belies, where their errors are white."""
+    """Find variances of fixes that contradict their scatter at rest, if their errors are white."""
     moving = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         source = next((each for each in moving if each.topic != fixes.topic), None)
@@ -160,10 +160,10 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def scatter(fixes: PlaceSeries, source: Series) -> tuple[float, int, float] | None:
-    """Return how fixes scatter while a speed says that the body rests.
+    """Compute the scatter of fixes while a speed says that the body is at rest.
 
-    Returns the variance as a multiple of what is stated, its degrees of freedom, and the correlation of
-    an error with the next; None where the body does not rest, or no variance is stated.
+    Returns the variance as a multiple of the stated one, its degrees of freedom, and the correlation of
+    successive errors; None if the body does not rest, or no variance is stated.
     """
     half_s = max(0.5, 2.0 * float(np.median(np.diff(source.times_s))))
     moved = source.integral(fixes.times_s + half_s) - source.integral(fixes.times_s - half_s)
@@ -188,7 +188,7 @@ def scatter(fixes: PlaceSeries, source: Series) -> tuple[float, int, float] | No
 
 
 def _filled(values: Floats) -> Floats:
-    """Fill values (n,) that are not known at the ends with those next to them."""
+    """Fill unknown values (n,) at the ends with the nearest known ones."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return values
@@ -196,9 +196,9 @@ def _filled(values: Floats) -> Floats:
 
 
 def chance(degrees: int, sigmas: float) -> float:
-    """Return a quantile of chi-square over its degrees of freedom, by that of a Gaussian.
+    """Compute a quantile of chi-square over its degrees of freedom, from that of a Gaussian.
 
-    Wilson and Hilferty, PNAS 17, 1931: within 2 % from 18 degrees on.
+    Wilson and Hilferty, PNAS 17, 1931: accurate to 2 % from 18 degrees on.
     """
     part = 2.0 / (9.0 * degrees)
     return float((1.0 - part + sigmas * part**0.5) ** 3)

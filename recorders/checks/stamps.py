@@ -1,4 +1,4 @@
-"""Checks stamps: their unit, order, regularity, and how they stand to the recorder's clock."""
+"""Checks of stamps: unit, order, regularity, and relation to the recorder's clock."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,12 +10,12 @@ from fuselog.recorders.checks.losses import FEWEST, REGULARS, losses
 from fuselog.recorders.log import Stream, schemas
 
 YEAR_2100_NS = 4_102_444_800 * 10**9
-JITTER = 0.2  # of the usual step
-SLOWEST_HZ, FASTEST_HZ = 0.5, 2e4  # of inertial units
+JITTER = 0.2  # relative to the usual step
+SLOWEST_HZ, FASTEST_HZ = 0.5, 2e4  # for inertial units
 FASTEST_FIX_HZ = 500.0
 LEAP_TOLERANCE_S, ZONE_TOLERANCE_S = 0.6, 1.0
-FAR_H = 14  # that clocks of places are from UTC at most
-# Since when (Unix time in s) GPS time runs ahead of UTC by so many seconds.
+FAR_H = 14  # the largest difference of local clocks from UTC
+# How many seconds GPS time is ahead of UTC, by Unix time in s since when.
 GPS_LEAPS = {
     915148800: 13,
     1136073600: 14,
@@ -26,9 +26,9 @@ GPS_LEAPS = {
 }
 TAI_LESS_GPS_S = 19
 DRIFT, FACT = 1e-5, 1e-3
-AGAIN, FEW_FALLS = 100.0, 10  # usual steps that a clock falls by when it begins again, and how often
+AGAIN, FEW_FALLS = 100.0, 10  # least fall of a clock that was reset, in usual steps, and how often
 LONG_S, SURE = 100.0, 6.0
-# What a sensor's own clock drives; fixes and poses may come as they can be computed.
+# Topics that a sensor's own clock drives; fixes and poses may come when they can be computed.
 _CLOCKED = {
     schemas.INERTIAL_SAMPLE.full_name,
     schemas.MAGNETIC_FIELD.full_name,
@@ -43,7 +43,7 @@ _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schema
 
 
 def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps whose decade is another unit's: beyond 2100, or at a rate that no sensor has."""
+    """Find stamps in a wrong unit: beyond 2100, or at a rate that no sensor has."""
     last_ns = int(stream.publish_time_ns.max())
     if last_ns > YEAR_2100_NS:
         year = 1970 + last_ns / 1e9 / 31_556_952
@@ -77,7 +77,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps that go back between messages, and equal ones of what is measured once at a time."""
+    """Find stamps that go back between messages, and equal stamps of single measurements."""
     is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
     rows = np.argsort(stream.log_time_ns if is_late else stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
@@ -126,7 +126,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find steps that scatter, of what should be regular and loses nothing."""
+    """Find irregular steps of a topic that should be regular and has no losses."""
     if len(stream) < FEWEST or stream.schema.full_name not in _CLOCKED:
         return
     steps_s = 1e-9 * _steps_ns(stream)
@@ -144,7 +144,7 @@ def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps that are leap seconds or a time zone off the recorder's clock."""
+    """Find stamps that differ from the recorder's clock by leap seconds or a time zone."""
     ahead_s = _ahead_s(stream)
     name = _named_offset(ahead_s, int(stream.log_time_ns[0]) / 1e9)
     if not name or stream.schema.full_name == schemas.TRUTH_STATE.full_name:
@@ -169,7 +169,7 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a clock a little fast or slow, as most are; more than 1e-3 is told by `losses.drifts`."""
+    """Find a clock that is slightly fast or slow; `losses.drifts` reports more than 1e-3."""
     if len(stream) < FEWEST or np.array_equal(stream.publish_time_ns, stream.log_time_ns):
         return
     measured_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
@@ -195,7 +195,7 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:
-    """Return which thing (n,) every message is of, where another topic says so by row; else zeros."""
+    """Return the thing (n,) of every message, if another topic states it by row; else zeros."""
     for each in streams.values():
         is_named = each.schema.full_name == schemas.IDENTITY.full_name
         if is_named and np.array_equal(each.publish_time_ns, stream.publish_time_ns):
@@ -221,7 +221,7 @@ def _ahead_s(stream: Stream) -> float:
 
 
 def _named_offset(offset_s: float, unix_s: float) -> str:
-    """Name what differs by so many seconds at a time; empty where nothing does."""
+    """Name a known offset of this many seconds at a time; empty if there is none."""
     gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
     for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
         if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:

@@ -1,4 +1,4 @@
-"""Finds when a topic's account of a motion is most like another's: by delay, and clock's gain."""
+"""Search for the delay, and the clock's gain, at which a topic agrees best with another's motion."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,31 +8,33 @@ import numpy as np
 from fuselog.recorders.checks.body import Floats, Series
 from fuselog.recorders.checks.windows import FEWEST, Windows, thinned
 
-Account = Callable[[Series, Floats, Floats], Floats]  # of windows, from their begin to their end
+Account = Callable[
+    [Series, Floats, Floats], Floats
+]  # values for windows, given their beginnings and ends
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
-FEW = 100  # windows at least by which a lag or a clock is sought: more of them overlap by half
-NEAR_S = 1.0  # a lag within it is as likely as all that are longer
-SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
-MISFIT = 0.02  # share of a motion that lever arms, slip and bends may leave unexplained at the right lag
-CHANGES = 4  # passes of a motion through its mean; with fewer a lever arm may look like a delay
+FEW = 100  # least number of windows to search for a lag or a clock
+NEAR_S = 1.0  # lags below it are as likely as all longer ones
+SURE = 2.0  # evidence for a lag; it is too small, since neighbouring windows share a position
+MISFIT = 0.02  # share of a motion that lever arms and slip may leave unexplained at the right lag
+CHANGES = 4  # crossings of the mean; with fewer a lever arm may look like a delay
 TINY = float(np.finfo(float).tiny)
-VARIES = 1e-6  # of its size, which a motion has to vary by to tell a time
+VARIES = 1e-6  # relative variation that a motion needs to determine a time
 
 
 class Timing(NamedTuple):
-    """Says how a source fits windows in time.
+    """The fit of a source to windows in time.
 
     Attributes:
-        lag_s: the windows are later than the source by so much.
-        gain: so many seconds a second the clock of the source gains.
-        likeness: the correlation there, -1 to 1.
-        evidence: by how much the log-likelihood exceeds that without lag and gain.
+        lag_s: how much later the windows are than the source.
+        gain: gain of the source's clock, in s/s.
+        likeness: correlation at this lag and gain, -1 to 1.
+        evidence: log-likelihood minus that without lag and gain.
         is_needed: whether without a lag more than a misfit of the motion is left unexplained.
-        tolerance_s: up to which a lag counts as none.
-        spread_s: by how much lags that are as likely differ from it, with the tolerance.
-        is_alone: whether no lags but its neighbours explain the motion as well, as those do that are a
-            period of the motion away.
+        tolerance_s: lags up to this size are ignored.
+        spread_s: largest difference of equally likely lags, plus the tolerance.
+        is_alone: whether only neighbouring lags explain the motion as well, and none a period of the
+            motion away.
     """
 
     lag_s: float
@@ -46,7 +48,7 @@ class Timing(NamedTuple):
 
 
 def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
-    """Return the lag, and gain, of the best correlation; None where too few windows can tell."""
+    """Find the lag and gain with the largest correlation; None if there are too few windows."""
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
     count = _independent(windows)
@@ -58,7 +60,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     best_s = float(lags_s[np.nanargmax(np.abs(coarse))])
     fine_s = best_s + np.arange(-STEP_S, STEP_S + 0.5 * FINE_S, FINE_S)
     near = _likeness(windows, source, account, fine_s)
-    if not np.isfinite(near).any():  # at an end of the lags, where all windows are too few
+    if not np.isfinite(near).any():  # at an end of the lags, where too few windows remain
         return None
     best = int(np.nanargmax(np.abs(near)))
     lag_s, likeness = float(fine_s[best]), float(near[best])
@@ -72,7 +74,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     without = _likeness(windows, source, account, zero_s)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
     evidence = float(_evidence(telling, likeness, usual))
-    if abs(lag_s) > NEAR_S:  # some lag of so many is the best by chance
+    if abs(lag_s) > NEAR_S:  # of so many lags, one is the best by chance
         evidence -= float(np.log(len(lags_s)))
     tried_s, tried = np.concatenate([lags_s, fine_s]), np.concatenate([coarse, near])
     as_likely_s = tried_s[_evidence(telling, likeness, tried) < SURE]
@@ -83,14 +85,14 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
 
 
 def _changes(windows: Windows) -> int:
-    """Count how often a motion passes through its mean."""
+    """Count how often a motion crosses its mean."""
     return int(np.count_nonzero(np.diff(windows.values > np.mean(windows.values))))
 
 
 def _is_one_peak(likeness: Floats, count: float) -> bool:
-    """Tell whether the lags that explain about as much are neighbours, and none of the first or last.
+    """Test whether the lags that fit about equally well are neighbours, and exclude both ends.
 
-    A peak between two lags is as high as the parabola through three says.
+    The height of a peak between lags comes from the parabola through three of them.
     """
     size = np.abs(likeness)
     below, above = size[1:-1] - size[:-2], size[1:-1] - size[2:]
@@ -105,7 +107,7 @@ def _is_one_peak(likeness: Floats, count: float) -> bool:
 
 
 def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
-    """Find the gain of the source's clock, the lag then and their likeness."""
+    """Find the gain of the source's clock, with the lag and the correlation there."""
     lags_s = np.arange(-10.0, 10.0, 0.2)
     best = (0.0, 0.0, 0.0)
     for gain in GAINS:
@@ -118,7 +120,7 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
 
 
 def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
-    """Correlate at each lag; NaN where less than half of the windows are in the source's span."""
+    """Correlate at each lag; NaN if less than half of the windows are within the source's span."""
     begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
     moves = account(source, begin_s, end_s)
     is_in = np.isfinite(moves)
@@ -134,10 +136,10 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
 
 
 def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
-    """Count the windows that tell independently of one another.
+    """Estimate the number of independent windows.
 
-    They do not overlap, and are fewer if what the lag leaves unexplained persists from one to the next,
-    as the motion of a lever arm does: by how much follows from a first-order autoregression.
+    They do not overlap, and count less if the residual persists from one to the next, as the motion of a
+    lever arm does; the reduction follows from a first-order autoregression.
     """
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)
@@ -159,6 +161,6 @@ def _independent(windows: Windows) -> int:
 
 
 def _evidence(count: float, likeness: float, usual: Any, misfit: float = 1e-9) -> Any:
-    """Compute how much likelier one correlation is than others, of so many Gaussian pairs."""
+    """Compute the log-likelihood ratio of one correlation to others, for `count` Gaussian pairs."""
     rest, before = (np.maximum(1.0 - np.square(each), misfit) for each in (likeness, usual))
     return 0.5 * count * np.log(before / rest)

@@ -1,4 +1,4 @@
-"""Checks angles: turn rates, courses and headings, and how an inertial unit is mounted."""
+"""Checks of angles: turn rates, courses and headings, and the mounting of inertial units."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,12 +17,16 @@ from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
 NEAR_DEGREES = 0.1
 TOO_FAST_RADPS = 35.0
 BACKWARDS_RAD = 2.6
-HALF = 0.5  # of a slope, above which a mirror image is one
-CLEARER = 1.5  # times as well as its mirror image do forces fit
+HALF = 0.5  # slope, above which a mirror image is one
+CLEARER = 1.5  # ratio by which forces must fit better than their mirror image
 FITS = 0.9
-SMALL_RAD, STEADY_RAD, SURE = 0.05, 0.25, 6.0  # of heading less course: its mean, spread and errors
+SMALL_RAD, STEADY_RAD, SURE = (
+    0.05,
+    0.25,
+    6.0,
+)  # of heading minus course: mean, spread and standard errors
 TURNED_RAD = np.radians(20.0)
-BETTER = 3.0  # times as near to the turn rates
+BETTER = 3.0  # times closer to the turn rates
 TURNS_RADPS = 0.05
 UNIT_TOLERANCE = 1e-3
 NORM_G, NORM_MILLI = (0.9, 1.1), (930.0, 1030.0)
@@ -30,14 +34,14 @@ LARGEST_SHARE = 0.9
 
 
 def signs(motion: BodyMotion) -> Iterator[Finding]:
-    """Turn rates, courses or headings that go the other way round than the others do."""
+    """Find turn rates, courses or headings that turn in the opposite direction to the others."""
     orientations = motion.body.orientations
     orientation = orientations[0] if orientations else None
     beside = motion.heading_course(orientation) if orientation else None
     headed = beside.sign if beside else 0
     for source in motion.body.turns:
         if hangs(motion, source.topic):
-            continue  # which `gravity` says
+            continue  # reported by `gravity`
         ratio = motion.turn(source)
         course = ratio.sign if ratio else 0
         heading = motion.heading_turn(orientation, source).sign if orientation else 0
@@ -53,7 +57,7 @@ def signs(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def _by_forces(motion: BodyMotion, source: Series) -> int:
-    """Say what forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
+    """Test a frame by forces: -1 if it is correct, so the rate is wrong; 1 if mirrored; else 0."""
     for force in motion.body.forces:
         if force.topic == source.topic:
             found = motion.forces(motion.aligned(force))
@@ -63,7 +67,7 @@ def _by_forces(motion: BodyMotion, source: Series) -> int:
 
 
 def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """Find which of a rate and a frame is mirrored; a witness that goes with the rate clears it."""
+    """Report which of a rate and a frame is mirrored; a witness that agrees with the rate clears it."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
@@ -111,7 +115,7 @@ def _compass(orientation: Series, others: str) -> Finding:
 
 
 def degrees(motion: BodyMotion) -> Iterator[Finding]:
-    """Turn rates in deg/s, or taken for such, by the course or because no body turns so fast."""
+    """Find turn rates in deg/s, or read as such, by the course or because no body turns so fast."""
     for source in motion.body.turns:
         ratio = motion.turn(source)
         rates = np.abs(
@@ -146,7 +150,7 @@ def _is_degrees(ratio: Slope) -> bool:
 
 
 def headings(motion: BodyMotion) -> Iterator[Finding]:
-    """Find headings that are off the course by one angle, of bodies that go where they head."""
+    """Find headings with a constant offset from the course, for bodies that move where they point."""
     for orientation in motion.body.orientations:
         ratio = motion.heading_course(orientation)
         offsets = motion.heading_offsets(orientation)
@@ -156,7 +160,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
         rest = wrap_angle(offsets - mean)
         spread = float(np.std(rest))
         error = spread / np.sqrt(len(rest) / 4.0)  # windows overlap
-        is_backwards = abs(mean) > BACKWARDS_RAD  # or so the wheels say
+        is_backwards = abs(mean) > BACKWARDS_RAD  # or the wheels' sign is wrong
         if abs(mean) > max(SMALL_RAD, SURE * error) and spread < STEADY_RAD:
             yield Finding(
                 "mounting",
@@ -172,7 +176,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def mounting(motion: BodyMotion) -> Iterator[Finding]:
-    """Find units whose forward is not the body's, by the forces in curves and at changes of speed."""
+    """Find units whose forward axis is not the body's, by forces in curves and at changes of speed."""
     for force in motion.body.forces:
         found = motion.forces(motion.aligned(force))
         if (
@@ -235,7 +239,7 @@ def gravity(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def hangs(motion: BodyMotion, topic: str) -> bool:
-    """Tell whether a unit is upside down: by its force, and by its turn rate beside the course."""
+    """Test by force, turn rate and course whether a unit is upside down."""
     turns = next((each for each in motion.body.turns if each.topic == topic), None)
     if turns is None or not any(_is_z_down(each) for each in motion.body.forces if each.topic == topic):
         return False
@@ -251,7 +255,7 @@ def _is_z_down(force: Series) -> bool:
 
 
 def quietest(force: Series) -> Floats | None:
-    """Average forces (3,) in the second in which they vary least; None where no second is whole."""
+    """Average forces (3,) in the second in which they vary least; None if no second is complete."""
     second = np.floor(force.times_s - force.times_s[0]).astype(int)
     edges = np.flatnonzero(np.diff(second, prepend=-1, append=second[-1] + 1))
     parts = [force.values[begin:end] for begin, end in pairwise(edges) if end - begin >= 10]
@@ -269,7 +273,7 @@ ORDERS = {
 
 
 def quaternions(motion: BodyMotion) -> Iterator[Finding]:
-    """Find quaternions that are not unit, or in another order, by turn rates."""
+    """Find quaternions that are not of unit length, or in another order, by turn rates."""
     for orientation in (*motion.body.orientations, *motion.body.references):
         norm = np.linalg.norm(orientation.values, axis=1)
         off = float(np.median(np.abs(norm - 1.0)))
@@ -309,7 +313,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
-    """Compute how far (rad/s, rms) quaternions turn otherwise than rates, by order; none at rest."""
+    """Compute the rms difference (rad/s) of quaternions from rates, by order; empty at rest."""
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]

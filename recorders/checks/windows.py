@@ -1,4 +1,4 @@
-"""Cuts a motion into windows: how far and by what angle places moved, and a topic's account."""
+"""Windows of a motion: how far and by what angle positions move, and what another topic says."""
 
 from dataclasses import dataclass, replace
 
@@ -9,20 +9,20 @@ from fuselog.recorders.checks.body import Body, Floats, PlaceSeries, Series
 from fuselog.recorders.models.planar import wrap_angle
 
 SPANS_S = (2.0, 5.0, 10.0)
-FEWEST = 12  # windows, below which nothing is said
-CLEAR = 12.0  # times the noise of a place, which a window has to be long
-WANDERS = 3.0  # standard deviations that places state, within which a body is not seen to move
-JUMP = 5.0  # times the noise of a place, and so many times what nearly all steps are long
+FEWEST = 12  # windows; with fewer nothing is concluded
+CLEAR = 12.0  # times the noise of a position: the least length of a clear move
+WANDERS = 3.0  # stated standard deviations, within which a body counts as at rest
+JUMP = 5.0  # times the noise of a position, and times the length of nearly all steps
 JUMP_STEPS = 2.0
-JUMPS = 0.05  # of the steps; more are how the body moves
+JUMPS = 0.05  # share of the steps; if there are more, the body moves so
 ASTRAY_S = 10.0  # before and after a jump
-NEAR = 4  # steps to either side, whose median velocity a step is compared with
-MOST = 2000  # windows; of more every second, third, ... is taken
+NEAR = 4  # steps on either side, with whose median velocity a step is compared
+MOST = 2000  # windows; more are thinned
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Holds windows (k,) from one stamp to a later one, and what was measured in each."""
+    """Windows (k,) from one stamp to a later one, and what was measured in each."""
 
     begin_s: Floats
     end_s: Floats
@@ -32,33 +32,33 @@ class Windows:
         return len(self.begin_s)
 
     def take(self, rows: NDArray[np.bool_] | slice) -> "Windows":
-        """Return some of them."""
+        """Select some of the windows."""
         return Windows(self.begin_s[rows], self.end_s[rows], self.values[rows])
 
 
 def thinned(count: int, most: int) -> slice:
-    """Return every second, third, ... of so many, so that at most so many are left."""
+    """Return a slice that keeps at most `most` of `count` items, evenly spaced."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def noise_of(places: Floats) -> float:
-    """Estimate the sigma of white noise of samples (n, 2), by how they differ from their neighbours.
+    """Estimate the standard deviation of white noise of samples (n, 2) from second differences.
 
-    What accelerates differs as well: it is too large rather than too small.
+    Acceleration adds to the differences, so the estimate is rather too large than too small.
     """
     bend = places[1:-1] - 0.5 * (places[:-2] + places[2:])
     return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(1.5)) if len(bend) else np.nan
 
 
 def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find the pairs of stamps that are a span apart, or a step where the steps are longer.
+    """Find pairs of stamps that are a span apart, or one step if the steps are longer.
 
     Args:
         times_s: (n,), ascending.
-        span_s: the span.
+        span_s: the span, in s.
 
     Returns:
-        The rows of the first and of the second stamps, (k,) each with k at most `MOST`.
+        The rows of the first and of the second stamps, (k,) each, with k at most `MOST`.
     """
     step_s = float(np.median(np.diff(times_s)))
     later = np.searchsorted(times_s, times_s + max(span_s, step_s) - 1e-6)
@@ -70,10 +70,10 @@ def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np
 
 
 def jumps(fixes: Series) -> NDArray[np.bool_]:
-    """Find the steps (n - 1,) from one place to the next that are jumps of the receiver.
+    """Find the steps (n - 1,) between positions that are jumps of the receiver.
 
-    A jump is a single step that is far from what the steps next to it say: beyond the noise, and beyond
-    what nearly all steps are long. Several in one direction are a motion, and so are many.
+    A jump is a single step that differs from its neighbours by more than the noise, and is longer than
+    nearly all steps. Several in one direction are a motion, and so are many.
     """
     steps, step_s = np.diff(fixes.values, axis=0), np.diff(fixes.times_s)
     if len(steps) < FEWEST:
@@ -90,10 +90,11 @@ def jumps(fixes: Series) -> NDArray[np.bool_]:
 
 
 def chords(fixes: Series, span_s: float) -> Windows:
-    """Return how places move (k, 2) in windows of a span, without those that are near a jump.
+    """Compute how positions move (k, 2) in windows of a span, without windows near a jump.
 
-    A receiver that jumps back may have gone astray slowly, and one that jumped away may come back so.
-    Of one that jumps so often that this leaves less than half, windows without a jump are taken.
+    A receiver that jumps back may have drifted slowly before, and may drift back after jumping away. If
+    jumps are so frequent that less than half of the windows remain, only windows with a jump are
+    removed.
     """
     first, second = pairs(fixes.times_s, span_s)
     at_s = fixes.times_s[1:][jumps(fixes)]
@@ -110,22 +111,22 @@ def chords(fixes: Series, span_s: float) -> Windows:
 
 
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Compute how far a speed or velocity says that one comes in windows, forward or not.
+    """Compute the distance in windows according to a speed or velocity, forward or backward.
 
     Args:
         source: the speed or velocity in m/s.
-        begin_s: (k,), where the windows begin.
-        end_s: (k,), where they end.
+        begin_s: (k,), beginnings of the windows, in s.
+        end_s: (k,), ends of the windows, in s.
 
     Returns:
-        (k,), in m, none negative; NaN beyond the source's stamps.
+        (k,), in m, not negative; NaN beyond the source's stamps.
     """
     moved = source.integral(end_s) - source.integral(begin_s)
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 
 
 def _moves(fixes: PlaceSeries) -> bool:
-    """Tell whether places leave their stated error, in which a receiver at rest wanders too."""
+    """Test whether positions leave their stated error, within which a receiver at rest wanders too."""
     stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
     sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0
     away_m = np.linalg.norm(fixes.values - np.median(fixes.values, axis=0), axis=1)
@@ -133,7 +134,7 @@ def _moves(fixes: PlaceSeries) -> bool:
 
 
 def places_of(body: Body) -> Series | None:
-    """Return where the body is: its fixes, else its velocities' sum; None where it is at rest."""
+    """Return the body's positions: fixes, or integrated velocities; None if it is at rest."""
     if body.fixes:
         return body.fixes[0] if _moves(body.fixes[0]) else None
     if body.velocities and body.speeds:
@@ -143,7 +144,7 @@ def places_of(body: Body) -> Series | None:
 
 
 def distances(places: Series, span_s: float) -> Windows | None:
-    """Return how far places move in windows of a span, or longer ones where that varies too little."""
+    """Compute distances in windows of a span, or of a longer one if they vary too little."""
     for each_s in (span_s, *SPANS_S):
         moved = chords(places, each_s)
         found = replace(moved, values=np.linalg.norm(moved.values, axis=1))
@@ -153,7 +154,7 @@ def distances(places: Series, span_s: float) -> Windows | None:
 
 
 def clear_moves(places: Series) -> Windows | None:
-    """Find moves (k, 2) well above the noise of places, in the shortest windows that have some."""
+    """Find moves (k, 2) well above the noise of positions, in the shortest windows that have some."""
     noise = noise_of(places.values)
     for span_s in SPANS_S:
         moved = chords(places, span_s)
@@ -164,7 +165,7 @@ def clear_moves(places: Series) -> Windows | None:
 
 
 def courses(body: Body) -> Series | None:
-    """Return the course (n,) in rad where the body moves clearly: of velocities, else of places."""
+    """Compute the course (n,) in rad while the body moves clearly, from velocities or positions."""
     of: Series | None
     if body.velocities:
         of = body.velocities[0]
@@ -180,7 +181,7 @@ def courses(body: Body) -> Series | None:
 
 
 def turned(angles: Series, span_s: float) -> Windows:
-    """Compute by how much angles change (k,) in windows of a span, wrapped to half a turn."""
+    """Compute the change of angles (k,) in windows of a span, wrapped to [-pi, pi)."""
     first, second = pairs(angles.times_s, span_s)
     change = angles.values[second] - angles.values[first]
     return Windows(angles.times_s[first], angles.times_s[second], wrap_angle(change))

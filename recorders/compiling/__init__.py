@@ -1,5 +1,5 @@
-"""Compiles loops over runs from plain Python functions, and keeps the machine code.
+"""Compilation of plain Python functions to loops over runs, and the cache of their machine code.
 
-Begin with `compile`. Under which key code is kept, `kernels.native` says for our own compiler, and
-`kernel_cache` for numba.
+Begin with `compile`. The keys of cached code are defined in `kernels.native` for our own compiler, and
+in `kernel_cache` for numba.
 """

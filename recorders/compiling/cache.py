@@ -1,7 +1,7 @@
-"""Keeps results that can be computed again in the user's cache; damaged or foreign files are not used.
+"""The user's cache of results that can be computed again; damaged or foreign files are not used.
 
-A file is one line of text, which begins with the SHA-256 of all that follows it and says what made the
-file, and then the content.
+A file has one line of text, which begins with the SHA-256 of the content and says what made the file,
+followed by the content.
 """
 
 import logging
@@ -21,15 +21,15 @@ from fuselog.recorders.environment import cache_folder as cache_folder
 from fuselog.recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
-# Nothing that is kept takes longer to make, on a slow and busy machine.
+# No cached result takes longer to make, even on a slow and busy machine.
 _TURN_S = 120.0
 
 
 def is_private(folder: Path) -> bool:
-    """Tell whether only this user can have written to a folder of the cache; reports why not.
+    """Test whether only this user can have written to a folder of the cache; warn if not.
 
-    A folder that is not there yet is private: `write_checked` makes it so. Of the folder that it lies in
-    others may be owners or writers where that is sticky, as /tmp is: nobody else moves an entry away.
+    A missing folder is private: `write_checked` makes it so. Its parent may belong to others, or be
+    writable for others, if it is sticky like /tmp: then nobody else can move an entry away.
     """
     for place in (folder.parent, folder):
         try:
@@ -52,9 +52,9 @@ def is_private(folder: Path) -> bool:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Tell whether a file or folder is this user's, and nobody else may write to it.
+    """Test whether a file or folder belongs to this user, and nobody else may write to it.
 
-    Systems without user numbers (Windows) keep a user's folders apart by themselves.
+    Systems without user numbers (Windows) separate the folders of users themselves.
     """
     return _user() is None or (status.st_uid == _user() and not status.st_mode & _OTHERS_MAY_WRITE)
 
@@ -65,12 +65,12 @@ def _user() -> int | None:
 
 @cache
 def say_once(sentence: str) -> None:
-    """Return a warning that one process gives once, however often its cause is met."""
+    """Log a warning once per process, however often its cause occurs."""
     logging.getLogger("fuselog").warning(sentence)
 
 
 def kept_files() -> Iterator[Path]:
-    """Return the files in this user's cache that fuselog wrote, and that are as it wrote them."""
+    """Yield the files in this user's cache that fuselog wrote and that are intact."""
     for path in sorted(cache_folder().glob("*/*.bin")):
         ours = not path.is_symlink() and is_private(path.parent)
         if ours and read_checked(path) is not None:
@@ -78,7 +78,7 @@ def kept_files() -> Iterator[Path]:
 
 
 def read_own(path: Path) -> bytes | None:
-    """Read as `read_checked`; None too where others may have written the file, whatever its folder."""
+    """Read a file like `read_checked`; also return None if others may have written the file itself."""
     try:
         with path.open("rb") as file:
             return _content(file.read()) if is_own(os.fstat(file.fileno())) else None
@@ -87,7 +87,7 @@ def read_own(path: Path) -> bytes | None:
 
 
 def read_checked(source: Path | Traversable) -> bytes | None:
-    """Return the content that `write_checked` wrote, or None where the file is damaged or not there."""
+    """Read the content that `write_checked` wrote; None if the file is damaged or missing."""
     try:
         return _content(source.read_bytes())
     except OSError:
@@ -100,9 +100,9 @@ def _content(written: bytes) -> bytes | None:
 
 
 def write_checked(path: Path, content: bytes, made_by: str) -> None:
-    """Write a file for this user alone, which appears whole or not at all, in folders of such.
+    """Write a private file, which appears completely or not at all, in private folders.
 
-    Raises BadInput, which begins with the path, where that cannot be done.
+    Raises BadInput that begins with the path if this fails.
     """
     try:
         _make_private(path.parent)
@@ -115,10 +115,10 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
 
 @contextmanager
 def in_turn(path: Path) -> Iterator[bool]:
-    """Wait until no other process makes this file; whether there was one, so that it may be there now.
+    """Wait until no other process makes this file; yield whether one did, so that it may exist now.
 
-    The lock goes with the process that holds it, however that ends. One that keeps it for very long, and
-    a disk that cannot lock, keep nobody from the work: it is done twice then, which harms nothing.
+    The lock ends with the process that holds it. If a process keeps the lock for very long, or the disk
+    does not support locks, the work is done twice, which is harmless.
     """
     lock = FileLock(path.with_suffix(".lock"), timeout=0)
     waited = False
@@ -135,13 +135,13 @@ def in_turn(path: Path) -> Iterator[bool]:
         yield waited
     finally:
         if lock.is_locked:
-            with suppress(OSError):  # the file is there: nobody needs the lock any more
+            with suppress(OSError):  # the file exists, so nobody needs the lock any more
                 Path(lock.lock_file).unlink()
             lock.release()
 
 
 def _make_private(folder: Path) -> None:
-    """Make a folder and those that it lies in, where they are not there, for this user alone."""
+    """Make a folder and its missing parents, accessible only to this user."""
     if not folder.exists():
         _make_private(folder.parent)
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Compiles functions of one run into loops over all runs, which the cores share.
+"""Compilation of functions of one run into loops over all runs, which the cores share.
 
-A kernel is a plain Python function over numbers and arrays, with all that it calls, that makes no
-arrays; `fuselog.recorders.compiling.kernels` writes it in LLVM's text, in milliseconds. With
-FUSELOG_UNCOMPILED=1 all are plain Python, which a debugger can follow: that is the reference.
+A kernel is a plain Python function over numbers and arrays, with all functions that it calls, that makes
+no arrays; `fuselog.recorders.compiling.kernels` writes it in LLVM's text, in milliseconds. With
+FUSELOG_UNCOMPILED=1 kernels run as plain Python, which a debugger can follow: that is the reference.
 """
 
 import os
@@ -26,30 +26,30 @@ Result = TypeVar("Result")
 
 
 class Loop(Protocol):
-    """Represents a compiled loop over runs."""
+    """A compiled loop over runs."""
 
     def of(
         self, arguments: Sequence[KernelArgument], memory: Memory | None = None
     ) -> Callable[[int, int], None]:
-        """Return what goes through the runs from a first one up to an end, with these arguments.
+        """Return a function that processes the runs from a first one up to an end.
 
-        Their last is the memory, where there is one.
+        The memory, if there is one, is the last argument.
         """
         ...
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Compile a function of arrays and numbers, with all that it calls, when it is first called.
+    """Compile a function of arrays and numbers, with all functions that it calls, at its first call.
 
-    For what Python calls as it stands; inside another kernel it is compiled with the rest. Its arguments
-    are given by position; it returns nothing, or one number of the kind that its annotation says.
-    Raises BadInput, when called, where a source is not at hand.
+    This is for functions that Python calls directly; in another kernel they are compiled with the rest.
+    Arguments are positional; the function returns nothing, or one number of the annotated kind. A call
+    raises BadInput if a source is not available.
 
     Args:
         function: plain Python over arrays and numbers.
 
     Returns:
-        The function that does the same compiled.
+        A function that does the same, compiled.
     """
 
     @cache
@@ -72,19 +72,19 @@ def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
-        run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
-            belongs to that run. It may be a closure over model functions and numbers: that is how it is
-            specialised. It may use NumPy and functions that keep to the same, and makes no arrays.
-        title: what it is to who waits until it is compiled, such as "ekf of robot".
+        run_once: `run_once(run, *arguments)` does the work of run number `run`, and writes only what
+            belongs to that run. It may be a closure over model functions and numbers, which specialises
+            it. It may use NumPy and functions with the same restrictions, and makes no arrays.
+        title: name in notices while it is compiled, such as "ekf of robot".
 
     Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
-    of runs or cores. What `scratch()` returns, made for every core (see `Scratch`), is the last argument
-    of `run_once`: arrays that one run after another may work in. Or that is `per_run[run]`, such as the
-    run's generator of random numbers; a run for which that is None is left out.
-    Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+    of runs or cores. The last argument of `run_once` is what `scratch()` returns, once for every core
+    (see `Scratch`): arrays that successive runs may work in. Or it is `per_run[run]`, such as the run's
+    random generator; runs for which that is None are skipped. Raises BadInput if a source is not
+    available (as for a function typed at a prompt).
 
-    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
-    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
+    For debugging: with FUSELOG_UNCOMPILED=1 kernels are plain Python, and an index out of bounds is an
+    IndexError; with FUSELOG_BOUNDSCHECK=1 compiled kernels raise it too.
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
 
@@ -99,11 +99,11 @@ def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
 
 @dataclass(frozen=True)
 class OverRuns:
-    """Goes through all runs, see `compile_over_runs`.
+    """A loop over all runs, see `compile_over_runs`.
 
     Attributes:
         run_once: the work of one run.
-        compiled_loop: makes the compiled loop; None for one that is always plain Python.
+        compiled_loop: makes the compiled loop; None for a loop that is always plain Python.
     """
 
     run_once: RunOnce
@@ -116,10 +116,10 @@ class OverRuns:
         scratch: Callable[[], KernelArgument] | None = None,
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
-        """Go through the runs; in plain Python, too, NaN and infinity raise nothing."""
+        """Process all runs; in plain Python, NaN and infinity raise no errors either."""
         if self.compiled_loop is not None and not is_uncompiled():
             with done_once():
-                loop = self.compiled_loop()  # imports what it needs
+                loop = self.compiled_loop()  # imports modules at first use
             _share(loop, runs, *arguments, scratch=scratch, per_run=per_run)
             return
         memory = [scratch()] if scratch else []
@@ -160,7 +160,7 @@ def _share(
 def _one_by_one(
     loop: Loop, arguments: Sequence[KernelArgument], per_run: Sequence[KernelArgument]
 ) -> Callable[[int, int], None]:
-    """Return what goes through the runs with a last argument for each."""
+    """Return a function that processes runs with a different last argument for each."""
     by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}
 
     def through(first: int, end: int) -> None:
@@ -172,7 +172,7 @@ def _one_by_one(
 
 
 def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int], None]]) -> None:
-    """Go through runs on several cores; in a few pieces per core, since runs differ in length."""
+    """Process runs on several cores, in a few pieces per core, since runs differ in length."""
 
     def work(through: Callable[[int, int], None] | None) -> None:
         through = through or prepared()
@@ -182,11 +182,11 @@ def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int],
     first = prepared()
     cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
     waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
-    first(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+    first(0, 0)  # compile here: a thread would wait forever for a module that is being imported
     helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
     try:
         work(first)
-    finally:  # none works on when this returns
+    finally:  # no thread is at work after this function returns
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
     for helper in begun:
@@ -194,7 +194,7 @@ def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int],
 
 
 def use_cores(count: int) -> None:
-    """Have kernels of this process use so many cores."""
+    """Set the number of cores that kernels of this process use."""
     os.environ[environment.CORES] = str(count)
     core_count.cache_clear()
     _helpers.cache_clear()
@@ -202,7 +202,7 @@ def use_cores(count: int) -> None:
 
 @cache
 def core_count() -> int:
-    """Count how many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
+    """Return the number of cores that kernels use: NUMBA_NUM_THREADS, or those this process may use."""
     asked = environment.core_count()
     if asked is not None:
         return asked
@@ -212,10 +212,10 @@ def core_count() -> int:
 
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Return the threads beside the calling one; a forked process has none of its parent's."""
+    """Make the threads besides the calling one; a forked process gets its own."""
     return ThreadPoolExecutor(max(1, core_count() - 1))
 
 
 def is_uncompiled() -> bool:
-    """Tell whether kernels are plain Python now."""
+    """Test whether kernels are currently plain Python."""
     return environment.is_on(environment.UNCOMPILED)

@@ -1,7 +1,7 @@
-"""Describes what a function is made of in words: its code, constants, and all that it calls.
+"""A description of what a function is made of, in words: its code, constants, and all that it calls.
 
-Two functions with the same words do the same. They are found without reading sources: from compiled
-bytecode, closures and the globals that it names.
+Functions with the same words do the same. The words come from compiled bytecode, closures and the
+globals that the function names, without reading sources.
 """
 
 import sys
@@ -15,12 +15,12 @@ import numpy as np
 
 from fuselog.recorders.compiling.kinds import Value
 
-# Whose parts are known by their names alone.
+# Packages whose parts are described by their names only.
 OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 
 
 def identity(function: FunctionType) -> str:
-    """Return the words of a function, each thing that it needs described once."""
+    """Describe a function in words, with each thing that it needs described once."""
     known: dict[int, int] = {}
     kept: list[Value] = []  # whose ids are keys
     return "\n".join(_words(function, known, kept, ()))
@@ -28,7 +28,7 @@ def identity(function: FunctionType) -> str:
 
 @cache
 def digest_of(room: str) -> str:
-    """Return the digest of a room's own sources: what it made before is made anew after a change."""
+    """Compute the digest of a package's own sources, so that a change invalidates what it made."""
     places = sorted(files(room).iterdir(), key=lambda place: place.name)
     sources = [place.read_bytes() for place in places if place.name.endswith(".py")]
     return sha256(b"".join(sources)).hexdigest()
@@ -37,13 +37,13 @@ def digest_of(room: str) -> str:
 def _words(
     value: Value, known: dict[int, int], kept: list[Value], names: Sequence[str]
 ) -> Iterator[str]:
-    """Return the words of what is used by code that has these names, among them its attributes."""
+    """Yield the words of a value used by code with these names, which select its attributes."""
 
     def of(part: Value) -> Iterator[str]:
         return _words(part, known, kept, names)
 
     own = getattr(value, "kernel_identity", None)
-    if callable(own) and not isinstance(value, type):  # it knows what it is, see fuselog.replay.tracing
+    if callable(own) and not isinstance(value, type):  # it describes itself, see fuselog.replay.tracing
         yield own()
     elif isinstance(value, bool | int | float | complex | str | bytes | None | np.generic):
         yield repr(value)
@@ -93,7 +93,7 @@ def _words(
 
 
 def _is_known(value: Value, known: dict[int, int], kept: list[Value]) -> bool:
-    """Tell whether it was described before, which it is from now on."""
+    """Test whether a value was described before, and mark it as described."""
     if id(value) in known:
         return True
     known[id(value)] = len(known)

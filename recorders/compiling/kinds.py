@@ -1,20 +1,20 @@
-"""Names the kinds of what kernels take and are made of, where no narrower type is known."""
+"""Names for types of kernels and their arguments that cannot be narrower."""
 
 from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
 
-# (run, *arguments): does the work of one run; what it takes is up to the kernel.
+# (run, *arguments): does the work of one run; the arguments are up to the kernel.
 RunOnce = Callable[..., None]  # type: ignore[explicit-any]
-# A function that is compiled, or one that does the same compiled.
+# A function that is compiled, or its compiled form.
 KernelFunction = Callable[..., Any]  # type: ignore[explicit-any]
 # A kernel's entry in machine code: takes the numbers and addresses of its arguments, returns a fault.
 Entry = Callable[..., int]  # type: ignore[explicit-any]
-# What a kernel takes: arrays, numbers, and tuples of them.
+# An argument of a kernel: arrays, numbers, and tuples of them.
 KernelArgument = Any  # type: ignore[explicit-any]
-# What an expression of a kernel is while it is lowered: a number or an array at run time, a tuple or a
-# record of such, or any object of Python that is known already.
+# The value of an expression while a kernel is lowered: a number or an array at run time, a tuple or
+# record of such values, or any Python object that is already known.
 Value = Any  # type: ignore[explicit-any]
-# An array that is known while a kernel is made, or that holds what it gives: of any kind.
+# An array of any kind that is known while a kernel is made, or that holds its results.
 AnyArray = NDArray[Any]  # type: ignore[explicit-any]

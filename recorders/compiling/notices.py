@@ -1,4 +1,4 @@
-"""Reports that a kernel is being compiled, where that takes long; counts what a process does once."""
+"""Notices of kernels that take long to compile, and the time that a process spends only once."""
 
 import logging
 import sys
@@ -10,28 +10,28 @@ from multiprocessing import parent_process
 from threading import Timer, local
 
 _LOG = logging.getLogger("fuselog")
-_PATIENCE_S = 1.0  # what compiles in less time is not told of
+_PATIENCE_S = 1.0  # faster compilations are not reported
 _spent = local()
 
 
 def seconds_done_once() -> float:
-    """Tell how long this thread has compiled, loaded kernels and imported until now, where told."""
+    """Return how long this thread has spent in `done_once` so far: compiling, loading and importing."""
     return getattr(_spent, "seconds", 0.0)
 
 
 @contextmanager
 def done_once() -> Iterator[None]:
-    """Tell that what is done here belongs to a first use, and to no estimator's time."""
+    """Count the time of this context as belonging to a first use, and not to an estimator."""
     begun_s, before_s = time.perf_counter(), seconds_done_once()
     try:
         yield
     finally:
-        _spent.seconds = before_s + time.perf_counter() - begun_s  # of one within another once
+        _spent.seconds = before_s + time.perf_counter() - begun_s  # nested contexts count once
 
 
 @contextmanager
 def compiling(title: str) -> Iterator[None]:
-    """Say what is compiled where that takes longer than a second, and how long it took."""
+    """Report what is compiled if it takes longer than a second, and how long it took."""
     patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
     patience.daemon = True
     begun_s = time.perf_counter()
@@ -47,9 +47,9 @@ def compiling(title: str) -> Iterator[None]:
 
 
 def _say(sentence: str) -> None:
-    """Say it by the program's logging, as the command line sets it up; else on standard error, once.
+    """Log a sentence as the command line configured it, or else print it to standard error once.
 
-    Not from a worker process, whose parent is what somebody watches.
+    Worker processes print nothing, since only the parent is watched.
     """
     if _LOG.hasHandlers():
         _LOG.info(sentence)

@@ -1,4 +1,4 @@
-"""Holds what cores work in while they go through a loop, and keeps it for the next time."""
+"""Working memory of cores in loops, which is reused between calls."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,7 +6,7 @@ from fuselog.recorders.compiling.kinds import KernelArgument
 
 
 class Memory:
-    """Holds what one core works in, and how a kernel describes that."""
+    """The working memory of one core, and its description for a kernel."""
 
     __slots__ = ("described", "value")
 
@@ -16,9 +16,9 @@ class Memory:
 
 
 class Scratch:
-    """Makes what cores work in, as the option `scratch` of a loop: each is kept for later calls.
+    """A maker of working memory, for the option `scratch` of a loop; memory is kept for later calls.
 
-    For one loop with arguments of the same sizes.
+    One instance serves one loop with arguments of the same sizes.
     """
 
     def __init__(self, make: Callable[[], KernelArgument]) -> None:
@@ -30,12 +30,12 @@ class Scratch:
         return self._make()
 
     def lend(self) -> Memory:
-        """Return memory that nobody works in."""
+        """Lend memory that is not in use."""
         try:
             return self._free.pop()
         except IndexError:
             return Memory(self._make())
 
     def take_back(self, memories: Sequence[Memory]) -> None:
-        """Keep memories in which nobody works any more."""
+        """Take back memories that are no longer in use."""
         self._free += memories

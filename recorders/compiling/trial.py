@@ -1,6 +1,6 @@
-"""Tries, in a process of its own, the processor that the environment asks to compile for.
+"""Test, in a separate process, of the processor that the environment asks to compile for.
 
-LLVM ends the process that gives it a processor or features that do not go together.
+LLVM ends the process if the processor and its features do not match.
 """
 
 import subprocess
@@ -12,7 +12,7 @@ from fuselog.recorders.processes import start_module
 
 
 def require_processor() -> None:
-    """Raise BadInput if code cannot be compiled for the processor that is asked for, if one is."""
+    """Raise BadInput if code cannot be compiled for the requested processor, if there is one."""
     if any(environment.processor()):
         _try(*environment.processor())
 
@@ -29,7 +29,7 @@ def _try(name: str | None, features: str | None) -> None:
 
 
 def main() -> None:
-    """Compile a function that adds for the processor that is asked for."""
+    """Compile an addition for the requested processor."""
     from fuselog.recorders.compiling.kernels.native import object_code
 
     object_code(

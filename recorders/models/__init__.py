@@ -1,4 +1,4 @@
-"""Models motion and measurements once, for simulators and estimators alike.
+"""Models of motion and measurements, shared by simulators and estimators.
 
-Begin with `planar`, the robot's. What one family needs is in `fuselog.recorders.families`.
+Begin with `planar`, the robot's. Models of single families are in `fuselog.recorders.families`.
 """

@@ -1,4 +1,4 @@
-"""Models a point whose velocity is constant but for white noise; state = (positions, velocities).
+"""A point with constant velocity except for white noise; state = (positions, velocities).
 
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2.
 """
@@ -9,8 +9,9 @@ from fuselog.recorders.models.planar import Component
 def noise_moments(
     acceleration_density: Component, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """Compute per axis position's variance, its covariance with velocity, and velocity's variance.
+    """Compute, for each axis, the variances of position and velocity, and their covariance.
 
+    Returns the position's variance, its covariance with velocity, and the velocity's variance.
     `acceleration_density` is the power spectral density of the acceleration, m^2/s^3.
     """
     velocity = acceleration_density * duration_s

@@ -1,4 +1,4 @@
-"""Converts places between a local tangent plane (east, north, up) and the WGS 84 ellipsoid."""
+"""Conversion of positions between a local tangent plane (east, north, up) and the WGS 84 ellipsoid."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 def earth_centred(
     latitude_deg: Component, longitude_deg: Component, altitude_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """Return a point at a height above the ellipsoid in the frame that turns with the earth, in m."""
+    """Convert a geodetic position to earth-centred, earth-fixed coordinates in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (
@@ -25,11 +25,11 @@ def earth_centred(
 
 
 def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
-    """Compute the directions east, north and up at places on WGS 84, in earth-centred axes.
+    """Compute the directions east, north and up at positions on WGS 84, in earth-centred axes.
 
     Args:
-        latitude_deg: (...).
-        longitude_deg: (...).
+        latitude_deg: (...), in deg.
+        longitude_deg: (...), in deg.
 
     Returns:
         (..., 3, 3), unit vectors as rows.
@@ -51,9 +51,9 @@ def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[n
 def out_of_tangent_plane(
     place_m: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Compute latitude, longitude (deg) and height (m) of a place (east, north) in the plane.
+    """Compute latitude, longitude (deg) and height (m) of a position (east, north) in the plane.
 
-    Bowring's formula, Survey Review 23, 1976: exact to less than a micrometre near the ground.
+    Bowring's formula, Survey Review 23, 1976: accurate to less than a micrometre near the ground.
     """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     east, north = place_m
@@ -80,9 +80,9 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Compute east, north and up (m) of a place as it is seen from the origin.
+    """Compute east, north and up (m) of a position relative to the origin.
 
-    Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
+    Both are latitude and longitude in deg and, unless it is 0, the height above the ellipsoid in m.
     """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     x, y, z = (
@@ -98,11 +98,11 @@ def into_tangent_plane(
 
 
 def local_metres(latitude_deg: Component, longitude_deg: Component) -> NDArray[np.float64]:
-    """Compute east and north (n, 2) in m of places from the median of them, NaN where there is none.
+    """Compute east and north (n, 2) in m of positions relative to their median; NaN if unknown.
 
     Args:
-        latitude_deg: (n,), NaN if there is none.
-        longitude_deg: (n,), NaN if there is none.
+        latitude_deg: (n,), NaN if unknown.
+        longitude_deg: (n,), NaN if unknown.
     """
     middle = np.nanmedian(latitude_deg), np.nanmedian(longitude_deg)
     east, north, _ = into_tangent_plane((latitude_deg, longitude_deg, 0.0), (*middle, 0.0))

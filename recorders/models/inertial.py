@@ -1,6 +1,7 @@
-"""Models inertial navigation in east, north, up: what an inertial unit makes of a motion.
+"""Inertial navigation in east, north, up: the motion according to an inertial unit.
 
-The body's axes are forward, left, up; a unit quaternion w, x, y, z turns its vectors into the plane's.
+The body's axes are forward, left, up; a unit quaternion w, x, y, z rotates vectors from them to the
+plane's.
 Component-first, as in `planar`. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
 Navigation Systems, 2nd edition, 2013, chapters 2 and 5.
 """
@@ -25,7 +26,7 @@ Vector = tuple[Component, Component, Component]
 
 
 def gravity(latitude_deg: Component, height_m: Component) -> Component:
-    """Compute normal gravity, m/s2, at a height over the WGS 84 ellipsoid: Somigliana's, less above.
+    """Compute normal gravity in m/s2 at a height above the WGS 84 ellipsoid, by Somigliana's formula.
 
     NIMA TR8350.2, 3rd edition, (4-1) and (4-3).
     """
@@ -41,18 +42,18 @@ def gravity(latitude_deg: Component, height_m: Component) -> Component:
 
 
 def earth_rate(latitude_deg: Component) -> Vector:
-    """Compute how the plane turns with the earth, rad/s, about east, north, up."""
+    """Compute the rotation of the local tangent plane with the earth, in rad/s about east, north, up."""
     latitude = np.radians(latitude_deg)
     return 0.0, EARTH_RATE_RADPS * np.cos(latitude), EARTH_RATE_RADPS * np.sin(latitude)
 
 
 def cross(a: Components, b: Components) -> Vector:
-    """Return the vector product."""
+    """Compute the cross product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def product(p: Components, q: Components) -> tuple[Component, Component, Component, Component]:
-    """Multiply two quaternions by Hamilton's product."""
+    """Multiply two quaternions (Hamilton product)."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -62,14 +63,14 @@ def product(p: Components, q: Components) -> tuple[Component, Component, Compone
 
 
 def rotation(x: Component, y: Component, z: Component) -> Components:
-    """Return the unit quaternion of a rotation vector."""
+    """Convert a rotation vector to a unit quaternion."""
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
     scale = 0.5 * np.sinc(half / np.pi)
     return np.cos(half), scale * x, scale * y, scale * z
 
 
 def into_plane(q: Components, v: Components) -> Vector:
-    """Turn a body's vector to the plane's axes: v + 2 w (u x v) + 2 u x (u x v) for q = (w, u)."""
+    """Rotate a vector from the body's to the plane's axes: v + 2 w (u x v) + 2 u x (u x v)."""
     w, x, y, z = q
     a, b, c = cross((x, y, z), v)
     d, e, f = cross((x, y, z), (a, b, c))
@@ -77,15 +78,15 @@ def into_plane(q: Components, v: Components) -> Vector:
 
 
 def into_body(q: Components, v: Components) -> Vector:
-    """Return a vector of the plane in the body's axes."""
+    """Rotate a vector from the plane's to the body's axes."""
     w, x, y, z = q
     return into_plane((w, -x, -y, -z), v)
 
 
 def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Components) -> Vector:
-    """Return a vector of a unit's axes in those of the body that it is mounted on, turned so, in rad.
+    """Rotate a vector from a unit's axes to the body's, given the mounting angles in rad.
 
-    A turn by `yaw` about up, of one by `pitch` about left, of one by `roll` about forward.
+    The rotation is by `roll` about forward, then by `pitch` about left, then by `yaw` about up.
     """
     sine, cosine = np.sin(roll), np.cos(roll)
     x, y, z = v[0], cosine * v[1] - sine * v[2], sine * v[1] + cosine * v[2]
@@ -98,13 +99,13 @@ def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Componen
 def strapdown(
     state: Components, force: Components, rate: Components, duration_s: Component, place: Components
 ) -> Components:
-    """Compute position, velocity, orientation (10) after a step of constant force and rate.
+    """Compute position, velocity and orientation (10) after a step with constant force and rate.
 
     Args:
-        state: position (m), velocity (m/s) and quaternion before it.
-        force: specific force of the body, m/s2.
-        rate: its turn rate against the stars, rad/s.
-        duration_s: of the step.
+        state: position (m), velocity (m/s) and quaternion before the step.
+        force: specific force in the body's axes, m/s2.
+        rate: inertial turn rate in the body's axes, rad/s.
+        duration_s: duration of the step.
         place: latitude (deg) and height (m) of the plane's origin.
     """
     px, py, pz, vx, vy, vz, qw, qx, qy, qz = state
@@ -132,7 +133,7 @@ def strapdown(
 
 
 def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """Find the orientation under which force points up, field north; NaN where they are parallel."""
+    """Compute the orientation in which the force points up and the field north; NaN if parallel."""
     up = unit(force)
     east = unit(cross(field, up))
     north = cross(up, east)
@@ -151,13 +152,13 @@ def triad(force: Components, field: Components) -> tuple[float, float, float, fl
 
 
 def unit(vector: Components) -> Components:
-    """Return the direction of a vector of three components; NaN where it has none."""
+    """Return the direction of a vector of three components; NaN for a zero vector."""
     x, y, z = vector[0], vector[1], vector[2]
     length = np.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
 
 
 def distance(tag: Components, anchor: Components) -> Component:
-    """Return the distance of two points in space."""
+    """Compute the distance between two points in space."""
     dx, dy, dz = tag[0] - anchor[0], tag[1] - anchor[1], tag[2] - anchor[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)

@@ -1,4 +1,4 @@
-"""Computes with axes and orientations as unit complex numbers and quaternions, x and -x alike.
+"""Axes and orientations as unit complex numbers and quaternions, where x and -x are equal.
 
 The algebra of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014,
 section 5.3. Quaternions are (w, x, y, z); all arrays keep their components on the last axis.
@@ -41,10 +41,10 @@ def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
 
     Args:
         left: (..., d), d = 2 or 4.
-        right: (..., d), the rotation that comes first.
+        right: (..., d), the rotation that is applied first.
 
     Returns:
-        (..., d).
+        The products (..., d).
     """
     return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
 
@@ -56,14 +56,14 @@ def conjugate(x: ArrayLike) -> NDArray[np.float64]:
 
 
 def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
-    """Turn vectors by orientations (33).
+    """Rotate vectors by orientations (33).
 
     Args:
         orientation: (..., 4), unit quaternions.
         vector: (..., 3), in the axes of the body.
 
     Returns:
-        (..., 3), in the axes that the orientations refer to.
+        (..., 3), in the axes to which the orientations refer.
     """
     vector = np.asarray(vector, float)
     pure = np.concatenate([np.zeros_like(vector[..., :1]), vector], axis=-1)
@@ -71,7 +71,7 @@ def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
 
 
 def heading(orientation: ArrayLike) -> NDArray[np.float64]:
-    """Return the heading in rad, anticlockwise from x, of bodies with these orientations (..., 4)."""
+    """Compute the heading in rad, anticlockwise from x, of bodies with orientations (..., 4)."""
     w, x, y, z = np.moveaxis(np.asarray(orientation, float), -1, 0)
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -83,7 +83,7 @@ def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
     Args:
         a: (..., d), unit vectors, d = 2 or 4.
-        b: (..., d), as those.
+        b: (..., d), like `a`.
 
     Returns:
         (...), in rad, 0 to pi/2.
@@ -95,15 +95,15 @@ def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 def require_unit(x: ArrayLike, what: str, tolerance: float = 1e-6) -> NDArray[np.float64]:
     """Scale every vector of `x` (..., d) to exactly unit length.
 
-    Raises BadInput where d is not 2 or 4, or a length differs from 1 by more than `tolerance`.
+    Raises BadInput if d is not 2 or 4, or a length differs from 1 by more than `tolerance`.
 
     Args:
         x: (..., d), with d = 2 or 4.
-        what: what messages call it.
+        what: name in messages.
         tolerance: how far a length may differ from 1.
 
     Returns:
-        (..., d).
+        The scaled vectors (..., d).
     """
     x = np.asarray(x, float)
     if x.ndim == 0 or x.shape[-1] not in (2, 4):

@@ -1,20 +1,20 @@
-"""Models a robot in the plane: pose = (x, y, heading), velocity = (forward, turn); its sensors.
+"""A robot in the plane and its sensors: pose = (x, y, heading), velocity = (forward, turn).
 
-Component-first functions: each takes scalars or arrays in every component, so that one source serves
-the simulators (arrays over time) and the estimators (scalars inside a compiled loop).
+Functions are component-first: every component may be a scalar or an array, so that simulators (arrays
+over time) and estimators (scalars in a compiled loop) share the same source.
 """
 
 from typing import Any
 
 import numpy as np
 
-# A number, or an array of them: the annotation of everything a component may be.
+# A number, or an array of numbers: the annotation of a component.
 Component = Any
 Components = Any
 
 
 def wrap_angle(angle: Component) -> Component:
-    """Return the equal angle in [-pi, pi).
+    """Wrap an angle to [-pi, pi).
 
     >>> round(float(wrap_angle(3 * np.pi / 2) / np.pi), 12)
     -0.5
@@ -49,14 +49,14 @@ def range_bearing(pose: Components, target: Components) -> tuple[Component, Comp
 
 
 def into_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Compute where a sensor with pose (x, y, heading) has a point (x, y) in its own frame."""
+    """Compute the position (x, y) of a point in the frame of a sensor with pose (x, y, heading)."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = point[0] - pose[0], point[1] - pose[1]
     return cosine * dx + sine * dy, cosine * dy - sine * dx
 
 
 def out_of_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Return the point (x, y) that a sensor with this pose has at `point` of its own frame."""
+    """Compute the position (x, y) of a point given in the frame of a sensor with this pose."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     return (
         pose[0] + cosine * point[0] - sine * point[1],

@@ -1,8 +1,8 @@
-"""Detects from its inertial samples alone whether a body stands.
+"""Detection of standstill from inertial samples.
 
-A body that stands feels gravity, which does not change, and does not turn. Skog, Handel, Nilsson and
-Rantakokko, Zero-Velocity Detection - An Algorithm Evaluation, IEEE Transactions on Biomedical
-Engineering 57(11), 2010: the variance of the specific force, and the energy of the turn rate.
+A body at rest measures constant gravity and no rotation. Skog, Handel, Nilsson and Rantakokko,
+Zero-Velocity Detection - An Algorithm Evaluation, IEEE Transactions on Biomedical Engineering 57(11),
+2010: the variance of the specific force, and the energy of the turn rate.
 """
 
 import numpy as np
@@ -13,20 +13,22 @@ Integers = NDArray[np.int64]
 
 
 def unrest(time_ns: Integers, force: Floats, rate: Floats, window_s: float) -> tuple[Floats, Floats]:
-    """Measure how much a unit was shaken and turned during the window that ends with each sample.
+    """Compute how much a unit was shaken and rotated in the window that ends with each sample.
 
     Args:
-        time_ns: (n,), sorted.
-        force: specific force, m/s2, (n, 3).
-        rate: turn rate, rad/s, (n, 3).
-        window_s: how long the window is.
+        time_ns: (n,), sorted, in ns.
+        force: (n, 3), specific force, m/s2.
+        rate: (n, 3), turn rate, rad/s.
+        window_s: length of the window.
 
     Returns the standard deviation (n,) of the force as a vector, m/s2, and the root mean square (n,) of
-    the turn rate, rad/s. They are infinite before the first window is over, and where samples of a
+    the turn rate, rad/s. They are infinite before the end of the first window, and if samples of a
     window are missing or not finite.
     """
     window_ns = round(1e9 * window_s)
-    numbers = np.hstack([force - np.nanmedian(force, axis=0), rate])  # differences keep their digits
+    numbers = np.hstack(
+        [force - np.nanmedian(force, axis=0), rate]
+    )  # the difference avoids cancellation
     known = np.asarray(np.isfinite(numbers).all(axis=1))
     numbers[~known] = 0.0
     begin = np.searchsorted(time_ns, time_ns - window_ns)

@@ -1,12 +1,12 @@
-"""Names the components of a state, as channels do."""
+"""Names of the components of a state, as in channels."""
 
 from collections.abc import Sequence
 
-# What moves in the plane with a velocity of its own.
+# States of bodies that move in the plane, without and with their own velocity.
 POSE = ("x_m", "y_m", "heading_rad")
 PLANE_MOTION = ("x_m", "vx_mps", "y_m", "vy_mps")
 ORIENTATION = tuple(f"orientation_{part}" for part in "wxyz")
-# What an inertial unit is navigated by: where it is, how it is turned, and its biases.
+# The state of inertial navigation: position, velocity, orientation, and biases.
 NAVIGATION = (
     *("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
     *ORIENTATION,
@@ -16,7 +16,7 @@ NAVIGATION = (
 
 
 def state_metadata(components: Sequence[str]) -> dict[str, str]:
-    """Return the metadata of a channel of states: its components, and of what kind each is.
+    """Return the metadata of a channel of states: components, and their kinds.
 
     An angle is a component in rad that wraps; those of ORIENTATION are a quaternion.
     """

@@ -1,6 +1,6 @@
-"""Simulates a car with wheels, an antenna that gives fixes, and a compass, each of which may err.
+"""Simulator of a car with wheels, an antenna that gives fixes, and a compass, with errors of each.
 
-It drives on exact arcs, one for each step of its odometry. Diagnosis and calibration are tried on it.
+The car drives on exact arcs, one for each step of its odometry. It tests diagnosis and calibration.
 Begin with `drive`; `streams_of` makes a log.
 """
 
@@ -20,38 +20,38 @@ from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_
 
 Floats = NDArray[np.floating]
 Motion = Callable[[Floats], tuple[Floats, Floats]]
-RAMP_S = 5.0  # to speed up after a rest
+RAMP_S = 5.0  # time of acceleration after a rest
 SPEED_MPS, TURN_RADPS, CIRCLE_S = 8.0, 0.4, 15.708
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Drive straight on; like every motion, returns speeds and turn rates (n,) at times (n,)."""
+    """Return speeds and turn rates (n,) at times (n,) of a straight drive; other motions are alike."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
 def changing_speed(time_s: Floats) -> tuple[Floats, Floats]:
-    """Drive straight on, now slower and now faster."""
+    """Return the rates of a straight drive at changing speed."""
     return SPEED_MPS + 4.0 * np.sin(0.4 * time_s), 0.0 * time_s
 
 
 def circle(time_s: Floats) -> tuple[Floats, Floats]:
-    """Drive a circle of 20 m."""
+    """Return the rates of a circle with a radius of 20 m."""
     return np.full_like(time_s, SPEED_MPS), np.full_like(time_s, TURN_RADPS)
 
 
 def circles(time_s: Floats) -> tuple[Floats, Floats]:
-    """Drive such circles to the left and to the right, in turn."""
+    """Return the rates of alternating circles to the left and to the right."""
     is_left = time_s // CIRCLE_S % 2 == 0
     return np.full_like(time_s, SPEED_MPS), np.where(is_left, TURN_RADPS, -TURN_RADPS)
 
 
 def slalom(time_s: Floats) -> tuple[Floats, Floats]:
-    """Drive a slalom."""
+    """Return the rates of a slalom."""
     return np.full_like(time_s, SPEED_MPS), TURN_RADPS * np.sin(0.8 * time_s)
 
 
 def rich(time_s: Floats) -> tuple[Floats, Floats]:
-    """Turn in both senses at changing speed, which determines every parameter."""
+    """Return the rates of turns in both directions at changing speed, which excite every parameter."""
     turn = 0.25 * np.sin(0.21 * time_s) + 0.15 * np.sin(0.53 * time_s)
     return SPEED_MPS + 3.0 * np.sin(0.4 * time_s), turn
 
@@ -67,27 +67,27 @@ MOTIONS: dict[str, Motion] = {
 
 
 class CarParameters(Parameters):
-    """States how the car drives, and how its sensors measure and err; without settings, none errs.
+    """How the car drives, and how its sensors measure; by default without errors.
 
     Attributes:
         duration_s: length of the drive.
-        motion: how it drives.
-        rest_s: it stands still for so long, then speeds up within 5 s.
-        begin: of the prior, if the first pose is drawn from the prior, which is about zero; any heading,
-            if it is at zero in any direction, and the prior is about it.
+        motion: kind of motion.
+        rest_s: time at rest, before 5 s of acceleration.
+        begin: "of the prior" draws the first pose from the prior, whose mean is zero; "any heading"
+            begins at zero in a random direction, which is the prior's mean.
         prior_sigma_m, prior_sigma_rad: standard deviations of the prior, of a position per axis, of the
             heading.
         odometry_step_s, fix_step_s, compass_step_s: times between messages.
-        first_fix_s: when fixes begin.
-        forward_noise_density: of the wheels, in m/s/sqrt(Hz).
-        turn_noise_density: of the wheels, in rad/s/sqrt(Hz).
+        first_fix_s: time of the first fix.
+        forward_noise_density: noise density of the wheels' forward speed, in m/s/sqrt(Hz).
+        turn_noise_density: noise density of the wheels' turn rate, in rad/s/sqrt(Hz).
         fix_sigma_m: standard deviation of a fix, per axis.
         compass_sigma_rad: standard deviation of a heading.
-        forward_factor, turn_factor: what the wheels' readings are of the motion.
-        turn_error_radps: what the wheels' turn rate is too large by.
-        lever_x_m, lever_y_m: where the antenna is, forward and left of the car's own point.
-        fix_delay_s: fixes say where the antenna was so long before.
-        compass_error_rad: what the compass is too large by.
+        forward_factor, turn_factor: ratio of the wheels' readings to the motion.
+        turn_error_radps: bias of the wheels' turn rate.
+        lever_x_m, lever_y_m: position of the antenna, forward and left of the car's reference point.
+        fix_delay_s: how long before its stamp a fix was measured.
+        compass_error_rad: bias of the compass.
     """
 
     duration_s: PositiveFloat = 120.0
@@ -121,7 +121,7 @@ class CarParameters(Parameters):
 
 
 class Truth(NamedTuple):
-    """Describes how the car drives: speeds, turn rates (n,) of each step, poses (n + 1, 3) between."""
+    """The motion of the car: speeds and turn rates (n,) of each step, poses (n + 1, 3) between steps."""
 
     step_s: float
     speed_mps: Floats
@@ -129,7 +129,7 @@ class Truth(NamedTuple):
     pose: Floats
 
     def at(self, times_s: Floats) -> Floats:
-        """Interpolate poses (m, 3) at any times, exactly; before the begin the car rests."""
+        """Interpolate poses (m, 3) at any times, exactly; before the beginning the car rests."""
         step = np.clip(times_s // self.step_s, 0, len(self.speed_mps) - 1).astype(int)
         since_s = np.maximum(times_s - step * self.step_s, 0.0)
         return self.pose[step] + arcs(
@@ -138,15 +138,15 @@ class Truth(NamedTuple):
 
 
 class Car(NamedTuple):
-    """Holds what a log of the car has: stamps in s, SI units; the heading anticlockwise from east.
+    """The data in a log of the car: stamps in s, SI units; the heading is anticlockwise from east.
 
     Attributes:
-        truth: how it drove.
-        odometry_s, speed_mps, turn_radps, fix_s, fix_m, compass_s, compass_rad: what was measured.
+        truth: motion of the car.
+        odometry_s, speed_mps, turn_radps, fix_s, fix_m, compass_s, compass_rad: measurements.
         forward_density, turn_density, fix_variance_m2, compass_sigma_rad: what the sensors state.
-        prior, prior_sigmas: the mean (3,) of the first pose, and its standard deviations.
-        fix_late_s, lever_m: how late fixes are, and of what antenna.
-        seed: of what is drawn beside the car.
+        prior, prior_sigmas: mean (3,) of the first pose, and its standard deviations.
+        fix_late_s, lever_m: delay of fixes, and position of the antenna.
+        seed: seed for further random numbers.
     """
 
     truth: Truth
@@ -169,16 +169,16 @@ class Car(NamedTuple):
 
 
 def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
-    """Compute how poses change along exact arcs.
+    """Compute the changes of poses along exact arcs.
 
     Args:
-        heading_rad: (n,), before each step.
-        speed_mps: (n,), forward.
-        turn_radps: (n,), anticlockwise.
-        duration_s: (n,), of each step.
+        heading_rad: (n,), heading before each step.
+        speed_mps: (n,), forward speed.
+        turn_radps: (n,), turn rate, anticlockwise.
+        duration_s: (n,), duration of each step.
 
     Returns:
-        (n, 3), what is added to x and y in m, and to the heading in rad.
+        (n, 3), changes of x and y in m, and of the heading in rad.
     """
     turned = turn_radps * duration_s
     chord = speed_mps * duration_s * np.sinc(0.5 * turned / np.pi)
@@ -187,12 +187,12 @@ def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s:
 
 
 def philox(key: int) -> np.random.Generator:
-    """Return the generator that reference numbers were drawn with."""
+    """Make the generator that reference values were drawn with."""
     return np.random.Generator(np.random.Philox(key=key))
 
 
 def drive(given: CarParameters, rng: np.random.Generator | None = None) -> Car:
-    """Drive the car; without a generator nothing has noise, and it begins at zero.
+    """Drive the car; without a generator there is no noise, and the car begins at zero.
 
     Raises BadInput if the drive is shorter than a step of a sensor.
     """
@@ -250,7 +250,7 @@ def drive(given: CarParameters, rng: np.random.Generator | None = None) -> Car:
 
 
 def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
-    """Return stamps (n,) in ns since zero."""
+    """Convert times (n,) in s to stamps in ns since zero."""
     return np.rint(1e9 * times_s).astype(np.int64)
 
 
@@ -261,12 +261,12 @@ def streams_of(
     has_compass: bool = True,
     has_prior: bool = True,
 ) -> list[Stream]:
-    """Return the streams of the car: wheels, fixes, and the compass and the prior if it has them.
+    """Make the streams of the car: wheels, fixes, and optionally the compass and the prior.
 
     Args:
-        car: what it measured.
-        stamps: makes stamps in ns of times (n,) in s.
-        has_compass, has_prior: whether it has these.
+        car: the measurements.
+        stamps: function that makes stamps in ns from times (n,) in s.
+        has_compass, has_prior: whether to include these.
     """
     half = 0.5 * car.compass_rad
     zero = np.zeros_like(half)
@@ -295,7 +295,7 @@ def streams_of(
 
 
 def simulate(parameters: CarParameters, rng: np.random.Generator) -> Recording:
-    """Record one run, with the truth at the ends of the odometry's steps."""
+    """Simulate one run, with the truth at the ends of the odometry's steps."""
     car = drive(parameters, rng)
     at_ns = simulation_stamps_ns(parameters.odometry_step_s * np.arange(len(car.truth.pose)))
     truth = truth_stream("/car/truth", at_ns, POSE, car.truth.pose)

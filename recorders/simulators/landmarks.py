@@ -1,7 +1,7 @@
-"""Simulates robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
+"""Simulator of robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
-Odometry reads the velocity that holds from its stamp to the next; the robot drives that velocity plus
-white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.
+Odometry states the velocity from its stamp to the next; the robot's velocity is that plus white noise.
+Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ SENSORS = {
     "bearing": schemas.BEARING,
     "relative_bearing": schemas.RELATIVE_BEARING,
 }
-# See `named_generator`. The logs of a seed keep their bytes by these; a new sensor needs none.
+# See `named_generator`. These keep the logs of a seed unchanged; a new sensor needs no number.
 NUMBERS = {
     "drive": 0,
     "prior": 1,
@@ -50,7 +50,7 @@ NUMBERS = {
 
 
 class Drive(NamedTuple):
-    """Holds what one robot did: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
+    """The motion of one robot: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
 
     times_s: NDArray[np.float64]
     poses: NDArray[np.float64]
@@ -68,7 +68,7 @@ class Drive(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Holds one sensor's looks: stamps (n,), pairs of look and target, and what is true of each pair."""
+    """The views of one sensor: stamps (n,), pairs of view and target, and the pairs' true values."""
 
     times_s: NDArray[np.float64]
     look: NDArray[np.int64]
@@ -79,7 +79,7 @@ class Sightings(NamedTuple):
 
 
 def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; every robot and sensor draws from a generator of its own, by its name."""
+    """Simulate one run; every robot and sensor has its own random generator, by name."""
     map_rng, *robot_rngs = rng.spawn(1 + parameters.robots)
     half = 0.5 * parameters.arena_m
     landmarks = map_rng.uniform(-half, half, (parameters.landmarks, 2))
@@ -182,7 +182,7 @@ def _robot_streams(
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:
-    """Simulate positions in the plane or on earth with their covariance, and when there were none."""
+    """Simulate fixes in the plane or on the earth with their covariance, and their outages."""
     if receiver.rate_hz == 0:
         return []
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
@@ -213,7 +213,7 @@ def _targets(
     drives: list[Drive],
     landmarks: NDArray[np.float64],
 ) -> Mapping[int, Drive | NDArray[np.float64]]:
-    """Return what robot `number` may see, by target number: points, and robots that move."""
+    """Return the possible targets of robot `number`: points, and moving robots, by number."""
     seen: dict[int, Drive | NDArray[np.float64]] = {}
     if parameters.robots_see_each_other:
         seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
@@ -226,7 +226,7 @@ def _look(
     targets: Mapping[int, Drive | NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> Sightings:
-    """Look at everything in range and view at the sensor's rate, less dropouts and outages."""
+    """View all targets in range and field of view at the sensor's rate, except dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
     outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
     pose = robot.pose_at(times_s)
@@ -256,7 +256,7 @@ def _dead(
     duration_s: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Draw a sensor's outages (k, 2), from and to, and tell at which times (n,) it is in one."""
+    """Draw a sensor's outages (k, 2), from and to, and test which times (n,) are in one."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
     starts_s = np.sort(rng.uniform(0, duration_s, count))
     outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
@@ -265,7 +265,7 @@ def _dead(
 
 
 def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Measure a range: bias, noise, and outliers anywhere in the sensor's range."""
+    """Measure ranges with bias, noise, and outliers anywhere in the sensor's range."""
     measured = true_m + sensor.bias_range_m + rng.normal(size=len(true_m)) * sensor.sigma_range_m
     wild = rng.uniform(0, sensor.maximum_range_m, len(true_m))
     is_outlier = rng.uniform(size=len(true_m)) < sensor.outlier_probability
@@ -273,7 +273,7 @@ def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray
 
 
 def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Measure a bearing: bias, noise, and outliers in any direction."""
+    """Measure bearings with bias, noise, and outliers in any direction."""
     noise = rng.normal(size=len(true_rad)) * sensor.sigma_bearing_rad
     wild = rng.uniform(-np.pi, np.pi, len(true_rad))
     is_outlier = rng.uniform(size=len(true_rad)) < sensor.outlier_probability
@@ -283,7 +283,7 @@ def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDA
 def _clocks(
     sensor: Sensor, times_s: NDArray[np.float64], look: NDArray[np.int64], rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
-    """Return the three clocks of every message; messages of one look share them."""
+    """Make the three clocks of every message; messages of one view share them."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
     return {
         "publish_time_ns": simulation_stamps_ns(times_s + sensor.stamp_offset_s)[look],
@@ -295,7 +295,7 @@ def _clocks(
 def _measure(
     schema: Schema, sensor: Sensor, seen: Sightings, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """Return the look that every message belongs to, and the messages' columns."""
+    """Return the view of every message, and the messages' columns."""
     names = [entry.name for entry in schema]
     columns: dict[str, NDArray] = {"target_id": seen.target}
     if "range_m" in names:
@@ -315,7 +315,7 @@ def _measure(
 
 
 def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of all pairs of targets that share a look."""
+    """Return the rows of all pairs of targets that share a view."""
     first, second = np.triu_indices(int(np.bincount(seen.look).max(initial=0)), k=1)
     count = np.bincount(seen.look, minlength=len(seen.times_s))
     start = np.cumsum(count) - count

@@ -1,4 +1,4 @@
-"""Defines the parameters of robots among landmarks: their drive, sensors and fixes."""
+"""The parameters of robots among landmarks: drive, sensors and fixes."""
 
 from typing import Annotated
 
@@ -19,24 +19,25 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 
 
 class Sensor(Parameters):
-    """All sensors of a robot have these in common.
+    """Parameters that all sensors of a robot have in common.
 
     Attributes:
         rate_hz: measurements per second; 0 switches the sensor off.
-        maximum_range_m: it sees targets up to this range.
-        field_of_view_deg: it sees targets within this angle about straight ahead.
-        outlier_probability: probability that a value is any that the sensor can have.
+        maximum_range_m: largest range at which targets are seen.
+        field_of_view_deg: field of view, centred straight ahead.
+        outlier_probability: probability that a value is replaced by a random one within the sensor's
+            range.
         dropout_probability: probability that a measurement is lost.
         outages_per_minute: mean number of outages per minute.
         outage_s: length of an outage.
         latency_s: least time from measurement to arrival at the recorder.
         latency_jitter_s: mean of the random time beyond this (exponential).
-        clock_offset_s: the sensor's clock is ahead by so much.
-        stamp_offset_s: the stamps of its messages are ahead by so much.
+        clock_offset_s: offset of the sensor's clock, positive if ahead.
+        stamp_offset_s: offset of the stamps of its messages, positive if ahead.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
-        bias_range_m: ranges are too long by so much.
-        bias_bearing_rad: bearings are too large by so much.
+        bias_range_m: bias of ranges.
+        bias_bearing_rad: bias of bearings.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -57,15 +58,15 @@ class Sensor(Parameters):
 
 
 class Fixes(Parameters):
-    """A receiver measures positions.
+    """A receiver that measures positions.
 
     Attributes:
         rate_hz: fixes per second; 0 switches it off.
         sigma_m: standard deviation of a fix, per axis.
         outages_per_minute: mean number of outages per minute.
         outage_s: length of an outage.
-        origin_deg: latitude and longitude of the plane's origin, with which fixes are latitudes and
-            longitudes; without it they are positions in the plane.
+        origin_deg: latitude and longitude of the origin of the local tangent plane; with it, fixes are
+            latitudes and longitudes, without it positions in the plane.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -76,7 +77,7 @@ class Fixes(Parameters):
 
 
 class LandmarksParameters(Parameters):
-    """Robots with odometry and sensors drive among landmarks in a square arena.
+    """Robots with odometry and sensors that drive among landmarks in a square arena.
 
     Attributes:
         duration_s: length of the run.
@@ -88,16 +89,16 @@ class LandmarksParameters(Parameters):
         odometry_latency_s: time from a reading of the odometry to its arrival at the recorder.
         forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
         turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
-        forward_scale_error: the robot drives faster than the odometry reports, by this share.
-        turn_bias_radps: the robot turns faster than the odometry reports, by so much.
+        forward_scale_error: relative excess of the robot's speed over the odometry's.
+        turn_bias_radps: excess of the robot's turn rate over the odometry's.
         prior_sigma_m: standard deviation of the position in the prior, per axis.
         prior_sigma_rad: standard deviation of the heading in the prior.
-        robots_see_each_other: whether robots are targets of the sensors too, beside landmarks.
-        range_bearing: the sensor of ranges and bearings.
-        range: the sensor of ranges.
-        bearing: the sensor of bearings.
-        relative_bearing: the sensor of angles between pairs of targets.
-        fix: the receiver of positions.
+        robots_see_each_other: whether robots are targets of the sensors, too.
+        range_bearing: sensor of ranges and bearings.
+        range: sensor of ranges.
+        bearing: sensor of bearings.
+        relative_bearing: sensor of angles between pairs of targets.
+        fix: receiver of positions.
     """
 
     duration_s: PositiveFloat = 60.0

@@ -1,8 +1,8 @@
-"""Simulates a vehicle, a person or a quadrotor with an inertial unit and a GNSS receiver on it.
+"""Simulator of a vehicle, a person or a quadrotor with an inertial unit and a GNSS receiver.
 
-Its path is a spline through way-points, of which velocity and acceleration are exact, so that the unit
-measures what belongs to the path and not to an integration. It begins at rest. The unit's errors are
-those of its grade; fixes have outages, float solutions, bursts of multipath, and delays.
+The path is a spline through way points with exact velocity and acceleration, so the unit's measurements
+contain no integration error. The body begins at rest. The unit has the errors of its grade; fixes have
+outages, float solutions, bursts of multipath, and delays.
 """
 
 from typing import NamedTuple
@@ -26,17 +26,17 @@ GRID_S = 0.05  # between the knots of the path
 
 
 class Path(NamedTuple):
-    """Holds the way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
+    """The path of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
 
     position: BSpline
     attitude: BSpline
 
     def orientation(self, times_s: Floats) -> Rotation:
-        """Return how the body is turned, forward, left, up to east, north, up."""
+        """Return the rotation from forward, left, up to east, north, up."""
         return Rotation.from_euler("ZYX", self.attitude(times_s))
 
     def turn_rate(self, times_s: Floats) -> Floats:
-        """Return how fast it turns against the plane, (n, 3) in the body's axes."""
+        """Compute the turn rate relative to the plane, (n, 3) in the body's axes."""
         _, pitch, roll = self.attitude(times_s).T
         yaw_rate, pitch_rate, roll_rate = self.attitude.derivative()(times_s).T
         return np.stack(
@@ -50,7 +50,7 @@ class Path(NamedTuple):
 
 
 def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Recording:
-    """Record one run."""
+    """Simulate one run."""
     path_rng, unit_rng, gnss_rng, prior_rng, carried_rng = rng.spawn(5)
     unit = parameters.unit
     times_s = np.arange(int(parameters.duration_s * unit.rate_hz + 1e-9) + 1) / unit.rate_hz
@@ -77,7 +77,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
 
 
 def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
-    """Compute the spline through the way-points, at rest first, and the attitude that goes with it."""
+    """Compute the spline through the way points, at rest first, and the attitude along it."""
     points = np.array(parameters.way_points_m, float).reshape(-1, 3)
     if not len(points):
         points = _random_points(parameters, rng)
@@ -95,7 +95,7 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
     knots_s = np.linspace(begin_s, end_s, len(points))
     still = [(1, np.zeros(3)), (2, np.zeros(3))]
     moving = make_interp_spline(knots_s, points, k=5, bc_type=(still, still))
-    # a grid of its own joins rest and way, fine enough to be as smooth as the spline
+    # a separate grid joins rest and motion, fine enough to be as smooth as the spline
     grid_s = np.arange(0.0, end_s + 0.1, GRID_S)
     moving_s = np.clip(grid_s, begin_s, end_s)
     place, velocity = moving(moving_s), moving.derivative()(moving_s)
@@ -117,7 +117,7 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
 def _step(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Bob and sway with each step, 1.9 a second, and turn slowly to both sides, in place."""
+    """Add the bobbing and swaying of steps, 1.9 per second, and slow turns to both sides, in place."""
     phase, step = rng.uniform(0.0, 2 * np.pi, 4), 2 * np.pi * 1.9 * grid_s
     place[:, 2] += 0.03 * going * np.sin(step + phase[0])
     attitude[:, 0] += 0.8 * going * np.sin(0.5 * grid_s + phase[1])
@@ -128,7 +128,7 @@ def _step(
 def _lean(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Look about, and have the thrust point along the body's up, in place."""
+    """Add turns of the view, and tilt the body so that its up axis follows the thrust, in place."""
     phase = rng.uniform(0.0, 2 * np.pi, 2)
     yaw = phase[0] + 1.5 * going * np.sin(0.2 * grid_s + phase[1])
     thrust = make_interp_spline(grid_s, place, k=5).derivative(2)(grid_s)
@@ -140,7 +140,7 @@ def _lean(
 
 
 def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -> Floats:
-    """Draw way-points a leg apart: of a vehicle or person that goes on, of a quadrotor in a box."""
+    """Draw way points a leg apart: ahead for a vehicle or person, in a box for a quadrotor."""
     legs = max(3, round((parameters.duration_s - parameters.rest_s) / parameters.leg_s))
     length_m = parameters.speed_mps * parameters.leg_s
     if parameters.carrier == "quadrotor":
@@ -154,7 +154,7 @@ def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -
 def _inertial(
     parameters: NavigationParameters, path: Path, times_s: Floats, rng: np.random.Generator
 ) -> tuple[Stream, Floats, Floats]:
-    """Simulate what the unit says (n samples), and its biases of gyro and accelerometer (n, 3)."""
+    """Simulate the unit's samples; return them, and the biases of gyroscope and accelerometer (n, 3)."""
     unit = parameters.unit
     turned = path.orientation(times_s).inv()
     earth = np.array(earth_rate(parameters.origin_latitude_deg))
@@ -189,7 +189,7 @@ def _sensed(
     bias_sigma: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Measure a true quantity (n, 3) along three axes; return also their biases (n, 3)."""
+    """Measure a true quantity (n, 3) along three axes; also return the biases (n, 3)."""
     step_s = 1.0 / unit.rate_hz
     walk = rng.normal(size=true.shape) * bias_density * np.sqrt(step_s)
     walk[0] = bias_sigma * rng.normal(size=3)
@@ -201,7 +201,7 @@ def _sensed(
 
 
 def _rounded(values: Floats, quantum: float) -> Floats:
-    """Round values to whole numbers of a quantum."""
+    """Round values to multiples of a quantum."""
     return np.round(values / quantum) * quantum if quantum else values
 
 
@@ -254,7 +254,7 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
 
 
 def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """Simulate what wheels, compass and barometer say, of those that are on board."""
+    """Simulate wheels, compass and barometer, if they are on board."""
     carried, streams = parameters.carried, []
 
     def times(rate_hz: float) -> Floats:
@@ -308,16 +308,16 @@ def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Genera
 
 
 def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
-    """Tell which times lie in one of the spans."""
+    """Test which times are in one of the spans."""
     spans = np.array(spans_s, float).reshape(-1, 2)
     inside = (times_s[:, None] >= spans[:, 0]) & (times_s[:, None] < spans[:, 1])
     return np.any(inside, axis=1, keepdims=True)[:, 0]
 
 
 def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
-    """Draw the first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
+    """Draw the prior: the truth with an error, whose rotation is a turn about up, and a tilt.
 
-    The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
+    The turn is about the up axis of the mean, so that an unknown heading does not affect the tilt.
     """
     prior, unit = parameters.prior, parameters.unit
     sigma = np.repeat(
@@ -349,7 +349,7 @@ def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Gener
 
 
 def _origin(parameters: NavigationParameters) -> dict[str, str]:
-    """Return where on earth the plane lies, as channels state it."""
+    """Return the metadata that states the origin of the plane."""
     return stated_numbers(parameters, "origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
 
 

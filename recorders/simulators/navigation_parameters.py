@@ -1,4 +1,4 @@
-"""Defines the parameters of a body that carries an inertial unit and a GNSS receiver."""
+"""The parameters of a body with an inertial unit and a GNSS receiver."""
 
 from typing import Annotated, Literal
 
@@ -13,7 +13,7 @@ Span = tuple[float, float]
 
 
 class Unit(Parameters):
-    """States how an inertial unit errs; without settings as a telephone's does.
+    """The errors of an inertial unit; by default those of a phone.
 
     Attributes:
         rate_hz: samples per second.
@@ -27,7 +27,7 @@ class Unit(Parameters):
         misalignment_sigma_rad: standard deviation of the misalignments of the axes.
         force_quantum_mps2: specific forces are rounded to multiples of this; 0 does not round.
         gyro_quantum_radps: turn rates are rounded to multiples of this; 0 does not round.
-        delay_s: samples are stamped so late.
+        delay_s: delay of the stamps of samples.
     """
 
     rate_hz: PositiveFloat = 100.0
@@ -45,7 +45,7 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """States what a GNSS receiver gives, and its weak times: spans [begin, end] in s since the epoch.
+    """The output of a GNSS receiver, and its disturbances: spans [begin, end] in s since the epoch.
 
     Attributes:
         rate_hz: positions per second.
@@ -55,14 +55,14 @@ class Receiver(Parameters):
         sigma_mps: standard deviation of a velocity, per horizontal axis.
         sigma_up_mps: standard deviation of a vertical velocity.
         lever_m: position of the antenna in the body (forward, left, up).
-        delay_s: positions are stamped so late.
-        velocity_delay_s: velocities are stamped so late.
-        outages_s: spans in which it is silent.
-        floats_s: spans in which it has float solutions.
-        float_factor: errors of float solutions are so many times larger, as their covariance states.
-        multipath_s: spans in which positions are off by `multipath_m`, which their covariance does not
-            state.
-        multipath_m: by how much positions are off then (east, north, up).
+        delay_s: delay of the stamps of positions.
+        velocity_delay_s: delay of the stamps of velocities.
+        outages_s: spans without messages.
+        floats_s: spans with float solutions.
+        float_factor: factor of the errors of float solutions, which their covariance states.
+        multipath_s: spans in which positions have the offset `multipath_m`, which their covariance does
+            not state.
+        multipath_m: offset of positions in these spans (east, north, up).
     """
 
     rate_hz: PositiveFloat = 5.0
@@ -82,13 +82,13 @@ class Receiver(Parameters):
 
 
 class Carried(Parameters):
-    """A body may carry these further sensors.
+    """Further sensors that a body may carry.
 
     Attributes:
         wheel_rate_hz: forward speeds of the wheels per second; 0 leaves them out.
         wheel_sigma_mps: standard deviation of a forward speed.
         wheel_scale_sigma: standard deviation of the wheels' error of scale, as a share.
-        axle_m: where wheels measure the speed, in the body (forward, left, up).
+        axle_m: position where wheels measure the speed, in the body (forward, left, up).
         compass_rate_hz: orientations of the compass per second; 0 leaves it out.
         compass_sigma_rad: standard deviation of the compass's heading.
         barometer_rate_hz: heights of the barometer per second; 0 leaves it out.
@@ -106,7 +106,7 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """States the prior of the log; the standard deviations of the biases are the unit's.
+    """The prior in the log; the standard deviations of the biases are those of the unit.
 
     Attributes:
         is_told: whether the log has a prior.
@@ -124,25 +124,25 @@ class Prior(Parameters):
 
 
 class NavigationParameters(Parameters):
-    """States what moves, where, and its sensors.
+    """What moves, where, and its sensors.
 
-    A person sways, bobs with each step and turns to both sides of the path; a quadrotor leans into its
-    acceleration and may look in any direction.
+    A person sways and bobs with each step, and turns to both sides of the path; a quadrotor tilts to
+    accelerate, and may point in any direction.
 
     Attributes:
-        carrier: what moves.
+        carrier: type of the moving body.
         duration_s: length of the run.
-        rest_s: the body rests for so long first.
-        leg_s: time between way points that are drawn at random.
+        rest_s: time at rest at the beginning.
+        leg_s: time between random way points.
         speed_mps: speed along the path.
-        way_points_m: the path (east, north, up); without any it is drawn at random.
-        origin_latitude_deg: latitude of the local plane's origin.
-        origin_longitude_deg: longitude of the local plane's origin.
-        origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
+        way_points_m: points of the path (east, north, up); random if empty.
+        origin_latitude_deg: latitude of the origin of the local tangent plane.
+        origin_longitude_deg: longitude of the origin of the local tangent plane.
+        origin_altitude_m: height of the origin above the WGS 84 ellipsoid.
         unit: errors of the inertial unit.
-        gnss: the GNSS receiver.
+        gnss: GNSS receiver.
         carried: further sensors on board.
-        prior: what the log states of the start.
+        prior: prior in the log.
     """
 
     carrier: Literal["vehicle", "pedestrian", "quadrotor"] = "vehicle"

@@ -1,7 +1,8 @@
-"""Compiles kernels that make no arrays: from Python's source to machine code in milliseconds.
+"""Compilation of kernels that make no arrays: from Python's source to machine code in milliseconds.
 
-Such a kernel is a plain Python function of numbers, arrays, tuples and NamedTuples, with all that it
-calls. `lowering` goes through its source once for the types and sizes at hand and writes LLVM's text:
-what is known already (sizes, kinds of components, which function is called) is worked out meanwhile,
-as Python would, and leaves no trace. Begin reading in `native`, which keeps, loads and calls them.
+Such a kernel is a plain Python function of numbers, arrays, tuples and NamedTuples, with all functions
+that it calls. `lowering` goes through its source once for the given types and sizes, and writes LLVM's
+text. What is already known (sizes, kinds of components, the called functions) is evaluated at the same
+time, as Python would, and adds no code. Begin reading in `native`, which caches, loads and calls
+kernels.
 """

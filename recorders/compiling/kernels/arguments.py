@@ -1,6 +1,6 @@
-"""Describes a kernel's arguments for its key, packs them as words, and loads them in the kernel.
+"""Description of a kernel's arguments for its key, packing as words, and loading in the kernel.
 
-NumPy's own structure of an array says where its numbers and its sizes are; its address is the word.
+NumPy's structure of an array holds the addresses of its numbers and sizes; the word is its own address.
 """
 
 import operator
@@ -18,7 +18,7 @@ KNOWN = 64  # sizes up to this are part of a kernel
 
 
 class KnownArray(NamedTuple):
-    """Describes how an array lies in memory: NumPy's letter of its numbers, and its sizes or None."""
+    """The memory layout of an array: NumPy's letter of its numbers, and its sizes or None."""
 
     letter: str
     shape: tuple[int | None, ...]
@@ -28,17 +28,17 @@ class KnownArray(NamedTuple):
 _LETTERS: dict[str, str] = {np.dtype(stored).char: stored for stored in STORED}
 _LETTERS["q"] = _LETTERS["l"] = "<i8"
 _LETTERS["Q"] = _LETTERS["L"] = "<u8"
-# bits of NumPy's flags: in C's order, aligned
+# bits of NumPy's flags: C order, aligned
 _PACKED, _ALIGNED = 0x0001, 0x0100
 _LAYOUT = _PACKED | _ALIGNED
-# where NumPy's own structure of an array has what (PyArrayObject_fields), behind the head of an object
+# offsets in NumPy's structure of an array (PyArrayObject_fields), after the head of an object
 _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
 
 
 def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
-    """Add what an argument is, for the kernel's key, and what it is at run time.
+    """Append the kinds of an argument, for the kernel's key, and its values at run time.
 
-    So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
+    The first `varies` axes of an array vary, unless its NamedTuple overrides this (`varies`).
     """
     if isinstance(value, np.ndarray):
         shape = value.shape
@@ -59,7 +59,7 @@ def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]
 
 
 def with_types(value: Value, kinds: Iterator[Value]) -> Value:
-    """Return an argument in full, as `value_of` takes it: from what it is and its part of the key."""
+    """Complete the description of an argument from its part of the key, as `value_of` needs it."""
     kind = next(kinds)
     if isinstance(value, tuple):
         return type(value), tuple(with_types(each, kinds) for each in value)
@@ -86,7 +86,7 @@ _SCALARS: tuple[tuple[Value, str], ...] = (
 
 
 def letters(kind: Value) -> str:
-    """Describe how the numbers of an argument are packed into words."""
+    """Return the format that packs the numbers of an argument into words."""
     if isinstance(kind, KnownArray):
         return "q"
     if isinstance(kind, tuple):
@@ -95,7 +95,7 @@ def letters(kind: Value) -> str:
 
 
 def value_of(kind: Value, emitter: Emitter, words: Iterator[int]) -> Value:
-    """Return the value that a described argument is in the kernel: loaded from its words."""
+    """Load the value of a described argument from its words."""
     if isinstance(kind, KnownArray):
         return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
     if isinstance(kind, tuple):
@@ -118,7 +118,7 @@ def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
 
 
 def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
-    """Return an array of NumPy's: where its numbers are, and the sizes that are not known."""
+    """Load a NumPy array: the address of its numbers, and the unknown sizes."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
     shape: list[Value] = [

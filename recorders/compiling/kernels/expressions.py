@@ -1,4 +1,4 @@
-"""Lowers expressions: what is known is evaluated as Python would, the rest becomes instructions."""
+"""Lowering of expressions: what is known is evaluated as in Python, the rest becomes instructions."""
 
 import ast
 import operator
@@ -42,12 +42,12 @@ from fuselog.recorders.compiling.kernels.values import (
 )
 from fuselog.recorders.compiling.kinds import AnyArray, Value
 
-# Functions that make arrays, and whether these are zero.
+# Functions that make arrays, and whether these are initialised with zeros.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
 
 
 class Expressions(Scope, ABC):
-    """Represents one function while its expressions are lowered."""
+    """One function while its expressions are lowered."""
 
     @abstractmethod
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
@@ -56,28 +56,28 @@ class Expressions(Scope, ABC):
     # --- expressions ---
 
     def value(self, node: ast.expr) -> Value:
-        """Return what an expression gives."""
+        """Lower an expression; return its value."""
         self.line = getattr(node, "lineno", self.line)
         return getattr(self, f"of_{type(node).__name__}", self.unknown)(node)
 
     def unknown(self, node: ast.expr) -> Value:
-        """Say that there are no such expressions in kernels."""
+        """Raise TypeError for expressions that kernels do not support."""
         raise TypeError(f"a kernel has no {type(node).__name__}: {ast.unparse(node)}")
 
     def of_Constant(self, node: ast.Constant) -> Value:  # noqa: N802
-        """Return a number or a text."""
+        """Return the value of a constant."""
         return node.value
 
     def of_Name(self, node: ast.Name) -> Value:  # noqa: N802
-        """Return a variable, a parameter, or something from outside."""
+        """Return the value of a variable, a parameter, or a name from outside."""
         return self.lookup(node.id)
 
     def of_Tuple(self, node: ast.Tuple) -> Value:  # noqa: N802
-        """Return a tuple."""
+        """Lower a tuple."""
         return tuple(self.listed(node.elts))
 
     def listed(self, nodes: list[ast.expr]) -> Iterator[Value]:
-        """Yield entries or arguments, those of `*others` among them."""
+        """Yield entries or arguments, including those of `*others`."""
         for node in nodes:
             if isinstance(node, ast.Starred):
                 yield from self.iterated(node.value)
@@ -85,7 +85,7 @@ class Expressions(Scope, ABC):
                 yield self.value(node)
 
     def of_GeneratorExp(self, node: ast.GeneratorExp) -> Value:  # noqa: N802
-        """Return values for every one of what is known, as a tuple."""
+        """Lower a generator over known values to a tuple."""
         before = dict(self.known)
         found = tuple(self._generated(node, list(node.generators)))
         self.known = before
@@ -109,7 +109,7 @@ class Expressions(Scope, ABC):
                 self._bind(each, part)
 
     def iterated(self, node: ast.expr) -> list[Value]:
-        """Return the values that a loop goes over, where they are known."""
+        """Return the values of a loop, which must be known."""
         found = self.value(node)
         parts = entries(found)
         if parts is not None:
@@ -119,11 +119,11 @@ class Expressions(Scope, ABC):
         raise TypeError("a loop goes over a range, or over a tuple")
 
     def of_BinOp(self, node: ast.BinOp) -> Value:  # noqa: N802
-        """Lower `a + b` and the like."""
+        """Lower `a + b` and similar."""
         return self.operation(node.op, self.value(node.left), self.value(node.right))
 
     def operation(self, node: ast.operator, left: Value, right: Value) -> Value:
-        """Return the result of an operator."""
+        """Lower a binary operator."""
         operation = OPERATORS[type(node)]
         if is_known(left) and is_known(right):
             both = as_python(left), as_python(right)
@@ -137,7 +137,7 @@ class Expressions(Scope, ABC):
         return binary(self.emitter, operation, self.scalar(left), self.scalar(right))
 
     def scalar(self, value: Value) -> Value:
-        """Return a number; raises TypeError where it is none."""
+        """Convert a value to a number; raise TypeError if it is not one."""
         if isinstance(value, Number) or is_static(value):
             return value
         if isinstance(value, Array) and not value.shape:
@@ -155,7 +155,7 @@ class Expressions(Scope, ABC):
         return value
 
     def truth(self, value: Value) -> Value:
-        """Tell whether something holds: known, or a number at run time."""
+        """Convert a value to a truth value: known, or a number at run time."""
         if isinstance(value, Number):
             return self.emitter.truth(value)
         if isinstance(value, Array):
@@ -163,7 +163,7 @@ class Expressions(Scope, ABC):
         return bool(value)
 
     def of_BoolOp(self, node: ast.BoolOp) -> Value:  # noqa: N802
-        """Lower `a and b`: the second is looked at only where the first leaves it open."""
+        """Lower `a and b`; the second operand is evaluated only if the first does not decide."""
         is_and = isinstance(node.op, ast.And)
         first = self.truth(self.value(node.values[0]))
         rest = node.values[1] if len(node.values) == 2 else ast.BoolOp(node.op, node.values[1:])
@@ -188,7 +188,7 @@ class Expressions(Scope, ABC):
         return found
 
     def compared(self, operation: Value, left: Value, right: Value) -> Value:
-        """Return the result of one comparison."""
+        """Lower a single comparison."""
         if is_known(left) and is_known(right):
             return bool(operation(as_python(left), as_python(right)))
         if operation in (operator.is_, operator.is_not):
@@ -224,11 +224,11 @@ class Expressions(Scope, ABC):
         return self.value(node.body if condition else node.orelse)
 
     def of_Attribute(self, node: ast.Attribute) -> Value:  # noqa: N802
-        """Return a field of a NamedTuple, the shape of an array, something of a module."""
+        """Return a field of a NamedTuple, a property of an array, or a name from a module."""
         return self.attribute(self.value(node.value), node.attr)
 
     def attribute(self, owner: Value, name: str) -> Value:
-        """Return what something has under a name."""
+        """Return the attribute `name` of a value."""
         if isinstance(owner, Record) and name in owner.type._fields:
             return owner.get(name)
         if isinstance(owner, Array):
@@ -243,7 +243,7 @@ class Expressions(Scope, ABC):
         raise TypeError(f"a {type(owner).__name__} has no {name} in a kernel")
 
     def of_Subscript(self, node: ast.Subscript) -> Value:  # noqa: N802
-        """Return a number of an array, a part of it, or an entry of a tuple."""
+        """Lower a subscript: an element or part of an array, or an entry of a tuple."""
         owner = self.value(node.value)
         parts = entries(owner)
         if parts is None:
@@ -259,7 +259,7 @@ class Expressions(Scope, ABC):
         return parts[int(index)] if is_static(index) else self.entry(parts, index)
 
     def entry(self, parts: tuple[Value, ...], index: Number) -> Number:
-        """Return an entry of a tuple of numbers, by an index that is not known."""
+        """Select an entry of a tuple of numbers by an index at run time."""
         if not all(isinstance(each, Number) or is_static(each) for each in parts):
             raise TypeError("an entry of this tuple is found by an index that is known")
         if all(map(is_static, parts)):
@@ -273,7 +273,7 @@ class Expressions(Scope, ABC):
         return load(self.emitter, part_of(self.emitter, kept, (index,)))
 
     def element(self, node: ast.Subscript, owner: Value = None) -> Array:
-        """Return the place in an array, or the part of one, that a subscript stands for."""
+        """Return the element or part of an array that a subscript denotes."""
         owner = self.value(node.value) if owner is None else owner
         if isinstance(owner, np.ndarray):
             owner = self.constant_array(owner)
@@ -285,7 +285,7 @@ class Expressions(Scope, ABC):
         return part_of(self.emitter, owner, tuple(self._index(each) for each in index))
 
     def constant_array(self, array: AnyArray) -> Array:
-        """Return an array from outside, which a kernel reads: one that nobody can write to."""
+        """Return an array from outside, which must not be writeable."""
         if array.flags.writeable:
             raise TypeError("an array that could change is part of a kernel; pass it as an argument")
         return self.program.table(array)
@@ -305,7 +305,7 @@ class Expressions(Scope, ABC):
     # --- calls ---
 
     def of_Call(self, node: ast.Call) -> Value:  # noqa: N802
-        """Make a function, a NamedTuple, or something that writes its own instructions."""
+        """Lower a call of a function, a NamedTuple, or an object that lowers itself."""
         if isinstance(node.func, ast.Attribute) and node.func.attr == "_replace":
             owner = self.value(node.func.value)
             new = {each.arg: self.value(each.value) for each in node.keywords}
@@ -319,14 +319,14 @@ class Expressions(Scope, ABC):
         return self.called(function, arguments, named)
 
     def called(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
-        """Return what a call gives."""
+        """Lower a call; return its result."""
         write = getattr(function, "lowered", None)
-        if write is not None:  # it knows how, see fuselog.replay.tracing
+        if write is not None:  # it lowers itself, see fuselog.replay.tracing
             return write(self.program, self.emitter, arguments)
         if isinstance(function, Hashable) and function in _MAKERS:
             return self.new_array(*arguments, is_zero=_MAKERS[function], **named)
         is_number = isinstance(function, Hashable) and function in FUNCTIONS
-        if not is_number:  # what is compiled for Python as well is compiled with the rest here
+        if not is_number:  # functions compiled for Python are compiled again as a part of this kernel
             function = getattr(function, "__wrapped__", function)
         if function is getattr:
             return self.attribute(*arguments)
@@ -342,7 +342,7 @@ class Expressions(Scope, ABC):
         if all(map(is_known, (*arguments, *named.values()))):
             try:
                 return self._worked_out(function, arguments, named)
-            except ArithmeticError:  # which no kernel raises: a division by zero gives infinity
+            except ArithmeticError:  # kernels do not raise it: a division by zero gives infinity
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
@@ -352,7 +352,7 @@ class Expressions(Scope, ABC):
         raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
 
     def new_array(self, like: Value, dtype: Value = float, *, is_zero: bool) -> Array:
-        """Make what `np.empty` and the like give, of known sizes: there until the function returns."""
+        """Lower `np.empty` and similar for known sizes; the memory lasts until the function returns."""
         shape = like.shape if isinstance(like, Array) else like if isinstance(like, tuple) else (like,)
         if not all(is_static(size) for size in shape):
             raise TypeError("an array that is made here has sizes that are known; pass it as scratch")
@@ -363,17 +363,17 @@ class Expressions(Scope, ABC):
         return array
 
     def copied(self, array: Array) -> Array:
-        """Make what `array.copy()` gives, of known sizes: there until the function returns."""
+        """Lower `array.copy()` for known sizes; the memory lasts until the function returns."""
         copy = self.new_array(array, is_zero=False)
         self.fill(copy, array)
         return copy
 
     @abstractmethod
     def fill(self, place: Array, value: Value) -> None:
-        """Write a number to every place of an array."""
+        """Assign a number to every element of an array."""
 
     def _worked_out(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
-        """Return the result of a function whose arguments are all known: Python has it."""
+        """Evaluate a function of known arguments in Python."""
         known = [as_python(each) for each in arguments]
         with np.errstate(all="ignore"):
             return from_python(
@@ -392,7 +392,7 @@ def _whole(size: int | str) -> Value:
 
 
 def _given(function: FunctionType, arguments: list[Value], named: dict[str, Value]) -> list[Value]:
-    """Return all arguments in their places, with defaults."""
+    """Return all arguments in their order, with defaults."""
     code = function.__code__
     names = code.co_varnames[: code.co_argcount]
     defaults = dict(zip(names[::-1], (function.__defaults__ or ())[::-1], strict=False))

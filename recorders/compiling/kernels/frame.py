@@ -1,4 +1,4 @@
-"""Keeps the frame of a function that is lowered: its blocks, and its variables' places in memory."""
+"""The frame of a lowered function: its blocks, and the memory of its variables."""
 
 from types import FunctionType
 
@@ -22,11 +22,11 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """Says that a variable has to hold numbers of another kind than its first value."""
+    """Raised if a variable has to hold numbers of another kind than its first value."""
 
 
 class Frame(Expressions):
-    """Represents one function's blocks of instructions, and the places of its variables."""
+    """One function's blocks of instructions, and the memory of its variables."""
 
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
@@ -53,7 +53,7 @@ class Frame(Expressions):
     # --- blocks ---
 
     def go(self, label: str) -> None:
-        """End a block by going on elsewhere."""
+        """End a block with a jump."""
         self.emitter.add(f"br label %{label}")
         self.ended = True
 
@@ -63,23 +63,23 @@ class Frame(Expressions):
         self.ended = False
 
     def branch(self, condition: Number, yes: str, no: str) -> None:
-        """End a block by going on at one of two."""
+        """End a block with a jump to one of two others."""
         self.emitter.add(f"br i1 {condition.code}, label %{yes}, label %{no}")
         self.ended = True
 
     # --- places in memory ---
 
     def place(self, value: Value) -> Value:
-        """Return a place for values like this one: its leaves are addresses."""
+        """Allocate memory for values like this one; the leaves of the result are addresses."""
         return rebuilt(value, iter([self.emitter.memory(kind) for kind, _ in leaves(value)]))
 
     def write(self, place: Value, value: Value) -> None:
-        """Write a value to a place for it."""
+        """Store a value in its memory."""
         for (kind, code), (_, address) in zip(leaves(value), leaves(place), strict=True):
             self.emitter.add(f"store {kind} {code}, ptr {address}")
 
     def read(self, place: Value) -> Value:
-        """Return the value at a place."""
+        """Load the value in some memory."""
         names = []
         for kind, address in leaves(place):
             names.append(self.emitter.fresh())
@@ -87,7 +87,7 @@ class Frame(Expressions):
         return rebuilt(place, iter(names))
 
     def assign(self, name: str, value: Value) -> None:
-        """Give a name a value."""
+        """Assign a value to a name."""
         if name not in self.placed:
             self.known[name] = value
             return
@@ -97,14 +97,14 @@ class Frame(Expressions):
         self.write(self.places[name], value)
 
     def fitting(self, name: str, value: Value) -> Value:
-        """Return the value as its place holds it; raises `Wider` where the place has to be another."""
+        """Convert a value to what its memory holds; raise `Wider` if the memory has to change."""
         value = self.widened(name, unsure(at_run_time(value)))
         if name in self.places:
             value = self.converted(name, value, self.places[name])
         return value
 
     def widened(self, name: str, value: Value) -> Value:
-        """Return the value with the kinds of numbers that its place was found to need."""
+        """Convert the numbers of a value to the kinds that its memory was found to need."""
         if isinstance(value, Number):
             kind = self.kinds.get(name, value.kind)
             return self.emitter.as_kind(value, common_kind(value, Number(kind, "")))
@@ -115,9 +115,9 @@ class Frame(Expressions):
         return Record(value.type, made) if isinstance(value, Record) else made
 
     def converted(self, name: str, value: Value, place: Value) -> Value:
-        """Convert a number, or a tuple's numbers, to the place's kinds.
+        """Convert a number, or the numbers in a tuple, to the kinds of the memory.
 
-        `Wider` where it cannot hold them.
+        Raises `Wider` if the memory cannot hold them.
         """
         if signature(value) == signature(place):
             return value
@@ -141,19 +141,19 @@ class Frame(Expressions):
         return rebuilt(place, iter([code for each in made for _, code in leaves(each)]))
 
     def lookup(self, name: str) -> Value:
-        """Return what a name stands for."""
+        """Return the value of a name."""
         if name in self.places:
             return self.read(self.places[name])
         return super().lookup(name)
 
 
 def unsure(value: Value) -> Value:
-    """Return a number of which it is not known whether it is negative."""
+    """Return a number without the assumption that it is not negative."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
 def common_value(one: Value, other: Value) -> Value:
-    """Return the one value, with numbers of the kinds that hold the other's too."""
+    """Return the first value, with numbers of kinds that can also hold the other's."""
     if isinstance(one, Number) and isinstance(other, Number):
         return one._replace(kind=common_kind(one, other))
     parts, others = entries(one), entries(other)

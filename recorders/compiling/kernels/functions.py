@@ -1,4 +1,4 @@
-"""Writes functions of numbers, as NumPy, Python and libm have them, in LLVM's text: `FUNCTIONS`."""
+"""Functions of numbers from NumPy, Python and libm in LLVM's text: `FUNCTIONS`."""
 
 import math
 import operator
@@ -27,7 +27,7 @@ from fuselog.recorders.compiling.kinds import KernelFunction, Value
 
 
 def absolute(emitter: Emitter, x: Scalar) -> Number:
-    """Make `abs(x)`."""
+    """Lower `abs(x)`."""
     if kind_of(x) == REAL:
         return emitter.call("llvm.fabs.f64", emitter.as_kind(x, REAL))
     whole = emitter.as_kind(x, WHOLE)
@@ -36,7 +36,7 @@ def absolute(emitter: Emitter, x: Scalar) -> Number:
 
 
 def _least(operation: Value, emitter: Emitter, *values: Scalar) -> Number:
-    """Lower Python's `min` and `max`: the first of equal ones."""
+    """Lower Python's `min` and `max`, which return the first of equal arguments."""
     kind = common_kind(*values)
     found, *others = (emitter.as_kind(each, kind) for each in values)
     for each in others:
@@ -45,7 +45,7 @@ def _least(operation: Value, emitter: Emitter, *values: Scalar) -> Number:
 
 
 def _bounded(operation: Value, emitter: Emitter, x: Scalar, y: Scalar) -> Number:
-    """Lower `np.minimum` and `np.maximum`, which are NaN where an argument is."""
+    """Lower `np.minimum` and `np.maximum`, which return NaN if an argument is NaN."""
     kind = common_kind(x, y)
     x, y = emitter.as_kind(x, kind), emitter.as_kind(y, kind)
     first = compare(emitter, operation, x, y)
@@ -155,7 +155,7 @@ _LIBM_RENAMED = {
     np.copysign: "llvm.copysign.f64",
     np.fabs: "llvm.fabs.f64",
 }
-# What NumPy's and Python's functions are of numbers: (emitter, *arguments) -> number.
+# The counterparts of NumPy's and Python's functions of numbers: (emitter, *arguments) -> number.
 FUNCTIONS: dict[Value, KernelFunction] = {
     **{getattr(np, name): partial(_of_reals, f"llvm.{name}.f64") for name in _INTRINSICS},
     **{getattr(np, name): partial(_of_reals, name) for name in _LIBM},
@@ -228,7 +228,7 @@ FUNCTIONS: dict[Value, KernelFunction] = {
     np.uint64: lambda emitter, x: emitter.as_kind(x, WORD),
     bool: lambda emitter, x: emitter.truth(x),
 }
-# Python's own functions of the same names.
+# Python's functions with the same names.
 FUNCTIONS |= {
     getattr(math, name): FUNCTIONS[getattr(np, name)]
     for name in (

@@ -1,4 +1,4 @@
-"""Evaluates what is known while a kernel is lowered, as Python would."""
+"""Evaluation of values that are known while a kernel is lowered, as in Python."""
 
 import ast
 import operator
@@ -11,16 +11,16 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 def is_in(x: Value, many: Value) -> bool:
-    """Tell what `x in many` is."""
+    """Evaluate `x in many`."""
     return x in many
 
 
 def is_not_in(x: Value, many: Value) -> bool:
-    """Tell what `x not in many` is."""
+    """Evaluate `x not in many`."""
     return x not in many
 
 
-# Python's operators by their names in a source.
+# Python's operators by their nodes in a syntax tree.
 OPERATORS: dict[type[ast.AST], Value] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -48,7 +48,7 @@ OPERATORS: dict[type[ast.AST], Value] = {
 
 
 def is_known(value: Value) -> bool:
-    """Tell whether nothing of a value exists at run time only."""
+    """Test whether no part of a value exists only at run time."""
     if isinstance(value, Number | Array):
         return False
     parts = entries(value)
@@ -56,14 +56,14 @@ def is_known(value: Value) -> bool:
 
 
 def as_python(value: Value) -> Value:
-    """Return what is known, as Python has it."""
+    """Convert a known value to Python's types."""
     if isinstance(value, Record):
         return value.type(*map(as_python, value.values))
     return tuple(map(as_python, value)) if isinstance(value, tuple) else value
 
 
 def from_python(value: Value) -> Value:
-    """Return what Python has, as it is known while lowering."""
+    """Convert a Python value to its form while lowering."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return Record(type(value), tuple(map(from_python, value)))
     if isinstance(value, tuple | list):

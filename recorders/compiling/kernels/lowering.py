@@ -1,8 +1,8 @@
-"""Lowers a function: goes through its source once and writes what it does as LLVM's text.
+"""Lowering of a function: its source is walked once and written as LLVM's text.
 
-Statements are here, expressions in `expressions`. A name that gets one value before all its uses is that
-value; any other is a place in memory, of which LLVM makes registers. What is known already is worked
-out: an `if` of it takes one side, a loop over a tuple is written out.
+Statements are here, expressions in `expressions`. A name with a single assignment before all of its uses
+is that value; other names are places in memory, which LLVM turns into registers. What is known is
+evaluated: a known `if` has one branch, and a loop over a tuple is unrolled.
 """
 
 import ast
@@ -38,14 +38,14 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class _Loop(NamedTuple):
-    """Holds where `break` and `continue` of a loop lead."""
+    """The targets of `break` and `continue` in a loop."""
 
     end: str
     next: str
 
 
 def lower(program: Program, function: FunctionType, arguments: list[Value]) -> tuple[Emitter, Value]:
-    """Return the body of a function for these arguments, and what it returns."""
+    """Lower a function for these arguments; return its body and its result."""
     kinds: dict[str, str] = {}
     while True:
         lowering = _Lowering(program, function, arguments, kinds)
@@ -63,19 +63,19 @@ def lower(program: Program, function: FunctionType, arguments: list[Value]) -> t
 
 
 class _Lowering(Frame):
-    """Lowers the body of one function, for arguments of these kinds."""
+    """The lowering of one function's body, for arguments of given kinds."""
 
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
     ) -> None:
         self._loops: list[_Loop] = []
-        self._depth = 0  # of branches and loops that may not be run
+        self._depth = 0  # depth of branches and loops that may not be executed
         self._returned: Value = None
         self._exit = ""
         super().__init__(program, function, arguments, kinds)
 
     def body(self) -> Value:
-        """Lower all of it, and return what it returns."""
+        """Lower the whole body; return the function's result."""
         self.statements(self.definition.body)
         if self._exit:
             if not self.ended:
@@ -89,7 +89,7 @@ class _Lowering(Frame):
     # --- statements ---
 
     def statements(self, body: Sequence[ast.stmt]) -> None:
-        """Lower statements up to the one after which none is run."""
+        """Lower statements up to one after which none is reached."""
         for statement in body:
             if self.ended:
                 return
@@ -97,14 +97,14 @@ class _Lowering(Frame):
             getattr(self, f"do_{type(statement).__name__}", self.refuse)(statement)
 
     def refuse(self, statement: ast.stmt) -> None:
-        """Say that there are no such statements in kernels."""
+        """Raise TypeError for statements that kernels do not support."""
         raise TypeError(f"a kernel has no {type(statement).__name__.lower()} statements")
 
     def do_Pass(self, _: ast.Pass) -> None:  # noqa: N802
         """Do nothing."""
 
     def do_Expr(self, statement: ast.Expr) -> None:  # noqa: N802
-        """Return a call, or a docstring."""
+        """Lower a call, and ignore a docstring."""
         if not isinstance(statement.value, ast.Constant):
             self.value(statement.value)
 
@@ -120,7 +120,7 @@ class _Lowering(Frame):
             self.give(statement.target, self.value(statement.value))
 
     def do_AugAssign(self, statement: ast.AugAssign) -> None:  # noqa: N802
-        """Lower `a += value`, of a name, or of a place in an array, which is found once."""
+        """Lower `a += value`, for a name or an element of an array, which is located once."""
         target = statement.target
         if isinstance(target, ast.Subscript):
             place = self.element(target)
@@ -152,7 +152,7 @@ class _Lowering(Frame):
             raise TypeError("only names and parts of arrays can be assigned to")
 
     def fill(self, place: Array, value: Value) -> None:
-        """Write a number, or an array of the same shape, to every place of an array."""
+        """Assign a number, or an array of the same shape, to every element of an array."""
 
         def write(index: Number) -> None:
             part = part_of(self.emitter, place, (index,))
@@ -172,7 +172,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Return a value: where no branch is open it may be known, else all of it is a place."""
+        """Lower `return`: outside of branches the value may stay known, otherwise it is in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it has made; pass one that it fills")
@@ -189,7 +189,7 @@ class _Lowering(Frame):
         self.go(self._exit)
 
     def do_If(self, statement: ast.If) -> None:  # noqa: N802
-        """Return both sides, or the one that is known to be taken."""
+        """Lower both branches, or only the one that is known to be taken."""
         condition = self.truth(self.value(statement.test))
         if not isinstance(condition, Number):
             self.statements(statement.body if condition else statement.orelse)
@@ -209,7 +209,7 @@ class _Lowering(Frame):
             self.begin(after)
 
     def do_While(self, statement: ast.While) -> None:  # noqa: N802
-        """Make a loop, tested at its head."""
+        """Lower a `while` loop, whose condition is tested at its head."""
         head, body, after = (self.label(name) for name in ("while", "body", "after"))
         self.go(head)
         self.begin(head)
@@ -227,7 +227,7 @@ class _Lowering(Frame):
             self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
-        """Return the statements of a loop, after which it goes on at `then`."""
+        """Lower the statements of a loop, which continues at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)
@@ -237,15 +237,15 @@ class _Lowering(Frame):
         self._loops.pop()
 
     def do_Break(self, _: ast.Break) -> None:  # noqa: N802
-        """Leave the loop."""
+        """Jump to the end of the loop."""
         self.go(self._loops[-1].end)
 
     def do_Continue(self, _: ast.Continue) -> None:  # noqa: N802
-        """Go on with the loop's next round."""
+        """Jump to the next iteration of the loop."""
         self.go(self._loops[-1].next)
 
     def do_For(self, statement: ast.For) -> None:  # noqa: N802
-        """Make a loop over a range of numbers, or written out over what is known."""
+        """Lower a loop over a range of numbers, or unroll one over known values."""
         call = statement.iter
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range":
             bounds = [self.value(each) for each in call.args]
@@ -268,7 +268,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def counted(self, start: Number, stop: Number, step: int) -> Iterator[Number]:
-        """Return the number of a loop's round, once: between the loop's head and its end."""
+        """Yield the number of an iteration, once: between the loop's head and its end."""
         if not is_static(step) or step == 0:
             raise TypeError("the step of a range is a number that is known")
         head, inner, following, after = (self.label(name) for name in ("for", "body", "next", "after"))
@@ -293,7 +293,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
-        """Lower `yes if condition else no`, of which one is computed."""
+        """Lower `yes if condition else no`, of which only one is evaluated."""
         labels, after, before = (
             (self.label("then"), self.label("else")),
             self.label("after"),

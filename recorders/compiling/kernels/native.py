@@ -1,8 +1,8 @@
-"""Makes machine code of kernels through LLVM, keeps and loads it, and calls it with NumPy's arrays.
+"""Machine code of kernels: made by LLVM, cached, loaded, and called with NumPy arrays.
 
-A kernel is compiled for the kinds and sizes of its arguments: of arrays that a core works in all sizes
-are known, of all others those behind the first axis, up to `arguments.KNOWN`. Its key is all that it
-is made of (`identity`), this room itself, LLVM, and the processor.
+A kernel is compiled for the kinds and sizes of its arguments. All sizes of working memory are known; for
+other arrays, those after the first axis are, up to `arguments.KNOWN`. The key of its code covers
+everything that it is made from (`identity`), this package itself, LLVM, and the processor.
 """
 
 import ctypes
@@ -42,12 +42,12 @@ from fuselog.recorders.compiling.notices import compiling, done_once
 from fuselog.recorders.compiling.scratch import Memory
 from fuselog.recorders.errors import BadInput
 
-_ALL = 64  # axes that an array may have
+_ALL = 64  # the most axes of an array
 _MADE_BY = "a kernel that fuselog compiled"
 
 
 class _Layout:
-    """Holds the kinds of what a core works in: the same object for the same kinds, quick to look up."""
+    """The kinds of a core's working memory: the same object for the same kinds, for a fast lookup."""
 
     def __init__(self, kinds: tuple[Value, ...]) -> None:
         self.kinds = kinds
@@ -57,7 +57,7 @@ _layout_of = cache(_Layout)
 
 
 def _described(memory: Value) -> tuple[_Layout, list[Value]]:
-    """Describe what a core works in: kinds, with all sizes known, and the numbers to hand over."""
+    """Describe working memory: its kinds, with all sizes known, and the numbers to pass."""
     kinds: list[Value] = []
     words: list[Value] = []
     describe(memory, 0, kinds, words)
@@ -65,9 +65,9 @@ def _described(memory: Value) -> tuple[_Layout, list[Value]]:
 
 
 class Kernel:
-    """Represents a function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
+    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
 
-    `title` says what it is, to who waits for it.
+    `title` names it in notices.
     """
 
     def __init__(self, run_once: FunctionType, title: str = "") -> None:
@@ -80,9 +80,9 @@ class Kernel:
     def of(
         self, arguments: Sequence[Value], memory: Memory | None = None, varies: int = 1
     ) -> Callable[[int, int], None]:
-        """Make the loop over the runs from `first` up to `end` for these arguments, which it holds.
+        """Make the loop over the runs from `first` up to `end` for these arguments, kept alive.
 
-        So many first axes of arrays vary, none of those in the memory; see `describe`.
+        The first `varies` axes of arrays vary, except in the memory; see `describe`.
         """
         kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Value] = []
@@ -114,7 +114,7 @@ class Kernel:
     def _layout_and_entry(
         self, arguments: Sequence[Value], kinds: Iterator[Value]
     ) -> tuple[Struct, KernelFunction]:
-        """Return how the numbers of such arguments are packed, and the entry that takes them."""
+        """Make the layout of such arguments as packed numbers, and the entry that takes them."""
         is_checked = next(kinds)
         described = tuple(with_types(each, kinds) for each in arguments)
         key = is_checked, described
@@ -126,9 +126,9 @@ class Kernel:
 
 
 def function_of(function: KernelFunction) -> KernelFunction:
-    """Make a function that makes no arrays, for Python; no size of the arrays that it is given is known.
+    """Compile a function for calls from Python, without assumptions on the sizes of its arrays.
 
-    It returns nothing, or a number of the kind that its annotation says.
+    The function makes no arrays, and returns nothing or a number of the annotated kind.
     """
     stated = function.__annotations__.get("return", "")
     returned = stated if isinstance(stated, str) else getattr(stated, "__name__", str(stated))
@@ -164,7 +164,7 @@ def function_of(function: KernelFunction) -> KernelFunction:
 def program_of(function: FunctionType, kinds: Sequence[Value], *, is_checked: bool = False) -> Program:
     """Make the kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
 
-    It returns 0, or where indices are checked the number of the first fault.
+    It returns 0, or the number of the first fault if indices are checked.
     """
     program, emitter, words = Program(lower, is_checked=is_checked), Emitter(), count()
     arguments = [value_of(kind, emitter, words) for kind in kinds]
@@ -198,7 +198,7 @@ def program_of(function: FunctionType, kinds: Sequence[Value], *, is_checked: bo
 
 
 def _checked_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) -> RunOnce:
-    """Make the kernel's entry that raises IndexError for an index beyond its array; it is not kept."""
+    """Make the kernel's entry that raises IndexError for an index out of bounds; it is not cached."""
     with compiling(title):
         program = program_of(function, kinds, is_checked=True)
         kernel = _loaded(object_code(program.text()))
@@ -212,11 +212,11 @@ def _checked_entry(function: FunctionType, kinds: tuple[Value, ...], title: str)
 
 
 def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) -> Entry:
-    """Load the kernel's entry from the cache; where that lacks it, make it and keep it there."""
+    """Load the kernel's entry from the cache; if it is missing, make it and add it to the cache."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
     path = None
-    with suppress(RuntimeError):  # a user without a home
+    with suppress(RuntimeError):  # a user without a home folder
         path = cache_folder() / "kernels" / f"{function.__name__}-{key}.bin"
     if path is not None and not is_private(path.parent):
         path = None
@@ -233,14 +233,14 @@ def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) ->
 
 
 def _kept(path: Path, key: str) -> bytes | None:
-    """Return the object code that a file holds; None where it is damaged, or another kernel's."""
+    """Read the object code in a file; None if it is damaged, or of another kernel."""
     found = read_checked(path)
     own = key.encode()
     return found.removeprefix(own) if found is not None and found.startswith(own) else None
 
 
 def _keep(path: Path, code: bytes) -> None:
-    """Write object code to a file; says once where that is impossible."""
+    """Write object code to a file; warn once if this is impossible."""
     try:
         write_checked(path, code, _MADE_BY)
     except BadInput as error:
@@ -249,7 +249,7 @@ def _keep(path: Path, code: bytes) -> None:
 
 
 def _named(kinds: Value) -> Value:
-    """Return kinds of arguments in words that are the same in every process."""
+    """Describe kinds of arguments in words that are the same in every process."""
     if isinstance(kinds, type):
         return f"{kinds.__module__}.{kinds.__qualname__}", getattr(kinds, "_fields", ())
     return tuple(map(_named, kinds)) if isinstance(kinds, tuple) else kinds
@@ -257,7 +257,7 @@ def _named(kinds: Value) -> Value:
 
 @cache
 def _surroundings() -> str:
-    """Return what beside a kernel's own sources its code depends on."""
+    """Describe what a kernel's code depends on apart from its own sources."""
     machine = _machine()
     return "\n".join(
         [
@@ -271,7 +271,7 @@ def _surroundings() -> str:
 
 
 def _machine() -> tuple[str, str]:
-    """Return the processor and its features: this one's, or those that are asked for as numba's are."""
+    """Return the processor and its features: this machine's, or those requested by numba's variables."""
     name = os.environ.get("NUMBA_CPU_NAME")
     features = os.environ.get("NUMBA_CPU_FEATURES")
     if features is None:
@@ -280,7 +280,7 @@ def _machine() -> tuple[str, str]:
 
 
 def _new_target() -> Value:
-    """Return LLVM's description of the machine."""
+    """Make LLVM's description of the machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = _machine()
@@ -297,9 +297,10 @@ def _made(function: FunctionType, kinds: Sequence[Value]) -> bytes:
 
 
 def object_code(text: str) -> bytes:
-    """Return the machine code of LLVM's text.
+    """Compile LLVM's text to machine code.
 
-    Without the SLP vectoriser, which costs as much as all else and gains these kernels nothing.
+    The SLP vectoriser is off, since it takes as long as all other passes and does not speed up these
+    kernels.
     """
     target = _new_target()
     module = llvm.parse_assembly(text)
@@ -311,11 +312,11 @@ def object_code(text: str) -> bytes:
     return bytes(target.emit_object(module))
 
 
-_ENGINES: list[Value] = []  # what is loaded stays
+_ENGINES: list[Value] = []  # loaded code is never released
 
 
 def _loaded(code: bytes) -> Entry:
-    """Return the entry of a kernel's object code; the engine owns its target."""
+    """Load a kernel's object code; return its entry. The engine owns its target."""
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -326,7 +327,7 @@ def _loaded(code: bytes) -> Entry:
 
 @contextmanager
 def _without_garbage() -> Iterator[None]:
-    """Collect no garbage meanwhile: a compiler makes very many objects and little of that."""
+    """Pause garbage collection, since a compiler makes very many objects, but little garbage."""
     collecting = gc.isenabled()
     gc.disable()
     try:

@@ -1,6 +1,6 @@
-"""Writes arithmetic and comparisons of numbers in LLVM's text.
+"""Arithmetic and comparisons of numbers in LLVM's text.
 
-Nothing is contracted or reassociated, so that a result does not depend on how code was optimised.
+Operations are not contracted or reassociated, so that results do not depend on the optimisation.
 Divisions by zero give infinity or NaN.
 """
 
@@ -14,14 +14,14 @@ import numpy as np
 
 from fuselog.recorders.compiling.kinds import Value
 
-REAL, WHOLE, WORD, TRUTH = "double", "i64", "u64", "i1"  # kinds; a word is an unsigned integer
+REAL, WHOLE, WORD, TRUTH = "double", "i64", "u64", "i1"  # kinds; WORD is an unsigned integer
 _WIDTH = {TRUTH: 0, WHOLE: 1, WORD: 2, REAL: 3}
 
 
 class Number(NamedTuple):
-    """Holds a number while a kernel is lowered: its kind, and its name or constant in LLVM's text.
+    """A number while a kernel is lowered: its kind, and its name or constant in LLVM's text.
 
-    `natural` numbers are known not to be negative.
+    `natural` numbers are known to be zero or more.
     """
 
     kind: str
@@ -30,16 +30,16 @@ class Number(NamedTuple):
 
     @property
     def type(self) -> str:
-        """Name its type as LLVM does."""
+        """Return LLVM's name of the type."""
         return WHOLE if self.kind == WORD else self.kind
 
 
-Static = bool | int | float  # what is known while lowering
+Static = bool | int | float  # known while lowering
 Scalar = Number | Static
 
 
 def constant(value: Value) -> Number:
-    """Return a number that is known, as LLVM writes it; real ones bit by bit."""
+    """Convert a known number to LLVM's text; real numbers bit by bit."""
     if isinstance(value, bool | np.bool_):
         return Number(TRUTH, "true" if value else "false")
     if isinstance(value, np.unsignedinteger):
@@ -50,26 +50,26 @@ def constant(value: Value) -> Number:
 
 
 def is_static(value: Value) -> TypeGuard[Static]:
-    """Tell whether it is a number that is known while lowering."""
+    """Test whether a value is a number that is known while lowering."""
     return isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating)
 
 
 class Emitter:
-    """Writes the instructions of one function.
+    """A writer of the instructions of one function.
 
-    `fault`, where indices are checked, gives the number (1, ...) that stands for the line at work.
+    If indices are checked, `fault` returns the number (1, ...) of the current line.
     """
 
     def __init__(self, fault: Callable[[], int] | None = None) -> None:
         self.lines: list[str] = []
-        self.allocated: list[str] = []  # memory of the function, which is taken once
+        self.allocated: list[str] = []  # memory of the function, allocated once
         self.declared: set[str] = set()
         self.fault = fault
         self.can_fail = False
         self._names = count()
 
     def fresh(self) -> str:
-        """Return a name that is not taken."""
+        """Return an unused name."""
         return f"%v{next(self._names)}"
 
     def add(self, line: str) -> None:
@@ -77,26 +77,26 @@ class Emitter:
         self.lines.append(f"  {line}")
 
     def memory(self, kind: str, size: int = 1) -> str:
-        """Return the address of memory for some numbers."""
+        """Allocate memory for some numbers; return its address."""
         name = self.fresh()
         self.allocated.append(f"  {name} = alloca {kind}, i64 {size}")
         return name
 
     def number(self, kind: str, text: str) -> Number:
-        """Return the result of an instruction."""
+        """Write an instruction; return its result."""
         name = self.fresh()
         self.add(f"{name} = {text}")
         return Number(kind, name)
 
     def call(self, name: str, *arguments: Number) -> Number:
-        """Return what a function of real numbers returns, such as `llvm.sqrt.f64` or `atan2`."""
+        """Call a function of real numbers, such as `llvm.sqrt.f64` or `atan2`."""
         parameters = ", ".join([REAL] * len(arguments))
         self.declared.add(f"declare double @{name}({parameters}) #0")
         given = ", ".join(f"double {each.code}" for each in arguments)
         return self.number(REAL, f"call double @{name}({given})")
 
     def stop_if(self, condition: Number, fault: Number) -> None:
-        """Leave the function, and all that called it, with a fault; see `Program.define`."""
+        """Leave the function and all of its callers with a fault; see `Program.define`."""
         if not self.can_fail:
             self.can_fail = True
             self.allocated += ["  %fault = alloca i64", "  store i64 0, ptr %fault"]
@@ -110,7 +110,7 @@ class Emitter:
     # --- conversions ---
 
     def as_kind(self, value: Scalar, kind: str) -> Number:
-        """Return a number as one of another kind, as Python and NumPy convert it."""
+        """Convert a number to another kind, as Python and NumPy do."""
         if not isinstance(value, Number):
             if kind == REAL:
                 return constant(float(value))
@@ -131,7 +131,7 @@ class Emitter:
         return Number(kind, value.code)
 
     def truth(self, value: Scalar) -> Number:
-        """Tell whether a number is other than zero."""
+        """Test whether a number is not zero."""
         if not isinstance(value, Number):
             return constant(bool(value))
         if value.kind == TRUTH:
@@ -141,7 +141,7 @@ class Emitter:
         return self.number(TRUTH, f"icmp ne i64 {value.code}, 0")
 
     def select(self, condition: Number, yes: Number, no: Number) -> Number:
-        """Return one of two numbers of one kind."""
+        """Select one of two numbers of the same kind."""
         if yes.code == no.code:
             return yes
         text = f"select i1 {condition.code}, {yes.type} {yes.code}, {no.type} {no.code}"
@@ -156,7 +156,7 @@ def kind_of(value: Scalar) -> str:
 def common_kind(*values: Scalar) -> str:
     """Find the kind of a result of these numbers.
 
-    A signed and an unsigned integer together have none.
+    Signed and unsigned integers have no common kind.
     """
     kinds = {kind_of(each) for each in values}
     if {WORD, WHOLE} <= kinds:
@@ -181,7 +181,7 @@ _ORDERED = {
 
 
 def binary(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
-    """Return the result of an operator of Python's."""
+    """Lower one of Python's binary operators."""
     if operation is operator.pow:
         return power(emitter, left, right)
     kind = common_kind(left, right)
@@ -206,7 +206,7 @@ def binary(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> N
 
 
 def _divided(emitter: Emitter, operation: Value, x: Number, y: Number) -> Number:
-    """Lower `x % y` or `x // y`, whose remainder has the sign of y."""
+    """Lower `x % y` or `x // y`; the remainder has the sign of y."""
     if x.kind == WORD:
         name = "urem" if operation is operator.mod else "udiv"
         return emitter.number(WORD, f"{name} i64 {x.code}, {y.code}")
@@ -231,7 +231,7 @@ def _divided(emitter: Emitter, operation: Value, x: Number, y: Number) -> Number
     nothing = emitter.select(divisor_below, constant(-0.0), zero)
     if operation is operator.mod:
         return emitter.select(is_off, emitter.select(apart, moved, rest), nothing)
-    # the quotient of what is a multiple but for round-off, snapped to the nearest integer
+    # the quotient is an integer except for round-off; snap it to the nearest one
     whole = emitter.number(REAL, f"fsub double {x.code}, {rest.code}")
     quotient = emitter.number(REAL, f"fdiv double {whole.code}, {y.code}")
     less = emitter.number(REAL, f"fsub double {quotient.code}, {constant(1.0).code}")
@@ -248,7 +248,7 @@ def _divided(emitter: Emitter, operation: Value, x: Number, y: Number) -> Number
 
 
 def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
-    """Return a power; of an integer that is known by multiplication."""
+    """Lower a power; known integer exponents become multiplications."""
     if isinstance(exponent, int):
         kind = REAL if exponent < 0 or kind_of(base) == REAL else WHOLE
         square, rest = emitter.as_kind(base, kind), abs(int(exponent))
@@ -265,7 +265,7 @@ def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
 
 
 def compare(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
-    """Return the result of a comparison; false with NaN, but for `!=`."""
+    """Lower a comparison; it is false with NaN, except for `!=`."""
     kind = common_kind(left, right)
     kind = WHOLE if kind == TRUTH else kind
     x, y = (emitter.as_kind(each, kind) for each in (left, right))

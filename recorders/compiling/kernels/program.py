@@ -1,4 +1,4 @@
-"""Assembles one kernel as LLVM's text: each function lowered once for each kind of its arguments."""
+"""A kernel as LLVM's text: each function is lowered once for each kind of its arguments."""
 
 import ast
 import inspect
@@ -23,17 +23,17 @@ from fuselog.recorders.compiling.kernels.values import (
 from fuselog.recorders.compiling.kinds import AnyArray, Value
 from fuselog.recorders.errors import BadInput
 
-FEW = 30  # lines of a function that is always written where it is called
+FEW = 30  # functions with fewer lines are always inlined
 
 
 class DoesNotCompile(BadInput):
-    """Holds what a kernel cannot be made of, and in which line."""
+    """An error for code that kernels do not support, with its line."""
 
 
 class Instance(NamedTuple):
-    """Holds a function lowered for some arguments: its name, the type of its result, and that value.
+    """A function lowered for some arguments: its name, and the type and value of its result.
 
-    One that `can_fail` returns the number of its fault too, 0 for none.
+    If `can_fail`, it also returns the number of its fault, 0 for none.
     """
 
     name: str
@@ -43,9 +43,9 @@ class Instance(NamedTuple):
 
 
 class Program:
-    """Represents the text of a kernel while it grows.
+    """The text of a kernel while it grows.
 
-    Where indices are checked, `faults` are the lines at which one can be beyond its array.
+    If indices are checked, `faults` are the lines in which one may be out of bounds.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Program:
         self._kept: list[Value] = []  # whose ids are keys
 
     def text(self) -> str:
-        """Return the whole module."""
+        """Join the parts of the module."""
         tables = [text for text, _ in self.tables.values()]
         attributes = "attributes #0 = { nounwind willreturn memory(none) }"
         return "\n".join([*tables, *self.functions, *sorted(self.declared), attributes, ""])
@@ -76,14 +76,14 @@ class Program:
         return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
 
     def table(self, numbers: AnyArray) -> Array:
-        """Return a constant array."""
+        """Return a constant array, defined once."""
         key = numbers.dtype.str, numbers.shape, numbers.tobytes()
         if key not in self.tables:
             self.tables[key] = table(self.name("table"), numbers)
         return self.tables[key][1]
 
     def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Value]) -> Value:
-        """Call a function with these arguments; it is lowered where that was not done yet."""
+        """Call a function with these arguments; lower it if this was not done before."""
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
             if id(function) in self._open:
@@ -101,7 +101,7 @@ class Program:
     def define(
         self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Value
     ) -> Instance:
-        """Add a function whose body ends before what it returns is given back."""
+        """Add a function with this body and result."""
         found = list(leaves(returned))
         results = [*found, ("i64", "0")] if body.can_fail else found
         kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"
@@ -131,7 +131,7 @@ class Program:
         return Instance(name, kind, returned, body.can_fail)
 
     def _parameter(self, index: int, value: Value) -> tuple[Value, list[tuple[str, str]]]:
-        """Return an argument as the function that it is given to knows it, and its leaves there."""
+        """Return an argument as its function sees it, and its leaves there."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
         known = placed(_unsure(value), is_local=False)
         return rebuilt(known, iter([code for _, code in found])), found
@@ -143,7 +143,7 @@ def _unsure(value: Value) -> Value:
 
 
 def called(emitter: Emitter, instance: Instance, arguments: Sequence[Value]) -> Value:
-    """Call a function that has been lowered."""
+    """Call a lowered function; return its result."""
     given = ", ".join(f"{kind} {code}" for each in arguments for kind, code in leaves(each))
     if instance.type == "void":
         emitter.add(f"call fastcc void {instance.name}({given})")
@@ -162,7 +162,7 @@ def called(emitter: Emitter, instance: Instance, arguments: Sequence[Value]) -> 
 
 @cache
 def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
-    """Make a function's source, its file, and the line before its first one."""
+    """Find a function's definition, its file, and the line before its first one."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError) as error:

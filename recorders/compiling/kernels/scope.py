@@ -1,4 +1,4 @@
-"""Looks up what a lowered function's names stand for, and where in its source it is."""
+"""Lookup of the names in a lowered function, and of positions in its source."""
 
 import builtins
 from itertools import count
@@ -15,7 +15,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Scope:
-    """Represents one function while it is lowered: where it is, and what its names stand for."""
+    """One function while it is lowered: the current position, and the values of its names."""
 
     def __init__(self, program: Program, function: FunctionType) -> None:
         self.program = program
@@ -28,21 +28,21 @@ class Scope:
         self._labels = count()
 
     def place_in_source(self) -> str:
-        """Return the file and the line at work."""
+        """Return the file and the current line."""
         _, file, above = definition_of(self.function)
         return f"{file}, line {above + self.line}"
 
     def fault(self) -> int:
-        """Return the number that stands for an index of the line at work that is beyond its array."""
+        """Return a new fault number for an index out of bounds in the current line."""
         self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
         return len(self.program.faults)
 
     def label(self, stem: str) -> str:
-        """Return a name for a block."""
+        """Return a new name for a block."""
         return f"{stem}{next(self._labels)}"
 
     def lookup(self, name: str) -> Value:
-        """Return what a name stands for."""
+        """Return the value of a name."""
         if name in self.known:
             return self.known[name]
         if name in self._outside:

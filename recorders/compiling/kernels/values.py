@@ -1,8 +1,8 @@
-"""Represents what a kernel's names stand for while it is lowered: numbers, arrays, tuples, constants.
+"""Values of a kernel's names while it is lowered: numbers, arrays, tuples, constants.
 
-A value is a `Number`, an `Array`, a tuple of values, a `Record` (a NamedTuple of values), or anything of
-Python's that is known already: a number, a text, a function. Its leaves are what exists at run time:
-numbers and, of an array, where it is and the sizes that are not known before.
+A value is a `Number`, an `Array`, a tuple of values, a `Record` (a NamedTuple of values), or any Python
+object that is already known: a number, a text, a function. Its leaves exist at run time: numbers, and
+for an array its address and its unknown sizes.
 """
 
 import operator
@@ -30,7 +30,7 @@ from fuselog.recorders.compiling.kinds import AnyArray, Value
 Size = int | str  # known, or the name of an integer
 Leaf = tuple[str, str]  # LLVM's type, and a name
 POINTER = "ptr"
-# how numbers of an array are stored, and the kind that they are read as
+# how the numbers of an array are stored, and the kind as which they are read
 STORED = {
     "<f8": ("double", REAL),
     "<i8": ("i64", WHOLE),
@@ -45,9 +45,9 @@ STORED = {
 
 @dataclass(frozen=True)
 class Array:
-    """Represents an array: how its numbers are stored, where, and its sizes and strides, in numbers.
+    """An array: the type of its numbers, its address, and its sizes and strides, in numbers.
 
-    `is_local`: whether it is gone when the function that made it returns.
+    `is_local` says whether its memory ends when the function that made it returns.
     """
 
     dtype: str
@@ -58,13 +58,13 @@ class Array:
 
     @property
     def turned(self) -> "Array":
-        """Return what `array.T` is."""
+        """Return the transposed array."""
         return Array(self.dtype, self.pointer, self.shape[::-1], self.strides[::-1], self.is_local)
 
 
 @dataclass(frozen=True)
 class Record:
-    """Represents a NamedTuple of values."""
+    """A NamedTuple of values."""
 
     type: type[Value]
     values: tuple[Value, ...]
@@ -75,14 +75,14 @@ class Record:
 
 
 def entries(value: Value) -> tuple[Value, ...] | None:
-    """Return the values that a tuple or NamedTuple holds; None of anything else."""
+    """Return the values in a tuple or NamedTuple; None for other values."""
     if isinstance(value, Record):
         return value.values
     return value if isinstance(value, tuple) and not isinstance(value, Number) else None
 
 
 def leaves(value: Value) -> Iterator[Leaf]:
-    """Return what of a value exists at run time."""
+    """Yield the parts of a value that exist at run time."""
     if isinstance(value, Number):
         yield value.type, value.code
     elif isinstance(value, Array):
@@ -111,7 +111,7 @@ def rebuilt(value: Value, names: Iterator[str]) -> Value:
 
 
 def signature(value: Value) -> Value:
-    """Return what a value is, but for the names of its leaves; what is known counts as it is."""
+    """Return the kind of a value, without the names of its leaves; known values are included."""
     if isinstance(value, Number):
         return value.kind
     if isinstance(value, Array):
@@ -127,7 +127,7 @@ def signature(value: Value) -> Value:
 
 
 def at_run_time(value: Value) -> Value:
-    """Return the value with every number that is known as one at run time."""
+    """Convert every known number in a value to one at run time."""
     if is_static(value):
         return constant(value)
     if isinstance(value, Record):
@@ -141,7 +141,7 @@ def at_run_time(value: Value) -> Value:
 
 
 def whole(size: Size | Scalar) -> Scalar:
-    """Return a size as a number."""
+    """Convert a size to a number."""
     return Number(WHOLE, size, natural=True) if isinstance(size, str) else size
 
 
@@ -161,7 +161,7 @@ def combined(emitter: Emitter, operation: Value, left: Size, right: Size) -> Siz
 
 
 def place_in(emitter: Emitter, index: Scalar, size: Size) -> Size:
-    """Find where an index points to, counted from the end where negative; checked if that is asked."""
+    """Find the position of an index, which may count from the end; check it if checks are enabled."""
     place = _counted(emitter, index, size)
     if emitter.fault is not None:
         code, end = (emitter.as_kind(whole(each), WHOLE).code for each in (place, size))
@@ -182,7 +182,7 @@ def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
 
 
 def part_of(emitter: Emitter, array: Array, index: tuple[Value, ...]) -> Array:
-    """Return a part of an array, by numbers and slices (pairs of bounds, None where open)."""
+    """Select a part of an array, by numbers and slices (pairs of bounds, None where open)."""
     offset: Size = 0
     shape: list[Size] = []
     strides: list[Size] = []
@@ -204,7 +204,7 @@ def part_of(emitter: Emitter, array: Array, index: tuple[Value, ...]) -> Array:
 
 
 def _within(emitter: Emitter, bound: Scalar, size: Size) -> Size:
-    """Return a bound of a slice: no further than the end."""
+    """Limit a bound of a slice to the end of the axis."""
     place = _counted(emitter, bound, size)
     if isinstance(place, int) and isinstance(size, int):
         return min(max(place, 0), size)
@@ -222,7 +222,7 @@ def _moved(emitter: Emitter, array: Array, offset: Size) -> str:
 
 
 def load(emitter: Emitter, place: Array) -> Number:
-    """Return the number at a place: an array without axes."""
+    """Load the number in an array without axes."""
     stored, kind = STORED[place.dtype]
     found = emitter.number(kind, f"load {stored}, ptr {place.pointer}")
     if stored == "i8" and kind == TRUTH:
@@ -236,7 +236,7 @@ def load(emitter: Emitter, place: Array) -> Number:
 
 
 def store(emitter: Emitter, place: Array, value: Scalar) -> None:
-    """Write a number to a place."""
+    """Store a number in an array without axes."""
     stored, kind = STORED[place.dtype]
     number = emitter.as_kind(value, kind)
     if stored == "i8" and kind == TRUTH:
@@ -250,7 +250,7 @@ def store(emitter: Emitter, place: Array, value: Scalar) -> None:
 
 
 def table(name: str, numbers: AnyArray) -> tuple[str, Array]:
-    """Return LLVM's definition of an array that is known and never written to, and the array."""
+    """Define a constant array; return LLVM's text and the array."""
     dtype = numbers.dtype.str
     stored, kind = STORED[dtype]
     if stored == "i8" and kind == TRUTH:
@@ -262,27 +262,27 @@ def table(name: str, numbers: AnyArray) -> tuple[str, Array]:
 
 
 def packed(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the strides of an array whose numbers lie close to each other."""
+    """Compute the strides of a contiguous array."""
     return tuple(prod(shape[axis + 1 :]) for axis in range(len(shape)))
 
 
 def made(emitter: Emitter, shape: tuple[int, ...], dtype: str) -> Array:
-    """Make memory for an array of known sizes, until the function returns."""
+    """Allocate memory for an array of known sizes, until the function returns."""
     memory = emitter.memory(STORED[dtype][0], max(1, prod(shape)))
     return Array(dtype, memory, shape, packed(shape), is_local=True)
 
 
 def is_local(value: Value) -> bool:
-    """Tell whether there is an array in it that is gone when its function returns."""
+    """Test whether a value contains an array whose memory ends when its function returns."""
     if isinstance(value, Array):
         return value.is_local
     return any(map(is_local, entries(value) or ()))
 
 
 def placed(value: Value, *, is_local: bool) -> Value:
-    """Return the value with arrays that are, or are not, gone when the function at hand returns.
+    """Mark the arrays of a value as local to the current function, or not.
 
-    What a function is given stays when it returns, and may be part of what that is.
+    The arguments of a function outlive it, and may be part of its result.
     """
     if isinstance(value, Array):
         return replace(value, is_local=is_local)

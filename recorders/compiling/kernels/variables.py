@@ -1,4 +1,4 @@
-"""Finds which names of a function are one value wherever they are used, and which need memory."""
+"""Search for names with a single value wherever they are used, and for those that need memory."""
 
 import ast
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class _Names(ast.NodeVisitor):
-    """Holds where names are given values and where they are used: branches and loops, and the order."""
+    """Assignments and uses of names, with their branches and loops, in order."""
 
     def __init__(self) -> None:
         self.given: dict[str, list[tuple[tuple[Value, ...], int]]] = {}
@@ -55,7 +55,7 @@ class _Names(ast.NodeVisitor):
                 self.visit_Name(each)
 
     def within(self, region: Value, nodes: Sequence[ast.AST]) -> None:
-        """Visit what lies in a branch or a loop."""
+        """Visit the nodes in a branch or a loop."""
         before, self._region = self._region, (*self._region, region)
         for each in nodes:
             self.visit(each)
@@ -64,7 +64,7 @@ class _Names(ast.NodeVisitor):
 
 @cache
 def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
-    """Find the names that are no single value: given one twice, or used where that may not be."""
+    """Find the names that need memory: assigned twice, or used where they may be unassigned."""
     names = _Names()
     for argument in ast.walk(definition.args):
         if isinstance(argument, ast.arg):
@@ -79,7 +79,7 @@ def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
 def _is_placed(
     given: list[tuple[tuple[Value, ...], int]], used: list[tuple[tuple[Value, ...], int]]
 ) -> bool:
-    """Tell whether some use may see another value than the one that stands nearest before it."""
+    """Test whether a use may see another value than that of the assignment directly before it."""
     for region, order in used:
         before = [each for each in given if each[1] < order]
         if not before or before[-1][0] != region[: len(before[-1][0])]:
