@@ -334,7 +334,7 @@ ROBOT = Model(
     start=START,
 )
 RECKONING = Model(
-    "robot pose from odometry alone",
+    "robot pose from odometry only",
     POSE,
     DeadReckoningParameters,
     (),

@@ -211,7 +211,7 @@ def _any_parameters(method: Method) -> type[Parameters]:
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
-_MODEL = "name of the model to estimate; without one, that which fits the log."
+_MODEL = "name of the model to estimate; by default, the registered model that fits the log."
 
 
 def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
@@ -367,7 +367,10 @@ def bind_model(
 
 def _check_role(label: str, role: str, roles: Collection[str]) -> None:
     if role not in roles:
-        raise BadInput(f"estimator {label}: topics.{role}: no model asks for it; {choices(role, roles)}")
+        raise BadInput(
+            f"estimator {label}: topics.{role}: no model has a topic of this name; "
+            f"{choices(role, roles)}"
+        )
 
 
 def _check_topics(

@@ -23,7 +23,7 @@ def requirements_of(model: Model) -> str:
     if model.start is None or model.control is None or not model.needs_sensor:
         return "; ".join(words)
     control, *maps, sensors = words
-    of_maps = [f"those about a map need {each}" for each in maps]
+    of_maps = [f"sensors with a map need {each}" for each in maps]
     return "; ".join([control, sensors.replace("one of", "any of", 1), *of_maps])
 
 
@@ -33,11 +33,11 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
         which = f"{name} needs" if len(models) == 1 else "a registered model needs"
-        return f"it has nothing that {which}"
+        return f"it has no topic that {which}"
     missing = "; ".join(part.words for part in parts if not part.is_here)
     if not missing:
-        return f"model {name} fits it, and is taken only by its name: --model {name}"
-    return f"model {name} comes nearest and lacks {missing}"
+        return f"model {name} fits it, but is only used if it is named: --model {name}"
+    return f"model {name} is the closest one, but lacks {missing}"
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
@@ -59,8 +59,8 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
             is_of_model = names_state(topics[prior], model, exactly=True)
             if others and place not in topics and is_of_model and not topics_of(model, topics, names):
                 return (
-                    f"{prior} is of model {name}, which needs {place} ({control.schema.full_name}); the "
-                    f"log has {', '.join(others)} of that type: choose one, as with "
+                    f"{prior} belongs to model {name}, which needs {place} ({control.schema.full_name}"
+                    f"); the log has {', '.join(others)} of that type: choose one, for example with "
                     f"--set topics.{control.topic}={others[0]}"
                 )
     return ""
@@ -91,7 +91,7 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
         words = f"{place} ({schema.full_name}"
         words += f" of system {system})" if system else ")"
         if known is not None and known.schema_name not in serving(schema):
-            return Requirement(f"{words}, which is {known.schema_name} here", is_here=False)
+            return Requirement(f"{words}, which has type {known.schema_name} in this log", is_here=False)
         is_of = known is not None and known.metadata.get("system", system) == system
         return Requirement(words, is_here=is_of)
 

@@ -47,7 +47,7 @@ _LIBM = {
     np.power: "pow",
 }
 _TESTS = (np.isnan, np.isfinite, np.isinf, np.signbit)
-_IS_EQUAL = """/* Whether numbers are equal; no NaN is. */
+_IS_EQUAL = """/* Whether two numbers are equal; false for NaN. */
 static int is_equal(REAL x, REAL y)
 {
     return x <= y && x >= y;
@@ -57,7 +57,7 @@ static int is_equal(REAL x, REAL y)
 HELPERS: Mapping[Any, tuple[str, str]] = {
     operator.mod: (
         "modulo",
-        """/* The remainder of x / y, which has the sign of y. */
+        """/* The remainder of x / y, with the sign of y. */
 static REAL modulo(REAL x, REAL y)
 {
     const REAL rest = fmod_S(x, y);
@@ -69,7 +69,7 @@ static REAL modulo(REAL x, REAL y)
     ),
     operator.floordiv: (
         "floor_of_quotient",
-        """/* The largest whole number that is not above x / y. */
+        """/* The largest integer that is not above x / y. */
 static REAL floor_of_quotient(REAL x, REAL y)
 {
     const REAL rest = fmod_S(x, y);
@@ -97,7 +97,7 @@ static REAL sinc(REAL x)
     ),
     np.sign: (
         "sign_of",
-        """/* -1, 0 or 1; NaN of NaN. */
+        """/* -1, 0 or 1; NaN for NaN. */
 static REAL sign_of(REAL x)
 {
     return x > 0.0_S ? 1.0_S : x < 0.0_S ? -1.0_S : isnan(x) ? x : 0.0_S;

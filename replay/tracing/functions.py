@@ -291,7 +291,7 @@ def _reason(error: Exception) -> str:
     no_method = re.search(r"which has no callable (\w+) method", str(error))
     if no_method:
         function = no_method[1]
-        return f"it uses np.{function} of an array in which some numbers are known; write it of each one"
+        return f"it uses np.{function} on an array with some known numbers; apply it to each number"
     if isinstance(error, IndexError) and "only integers" in str(error):
         return str(refused("an index"))
     return f"{type(error).__name__}: {error}"
@@ -315,7 +315,9 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
         ways = [
             "a number" if each.is_number else f"a tuple of {len(each.returned)}" for each in (yes, no)
         ]
-        raise CannotTrace(f"it returns {' on one way and '.join(ways)} on another; return one of them")
+        raise CannotTrace(
+            f"it returns {' on one path and '.join(ways)} on another; return the same on both"
+        )
     returned = tuple(
         graph.select(condition, *both) for both in zip(yes.returned, no.returned, strict=True)
     )
@@ -376,8 +378,8 @@ def traced(function: Any, *arguments: Argument) -> Any:
         return known
     if TracedFunction(function, arguments).kernel_identity() != made.kernel_identity():
         raise BadInput(
-            f"{place_of(function)}: it gives something else when it is called again; a clock, random "
-            "numbers and what changes meanwhile are no part of a model, so take them as parameters"
+            f"{place_of(function)}: it returns another result when it is called again; clocks, random "
+            "numbers and changing values cannot be part of a model, so make them parameters"
         )
     _KNOWN[key] = made, reads  # keeps a reference to the function, so that its id is not reused
     return made

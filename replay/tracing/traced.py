@@ -24,11 +24,11 @@ class CannotTrace(TypeError):
 MOST_WAYS = 256
 _MENDS = {
     "float()": "leave the number as it is, or write np.where(condition, a, b)",
-    "an array of float": "put the array together from its numbers: np.array([a, b])",
+    "an array of float": "build the array from its numbers: np.array([a, b])",
     "int()": "write np.floor or np.trunc, and np.choose for an index",
     "an index": "write np.interp(x, table_x, table_y), or np.choose(np.searchsorted(bounds, x), "
     "numbers)",
-    "math.*": "write np.* of it",
+    "math.*": "write np.* instead",
 }
 _INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 
@@ -36,14 +36,14 @@ _INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 def refused(what: str) -> CannotTrace:
     """Make the error for a use of a traced number that is not supported."""
     mend = _MENDS.get(what, "write it with operators, np.where and functions such as np.exp")
-    return CannotTrace(f"it uses {what} of a number that is not known before; {mend}")
+    return CannotTrace(f"it uses {what} on a number that is only known later; {mend}")
 
 
 def too_many_ways() -> CannotTrace:
     """Make the error for too many conditions, which may also come from an endless loop."""
     return CannotTrace(
-        f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that are not "
-        "known before; write np.clip or np.where, and a fixed number of rounds"
+        f"there are more than {MOST_WAYS} paths through its `if`s and `while`s on numbers that are only "
+        "known later; write np.clip or np.where, and a fixed number of iterations"
     )
 
 
@@ -176,7 +176,7 @@ def _chosen(a: Any, choices: Any) -> Any:
 def _known(what: str, table: Any) -> list[float]:
     """Return the numbers of a table; raise CannotTrace if they are traced."""
     if any(isinstance(each, Traced) for each in np.ravel(np.asarray(table, object))):
-        raise CannotTrace(f"it uses {what} of a table that is not known before; write np.where")
+        raise CannotTrace(f"it uses {what} on a table that is only known later; write np.where")
     return np.asarray(table, float).tolist()
 
 

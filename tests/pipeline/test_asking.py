@@ -84,7 +84,7 @@ def test_a_question_is_answered_and_nothing_done(
         ("replay a.mcap -e efk --set a=?", "no estimator 'efk'; did you mean 'ekf'?"),
         ("replay a.mcap -e ekf --model rbot --set a=?", "no model 'rbot'; did you mean 'robot'?"),
         ("diagnose a.mcap --set a=?", "--set NAME=?: name an estimator, such as -e ekf"),
-        ("estimators smoother:none", "'none' is not a filter that a smoother goes back over"),
+        ("estimators smoother:none", "'none' is not a filter that a smoother can use"),
     ],
 )
 def test_an_unknown_name_is_refused(

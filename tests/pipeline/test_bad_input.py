@@ -60,11 +60,11 @@ TABLE: dict[str, tuple[str, ...]] = {
     "run landmarks --late drop": ("only in the order of their arrival",),
     "run reactor --arrival-order": ("study reactor replays in the order of the stamps", "leave out"),
     'replay log.mcap -e ekf --set estimate=["bias_rnge_m"]': (
-        "not a parameter that can be estimated with this model",
+        "this model cannot estimate a parameter of this name",
         "'bias_range_m'",
     ),
     'replay log.mcap -e ekf --set estimate=["sigma_speed"]': (
-        "can be estimated with this model",
+        "this model cannot estimate a parameter of this name",
         "bias_bearing_rad",
     ),
     'replay log.mcap -e ekf --set estimate=["bias_range_m"]': ("estimate_sigma.bias_range_m=",),

@@ -215,8 +215,9 @@ def test_info_says_that_no_model_fits(
     fl.write("own.mcap", [fl.make_stream("/p/camera", fl.schemas.VECTOR_MEASUREMENT, [10**9], **seen)])
     said = fuselog("info", "own.mcap").out.splitlines()[-1]
     assert said == (
-        "No registered model fits it: it has nothing that a registered model needs; use a model of your "
-        'own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the documentation'
+        "No registered model fits it: it has no topic that a registered model needs; use a model of "
+        'your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the '
+        "documentation"
     )
 
 
@@ -366,7 +367,7 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         for row in fuselog("models", "--json").json
     }
     methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "sqrt", "smoother", "imm", "particles", "bound")
-    no_angle = "no: it lacks an angle or an orientation in its state, across which to cut its prior"
+    no_angle = "no: it lacks an angle or an orientation in its state, along which to split its prior"
     assert listed["vehicle"] == {**dict.fromkeys(methods, "yes"), "bank": no_angle}
     assert listed["robot"]["bank"] == "yes"
     table = fuselog("models").out

@@ -80,7 +80,7 @@ def test_from_the_bag_to_a_picture(fuselog: Callable[..., Any], real_data: Path,
     done = fuselog("replay", str(log), *both, "--save", str(rrd), "-o", str(estimates))
     assert done.code == 0
     for words in (
-        "ekf: the log has no prior (/prior): it begins at the first message of /pose",
+        "ekf: the log has no prior (/prior): the estimate starts at the first message of /pose",
         "smoother:ekf: no channel states turn_noise_density: 0.05 is assumed; --set turn_noise_density=",
     ):
         assert words in done.out
@@ -96,7 +96,7 @@ def test_from_the_bag_to_a_picture(fuselog: Callable[..., Any], real_data: Path,
     assert_array_equal(drawn["sim_time"], driven.publish_time_ns - seen.publish_time_ns[0])
     alone = fuselog("replay", str(log), "-e", "ekf", "--set", "topics.pose=", "-o", str(estimates))
     assert alone.code == 0
-    assert "it begins at zero, where its frame is" in alone.out
+    assert "the estimate starts at zero, the origin of its frame" in alone.out
     own = source["/odometry_pose"]
     steps_m = np.hypot(*np.diff(own["position_m"][:, :2], axis=0).T)
     reckoned = fl.open(estimates)["/estimates/ekf/pose"]["mean"]

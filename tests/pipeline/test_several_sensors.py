@@ -204,11 +204,11 @@ def test_commands_and_c_have_the_same_names(
     [
         (
             {"/gps2/fix.lever_z_m": 1.0},
-            "/gps2/fix.lever_z_m: its sensor reads no such parameter; did you",
+            "/gps2/fix.lever_z_m: its sensor has no such parameter; did you",
         ),
         (
             {"/gps3/fix.lever_x_m": 1.0},
-            "/gps3/fix has parameters of its own, but no sensor takes this topic; did you",
+            "parameters are set for /gps3/fix, but no sensor uses this topic; did you",
         ),
         ({"/gps2/fix.lever_x_m": "far"}, "parameter '/gps2/fix.lever_x_m' is 'far'"),
         ({"/gps2/fix.sigma_fix_m": -1.0}, "/gps2/fix: parameter 'sigma_fix_m' is -1.0"),
@@ -216,7 +216,7 @@ def test_commands_and_c_have_the_same_names(
             {"topics": {"fix": "/gps1/fix,/gps3/fix"}},
             "topics.fix = /gps3/fix: the log has no such topic",
         ),
-        ({"topics": {"fix": "/gps1/fix,/compass1/heading"}}, "no topic of the log that serves as fix"),
+        ({"topics": {"fix": "/gps1/fix,/compass1/heading"}}, "no such topic that serves as fix"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

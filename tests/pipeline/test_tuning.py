@@ -196,7 +196,7 @@ def test_a_log_without_a_prior_gives_the_same_from_far_and_near(drive: fl.Memory
     assert far.found.optimum == pytest.approx(near.found.optimum, rel=1e-3)
     assert far.parameters["start"].tolist() == [0.05]
     assert any(each.startswith(f"{name}: no channel states it") for each in far.notes)
-    assert any("begins where its path fits the first fixes" in each for each in far.notes)
+    assert any("starts where the path fits the first fixes" in each for each in far.notes)
 
 
 @pytest.mark.paper

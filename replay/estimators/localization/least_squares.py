@@ -65,11 +65,11 @@ class Status(IntEnum):
 
 SENTENCES = {
     Status.CONVERGED: "converged",
-    Status.NO_START: "no starting point: the rays of some target do not meet",
-    Status.NOT_FINITE: "the model has no finite value at the starting point (a target on a sensor?)",
-    Status.STALLED: "no part of the step lowers the cost: the run diverges",
-    Status.ITERATION_LIMIT: "not converged within the iteration limit",
-    Status.UNOBSERVABLE: "the measurements do not determine all parameters: rank below their number",
+    Status.NO_START: "no starting point: the rays to a target do not intersect",
+    Status.NOT_FINITE: "the model is not finite at the starting point; is a target on a sensor?",
+    Status.STALLED: "no step lowers the cost: the search diverges",
+    Status.ITERATION_LIMIT: "the search did not converge within the iteration limit",
+    Status.UNOBSERVABLE: "the measurements do not determine all parameters: rank too low",
 }
 
 
@@ -132,7 +132,7 @@ def solve(model: Model, start: Floats, *, max_iterations: int = 50) -> Solution:
     Raises BadInput if `start` has a wrong shape.
     """
     if start.ndim != 2 or 0 in start.shape:
-        raise BadInput(f"least squares: start has shape {start.shape}; give (runs, parameters)")
+        raise BadInput(f"least squares: start has shape {start.shape}; expected (runs, parameters)")
 
     def solve_block(block: Rows) -> Solution:
         return _solve_block(

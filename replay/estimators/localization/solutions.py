@@ -100,5 +100,5 @@ def positive(topic: Topic, name: str) -> float:
     """Return a positive number from the channel's metadata; raise BadInput for any other value."""
     value = stated([topic], name)
     if not 0.0 < value < np.inf:
-        raise BadInput(f"topic {topic.name} states {name} = {value:g}, which must be positive")
+        raise BadInput(f"topic {topic.name} states {name} = {value:g}; expected a positive number")
     return value

@@ -136,9 +136,9 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """
     samples, topic = read_samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
-        raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
+        raise BadInput(f"{topic} has no position to start from; give a topic of position fixes")
     start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
-    motion, how = read_motion(streams, parameters), "levelled, its heading unknown"
+    motion, how = read_motion(streams, parameters), "levelled, with an unknown heading"
     mean, covariance = np.zeros(16), np.zeros((15, 15))
     mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
     covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
@@ -154,7 +154,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
         found = _heading(turning, start_ns, motion, row, parameters)
         if found is not None:
             heading, heading_sigma = found[0], stated_or(parameters.heading_sigma_rad, found[1])
-            how = "levelled, its heading the course"
+            how = "levelled, with the course as its heading"
             how += _mounting(samples, turning, start_ns, motion, tilted, heading, parameters)
         how += _leap(samples, motion, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
@@ -234,8 +234,9 @@ def _first_place(
     if not len(usable):
         later_s = (time_ns[0] - samples.time_ns[0]) * NS if len(fix) else np.nan
         raise BadInput(
-            f"no message of {fix.topic} within the span of {topic}, and it begins "
-            f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
+            f"no message of {fix.topic} is within the time span of {topic}; it starts "
+            f"{later_s:.3g} s later; if their clocks differ, correct them by fix_delay_s or "
+            "inertial_delay_s"
         )
     first = usable[0]
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
@@ -250,15 +251,15 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
     x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
     length = float(np.sqrt(x * x + y * y + z * z))
     if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
-        in_g = "; it looks like g: import it with that unit" if 0.8 < length < 1.25 else ""
+        in_g = "; the unit looks like g: import the topic with that unit" if 0.8 < length < 1.25 else ""
         raise BadInput(
-            f"topic {topic}: gravity reads {length:.3g} m/s2 in the first {parameters.level_s:g} s, "
-            f"where it is 9.8{in_g}"
+            f"topic {topic}: the specific force is {length:.3g} m/s2 in the first "
+            f"{parameters.level_s:g} s; expected gravity, 9.8 m/s2{in_g}"
         )
     if z < -0.5 * length:
         raise BadInput(
             f"topic {topic}: the specific force of the first {parameters.level_s:g} s points down "
-            f"(z = {z:.3g} m/s2): is the unit mounted upside down? mounting_roll_rad=3.14159 turns it"
+            f"(z = {z:.3g} m/s2); if the unit is mounted upside down, give mounting_roll_rad=3.14159"
         )
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
@@ -282,9 +283,8 @@ def _bias(
     largest = float(np.abs(bias).max())
     if largest > LARGEST_BIAS_RADPS:
         raise BadInput(
-            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than the error of any gyro; "
-            "it looks "
-            "like deg/s: import it with that unit"
+            f"topic {topic}: the mean turn rate at rest is {largest:.3g} rad/s, more than the bias of "
+            "any gyro; the unit looks like deg/s: import the topic with that unit"
         )
     since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * NS
     _, stretch, count = np.unique(since_s // parameters.level_s, return_inverse=True, return_counts=True)
@@ -311,9 +311,9 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {motion.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
-        f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
-        f"inertial_delay_s={shift_s:g} moves the unit's"
+        f"; {motion.topic} starts to move {later_s:.3g} s after the unit; if their clocks differ by "
+        f"the {LEAP_SECONDS} leap seconds between GPS time and UTC, "
+        f"give inertial_delay_s={shift_s:g}"
     )
 
 
@@ -387,6 +387,7 @@ def _mounting(
         return ""
     yaw = wrap_angle(parameters.mounting_yaw_rad + apart)
     return (
-        f"; it speeds up {np.degrees(abs(apart)):.0f} deg to the {'left' if apart > 0 else 'right'} of "
-        f"where it seems to: is the unit mounted otherwise? mounting_yaw_rad={yaw:.2f} would fit"
+        f"; the velocity changes {np.degrees(abs(apart)):.0f} deg to the "
+        f"{'left' if apart > 0 else 'right'} of the measured acceleration; if the unit is mounted "
+        f"rotated, give mounting_yaw_rad={yaw:.2f}"
     )

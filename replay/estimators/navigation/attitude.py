@@ -179,16 +179,15 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     )
     if not np.isfinite(field).all():
         raise BadInput(
-            f"topic {stream.topic}: has no magnetic field in its first {parameters.rest_s:g} s, by "
-            "which "
-            "the heading begins; make rest_s longer, or give the log a prior"
+            f"topic {stream.topic}: no magnetic field in the first {parameters.rest_s:g} s, "
+            "which determines the heading at the start; increase rest_s, or give the log a prior"
         )
     with np.errstate(invalid="ignore"):
         orientation = triad(force, field)
     if not np.isfinite(orientation).all():
         raise BadInput(
-            f"topic {stream.topic}: specific force and magnetic field are parallel at the start, which "
-            "determines no heading; give the log a prior"
+            f"topic {stream.topic}: specific force and magnetic field are parallel at the start, so "
+            "they do not determine the heading; give the log a prior"
         )
     _, north, up = into_plane(tuple(orientation), tuple(field))
     mean = np.concatenate([orientation, np.zeros(6), [north, up]])
@@ -201,7 +200,9 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
         ],
         [3, 3, 3, 2],
     )
-    return Started(begin_ns, mean, np.diag(sigma**2), "at rest, levelled, north by its magnetometer")
+    return Started(
+        begin_ns, mean, np.diag(sigma**2), "at rest, levelled, with the heading of the magnetometer"
+    )
 
 
 UNIT = replace(CARRIED, delay="", estimates=True)  # its clock is the only one

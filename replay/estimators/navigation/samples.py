@@ -57,7 +57,7 @@ def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
     finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
     if not finite.any():
         raise BadInput(
-            f"topic {inertial.topic}: has no sample with both specific force and turn rate to begin with"
+            f"topic {inertial.topic}: no sample has both specific force and turn rate, as a start needs"
         )
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / NS)
     force, rate = (column[finite] for column in columns)

@@ -260,7 +260,7 @@ FILTERS: Mapping[str, Method] = {
         lacks=_lacks_moments,
     ),
     "sqrt": Method(
-        "square-root filter, which keeps digits that covariances lose; the filter follows the name, as "
+        "square-root filter for ill-conditioned covariances; the filter follows the name, as "
         "in sqrt:ukf",
         SquareRootParameters,
         no_steps,

@@ -23,9 +23,9 @@ from fuselog.replay.inference.model.stage import Stage
 FAILURES = (
     "the covariance is no longer positive definite",
     "the estimate is no longer finite",
-    "no particle explains what was measured",
-    "the truth is not known here",
-    "what drives the motion is silent for too long",
+    "no particle explains the measurement",
+    "the truth is unknown at this time",
+    "the control is missing for too long",
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4

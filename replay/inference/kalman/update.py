@@ -249,7 +249,7 @@ def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
         for name, kind in sensor.measured.items():
             if components.setdefault(name, kind) != kind:
                 raise BadInput(
-                    f"sensor {sensor.topic}: {name} is {kind} here and {components[name]} elsewhere"
+                    f"sensor {sensor.topic}: {name} is {kind}, but {components[name]} in another sensor"
                 )
     return components
 

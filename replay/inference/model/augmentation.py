@@ -80,7 +80,9 @@ def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added
     }
     for option, given in options.items():
         for name in given.keys() - set(asked):
-            raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
+            raise BadInput(
+                f"estimator {label}: {option}.{name}: {name} is not in `estimate`; add it there"
+            )
     named: dict[str, GaussMarkov] = {}
     errors: dict[PointError, GaussMarkov] = {}
     for asks in asked:
@@ -88,9 +90,9 @@ def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added
         own = point_errors(where, model, asks)
         if not own and asks not in model.augmentable:
             known = choices(asks, model.augmentable)
-            raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
+            raise BadInput(f"{where}: this model cannot estimate a parameter of this name; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
-            raise BadInput(f"{where}: is named twice; name it once")
+            raise BadInput(f"{where}: the parameter is named twice; name it once")
         sigma, drift, time_s = (given.get(asks) for given in options.values())
         if sigma is None:
             raise BadInput(
@@ -99,8 +101,8 @@ def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added
             )
         if time_s is not None and model.augmentable.get(asks) == "angle":
             raise BadInput(
-                f"{where}: is an angle, which cannot return to a mean; give "
-                f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
+                f"{where}: an angle cannot return to a mean; give "
+                f"estimate_drift.{asks} instead of estimate_time_s.{asks}"
             )
         process = GaussMarkov(sigma, drift or 0.0, time_s or np.inf)
         if own:
@@ -114,19 +116,17 @@ def check_augmentable(where: str, model: Model) -> None:
     """Raise BadInput if `augmentable` does not map parameters of the model to "linear" or "angle"."""
     if not isinstance(model.augmentable, Mapping):
         raise BadInput(
-            f"{where}: augmentable is a {type(model.augmentable).__name__}; it is a mapping from "
+            f"{where}: augmentable is a {type(model.augmentable).__name__}; expected a mapping from "
             'parameter to kind, such as {"length_m": "linear"}'
         )
     known = number_fields(model.parameters)
     for name, kind in model.augmentable.items():
         if name not in known:
             raise BadInput(
-                f"{where}: augmentable: '{name}' is no parameter of the model; {choices(name, known)}"
+                f"{where}: augmentable: '{name}' is not a parameter of the model; {choices(name, known)}"
             )
         if kind not in ("linear", "angle"):
-            raise BadInput(
-                f"{where}: augmentable: {name} is of kind '{kind}'; known are linear and angle"
-            )
+            raise BadInput(f"{where}: augmentable: {name} is of kind '{kind}'; expected linear or angle")
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:

@@ -131,7 +131,7 @@ def with_more(
                     for kind in kinds
                     if own.schema_name in serving(kind.schema)
                 ]
-                why = f"no topic of the log that serves as {role}; {choices(name, known)}"
+                why = f"the log has no such topic that serves as {role}; {choices(name, known)}"
                 raise BadInput(f"estimator {label}: topics.{role}: {name}: {why}")
             place = max(place for place, (sensor, _) in enumerate(sensors) if sensor.topic == role)
             sensors[place + 1 : place + 1] = [(each, topic) for each in serves]
@@ -346,16 +346,17 @@ def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, To
     if own and len(own) < len(placing):
         (sensor, topic), other = own[0], next(each for each in placing if each not in own)
         raise BadInput(
-            f"estimator {label}: {other[1].name} says where on earth, {topic.name} in "
-            f"{plane_in_words(topic.metadata)}, and no channel states where on earth that is; state it "
-            f"with --set {topic.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or leave one of them out with "
+            f"estimator {label}: {other[1].name} measures positions on earth, {topic.name} positions in "
+            f"{plane_in_words(topic.metadata)}, and no channel states its origin on earth; give it "
+            f"with --set {topic.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or leave one topic out with "
             f"--set topics.{other[0].topic}= or --set topics.{sensor.topic}="
         )
     if found.has_prior and frame_of(found.prior.metadata) and found.geodetic and "x_m" in model.state:
         raise BadInput(
-            f"estimator {label}: {found.geodetic[0].name} says where on earth, {found.prior.name} in "
-            f"{plane_in_words(found.prior.metadata)}; state where on earth that is with --set "
-            f"{found.prior.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or import it again with --origin"
+            f"estimator {label}: {found.geodetic[0].name} measures positions on earth, "
+            f"{found.prior.name} is in {plane_in_words(found.prior.metadata)}; give its origin on earth "
+            f"with --set {found.prior.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or import it again with "
+            "--origin"
         )
     if own:
         return found._replace(frame=own[0][1].metadata[FRAME])

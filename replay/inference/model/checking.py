@@ -288,7 +288,7 @@ def _check_correction(
     step = 0.3 * rng.normal(size=model.tangent)
     again = correct.step(at, correct.back(at, tuple(step), slope), slope)
     if not np.allclose(again, step, atol=1e-9):
-        both = f"{place_of(correct.step)} does not find the step of {place_of(correct.back)}"
+        both = f"{place_of(correct.step)} does not return the step that {place_of(correct.back)} took"
         raise AssertionError(both)
 
 
@@ -329,7 +329,7 @@ def _compare(
         inner = _tangent(call.state)[column] if name == "state" else f"{name} {column}"
         raise AssertionError(
             f"{call.what}: the derivative of {_tangent(call.outputs)[row]} by {inner} is "
-            f"{found[row]:.9g} and {others[row]:.9g} {how}"
+            f"{found[row]:.9g}, but {others[row]:.9g} {how}"
         )
 
 
@@ -363,10 +363,14 @@ def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
             away = _difference(call.value(twin, *others), value, outputs)
             wrong = np.flatnonzero(~(np.abs(away) <= 1e-8 * max(1.0, np.abs(value).max())))
             if len(wrong):
-                same = "a full turn on" if kind == "angle" else "at its negative, which is the same"
+                same = (
+                    "after a full turn"
+                    if kind == "angle"
+                    else "at its negative, which is the same state"
+                )
                 other = _tangent(call.outputs)[wrong[0]]
                 raise AssertionError(
-                    f"{call.what}: {names[first]} is of kind {kind}, but {other} is another {same}"
+                    f"{call.what}: {names[first]} is of kind {kind}, but {other} differs {same}"
                 )
 
 
@@ -376,7 +380,7 @@ def _check_length(call: _Call, value: Floats) -> None:
         if kind in ("axis", "quaternion") and not abs(np.linalg.norm(vector) - 1.0) < 1e-9:
             raise AssertionError(
                 f"{call.what}: {list(call.outputs)[first]} and its neighbours are of kind {kind}, but "
-                f"come out with length {np.linalg.norm(vector):.6g}"
+                f"have length {np.linalg.norm(vector):.6g}"
             )
 
 
@@ -431,7 +435,7 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
 
     if changes(1.0) and not changes(TURN):
         raise AssertionError(
-            f"check_model: {name} is declared linear, but nothing changes when it is a full turn on; "
+            f"check_model: {name} is declared linear, but nothing changes after a full turn; "
             "its kind is angle"
         )
 
@@ -445,7 +449,7 @@ def _check_noise(
     matrix = _matrix(noise, arguments, size, block)
     smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
     if not smallest >= -scale:
-        raise AssertionError(f"{place_of(noise)} gives a negative variance, {smallest:.6g}")
+        raise AssertionError(f"{place_of(noise)} returns a negative variance, {smallest:.6g}")
 
 
 def _matrix(
@@ -490,9 +494,9 @@ def _not_additive(
         name for name, is_wrong in zip(_tangent(model.state), wrong, strict=True) if is_wrong
     )
     return [
-        f"{place_of(motion.noise or motion.control_noise or motion.move)}: the noise does not add up: "
+        f"{place_of(motion.noise or motion.control_noise or motion.move)}: the noise is not additive: "
         f"over {SHORT_S:g} s the variance of {names} is {ratio[wrong][0]:.3g} times that of two halves, "
-        "so that estimates depend on how many messages there are; let a step add a variance "
+        "so estimates depend on the number of messages; make the added variance "
         "proportional to duration_s"
     ]
 

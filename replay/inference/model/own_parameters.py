@@ -70,14 +70,14 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
         if not sensors:
             taken = dict.fromkeys(own.name for each in found for _, own in each.sensors)
             raise BadInput(
-                f"estimator {label}: {topic} has parameters of its own, but no sensor takes this topic; "
-                f"{choices(topic, taken)}; --set topics.KIND=TOPIC,TOPIC takes several of a kind"
+                f"estimator {label}: parameters are set for {topic}, but no sensor uses this topic; "
+                f"{choices(topic, taken)}; --set topics.KIND=TOPIC,TOPIC uses several of a kind"
             )
         known = dict.fromkeys(name for sensor in sensors for name in read_by(model, sensor))
         for name in table:
             if name not in known:
                 raise BadInput(
-                    f"estimator {label}: {topic}.{name}: its sensor reads no such parameter; "
+                    f"estimator {label}: {topic}.{name}: its sensor has no such parameter; "
                     f"{choices(name, known)}"
                 )
         build(model.parameters, table, f"estimator {label}: {topic}")
@@ -120,7 +120,7 @@ def _transformed(
             if owned.setdefault(field, (topic, name)) != (topic, name):
                 raise BadInput(
                     f"the parameters of {topic} and {owned[field][0]} would have the same names; rename "
-                    "one of the topics, as fuselog relabel does"
+                    "one of the topics with fuselog relabel"
                 )
     made = replace(
         model,
@@ -157,7 +157,7 @@ def _with_fields(
         )
         fields[field] = bounds | None, None
         lines.append(f"    {field}: {said.get(name, name).rstrip('.')}; of {topic}.")
-    doc = "\n".join(["States what topics have for themselves.", "", "Attributes:", *lines])
+    doc = "\n".join(["Parameters of single topics.", "", "Attributes:", *lines])
     made = create_model(f"{parameters.__name__}OfTopics", __base__=parameters, __doc__=doc, **fields)
     made.OWNED = dict(owned)  # type: ignore[attr-defined]
     return made

@@ -111,7 +111,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
         row, _ = lacking[0]
         missing = list(dict.fromkeys(name for _, name in lacking))
         usual = model.start.parameters if model.start is not None else {}
-        better = ", or numbers that you know better" if usual else ""
+        better = ", or with better values if you know them" if usual else ""
         mend = " ".join(
             f"--set {model.key_of(name)}={usual.get(model.kind_of(name), '...')}" for name in missing
         )

@@ -16,8 +16,8 @@ def check_state(where: str, model: Model) -> None:
     """Raise BadInput if the kinds of a state's components are invalid."""
     if not are_kinds(model.kinds):
         raise BadInput(
-            f"{where}: a state of kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
-            "side by side) or quaternion (four side by side)"
+            f"{where}: the state has kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
+            "in a row) or quaternion (four in a row)"
         )
 
 
@@ -38,8 +38,8 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Settings)
     _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
     if motion.noises and (motion.noise is None or motion.control_noise is not None):
         raise BadInput(
-            f"{where}: noise that is not additive needs its variances, `noise`, and takes that of the "
-            "control with it; leave out `control_noise`"
+            f"{where}: noise that is not additive needs its variances, `noise`, and includes that of "
+            "the control; leave out `control_noise`"
         )
     if motion.noise is not None:
         wanted = (motion.noises,) if motion.noises else sizes
@@ -98,7 +98,7 @@ def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats
         given = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
         raise BadInput(
             f"{where}: the initial probabilities of the modes are {given}; give numbers of zero or more "
-            "whose sum is one"
+            "with sum one"
         )
     return rates, initial
 
@@ -122,14 +122,16 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, reference, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
-        raise BadInput(f"{where}: states no noise; give `noise`, or `covariance`, the field that has it")
+        raise BadInput(
+            f"{where}: has no noise; give `noise`, or `covariance`, the field that contains it"
+        )
     if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:
         raise BadInput(
-            f"{where}: the covariance {sensor.covariance} needs the field that it is of; give `vector`"
+            f"{where}: the covariance {sensor.covariance} needs the field it belongs to; give `vector`"
         )
     if callable(sensor.covariance) and sensor.read is None:
         raise BadInput(
-            f"{where}: reads covariances of fields that it does not read; give `read` as well"
+            f"{where}: `covariance` is a function, so the measurement needs one too; give `read`"
         )
     if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
@@ -145,12 +147,13 @@ def _check_interpolated(where: str, model: Model, control: Control) -> None:
             for each in (control, driving)
         )
         raise BadInput(
-            f"{where}: reads the control {asked}, the model's is {given}; give both the same `control`"
+            f"{where}: reads the control {asked}, but the model's is {given}; give both the same "
+            "`control`"
         )
     if not driving.interpolated:
         raise BadInput(
-            f"{where}: reads the control {control.topic} at its stamp, and that is held from message to "
-            "message; give the model's Control interpolated=True, or the sensor no `control`"
+            f"{where}: reads the control {control.topic} at its stamp, but the control is held between "
+            "messages; give the model's Control interpolated=True, or the sensor no `control`"
         )
 
 

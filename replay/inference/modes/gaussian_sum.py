@@ -303,7 +303,7 @@ class GaussianSumFilter(MixtureFilter):
 
 def _lacks(model: Model, inner: Method) -> str:
     if set(model.kinds) == {"linear"}:
-        return "an angle or an orientation in its state, across which to cut its prior"
+        return "an angle or an orientation in its state, along which to split its prior"
     return inner.lacks(model)
 
 
@@ -325,7 +325,7 @@ def _made_for(parameters: GaussianSumParameters) -> Method:
 
 
 GAUSSIAN_SUM = Method(
-    "bank of filters from a prior cut across its widest angle; the filter follows the name: bank:ekf",
+    "Gaussian-sum filter, which splits a wide prior; the filter follows the name, as in bank:ekf",
     GaussianSumParameters,
     no_steps,
     lacks=partial(_lacks, inner=FILTERS["ekf"]),

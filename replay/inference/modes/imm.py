@@ -82,7 +82,9 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
     @classmethod
     def _no_mode(cls, mode: object) -> None:
         if mode is not None:
-            raise ValueError("imm takes all modes of a model; leave out `mode`, or use a filter of one")
+            raise ValueError(
+                "imm uses all modes of a model; leave out `mode`, or use a filter for one mode"
+            )
 
 
 # Steps
@@ -195,7 +197,7 @@ class InteractingFilter(MixtureFilter):
     def why_in_sequence(self) -> str:
         """See `Filter.why_in_sequence`."""
         if self.parameters.smoothed_modes:
-            return "smoothed modes use what came later in any case (smoothed_modes)"
+            return "smoothed modes use later messages anyway (smoothed_modes)"
         return super().why_in_sequence
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:

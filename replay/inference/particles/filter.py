@@ -70,9 +70,7 @@ class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
     @model_validator(mode="after")
     def _parts_are_possible(self) -> Self:
         if self.progressive and self.resample_below == 1.0:
-            raise ValueError(
-                "progressive leaves resample_below of all effective, which cannot be 1; give less"
-            )
+            raise ValueError("with progressive, resample_below must be less than 1; reduce it")
         return self
 
 
@@ -152,7 +150,7 @@ class ParticleFilter(Filter):
     @property
     def why_in_sequence(self) -> str:
         """See `Filter.why_in_sequence`."""
-        return "all particles would have to be kept for every message of the window"
+        return "all particles would have to be stored for every message of the window"
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter the events of runs that have a measurement; the events of other runs wait."""
@@ -184,8 +182,8 @@ class ParticleFilter(Filter):
             time_ns[[*first.values()]],
             np.zeros(len(first), np.int64),
             [
-                f"{', '.join(constant)} is constant, and particles have only the values that were drawn "
-                "at the start; give estimate_drift, or take a Gaussian filter such as ekf"
+                f"{', '.join(constant)} is constant, so particles keep the values that were drawn "
+                "at the start; give estimate_drift, or use a Gaussian filter such as ekf"
             ],
         )
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]

@@ -326,7 +326,7 @@ def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int)
     if numbers.shape != (len(ragged), components):
         raise BadInput(
             f"topic {ragged.stream.topic}: the model reads an array of shape {numbers.shape} from "
-            f"{len(ragged)} messages; ({len(ragged)}, {components}) is needed"
+            f"{len(ragged)} messages; expected ({len(ragged)}, {components})"
         )
     return numbers
 
@@ -342,7 +342,7 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
     """
     in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
     reasons = [
-        f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
+        f"topic {topic.name}: the state is unknown while {control.topic} is missing for longer than "
         f"{control.gap}"
         for _, topic in found.sensors
     ]
@@ -377,7 +377,7 @@ def passed_over(
     reasons = [
         complaint_of(stage.model, sensors[topic], topic)
         if topic in sensors
-        else f"topic {topic}: it is not finite"
+        else f"topic {topic}: the control is not finite"
         for topic in block.streams
     ]
     merged = block.events

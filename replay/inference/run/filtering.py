@@ -305,13 +305,13 @@ class Filter:
         """Reason why the filter needs its messages in order; empty if it can reprocess late ones."""
         control = self.stage.model.control
         if self.parameters.every_s is not None:
-            return "there are no estimates between messages (every_s, --every) then"
+            return "it does not support estimates between messages (every_s, --every)"
         if control is not None and control.interpolated:
-            return f"{control.topic} is interpolated, so that messages wait for the next one of it"
+            return f"{control.topic} is interpolated, so messages have to wait for its next message"
         if self.delays_ns.any():
-            return "its messages are put where they were measured, and wait for each other"
+            return "messages are moved to their times of measurement and have to wait for each other"
         if self.is_random:
-            return "its samples are random, so that a message that is used again gets others"
+            return "its samples are random, and would differ if a message were processed again"
         return ""
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:

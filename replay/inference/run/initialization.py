@@ -132,7 +132,7 @@ class Initializer:
             found[topic.name] = of_runs(fixes.stream.take(rows[has_one]), has_one)
             origins = origins_of(found[topic.name])
             streams.append(self._origin_stream(found[topic.name]))
-            what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
+            what = f"no channel states the origin of the plane: the first fix of {topic.name} is used"
             facts.append(Fact(what, time_ns, has_one))
         if not self.found.has_prior:
             prior, begun = self._prior(first, static, clock, origins)
@@ -215,8 +215,8 @@ class Initializer:
         measured = sensor.measured
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
         text = (
-            f"{names}: unknown at the start, since with these noise densities the path between the "
-            "first fixes does not tell it; state the densities of your sensors first, or give a prior"
+            f"{names}: unknown at the start, since the path between the first fixes does not determine "
+            "it with these noise densities; state the densities of your sensors, or give a prior"
         )
         return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
@@ -228,7 +228,7 @@ class Initializer:
 
     @property
     def _without(self) -> str:
-        return f"the log has no prior ({self.found.prior.name}): it begins"
+        return f"the log has no prior ({self.found.prior.name})"
 
     def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "Begun") -> list["Fact"]:
         """Start all runs at zero, at their first control; this defines the frame of the estimates."""
@@ -236,8 +236,14 @@ class Initializer:
             found_ns, has_one, _ = first_of_runs(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
         begun.covariance[:] *= CERTAIN**2
-        where = "at zero, where its frame is"
-        return [Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+        where = "at zero, the origin of its frame"
+        return [
+            Fact(
+                f"{self._without}: the estimate starts {where}",
+                begun.time_ns,
+                begun.time_ns < FOREVER_NS,
+            )
+        ]
 
     def _found(
         self,
@@ -263,7 +269,7 @@ class Initializer:
             begun.time_ns[run], begun.mean[run] = found.time_ns, found.mean
             begun.covariance[run], how[run] = found.covariance, found.how
         return [
-            Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            Fact(f"{self._without}: the estimate starts {words}", begun.time_ns, np.array(how) == words)
             for words in dict.fromkeys(filter(None, how))
         ]
 
@@ -316,10 +322,15 @@ class Initializer:
                 begun.mean[run], sigma = state_by_message(self.stage, number, table.data[rows[run]])
                 begun.covariance[run] = sigma**2 * np.eye(len(sigma))
         if (chosen < 0).all():
-            raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
+            raise BadInput(
+                f"estimator {self.name}: {self._without}, and no message can replace "
+                f"it: {self._complaints()}"
+            )
         return [
             Fact(
-                f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
+                f"{self._without}: the estimate starts at the first message of {topic.name}",
+                begun.time_ns,
+                chosen == number,
             )
             for number, _, topic in self._measuring
         ]
@@ -350,7 +361,11 @@ class Initializer:
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
-        return Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+        return Fact(
+            f"{self._without}: the estimate starts where the path fits the first fixes",
+            begun.time_ns,
+            is_aligned,
+        )
 
     def _align(self, events: FilterEvents, run: int, stage: Stage) -> tuple[int, Floats, Floats] | None:
         """Align a run: return stamp, mean and covariance at one of its first fixes, or None."""

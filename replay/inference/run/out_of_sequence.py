@@ -78,7 +78,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverR
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
     loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
-    title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
+    title = f"{title_of(stage.model, method.summary)}, which reprocesses late messages"
     return compile_over_runs(loop, title=title), steps
 
 

@@ -64,12 +64,12 @@ def cached_set(name: SetName, report: Report = silent) -> Array:
     if points is not None:
         return points
     if path.exists():
-        report(f"{path} is damaged or not ours; its samples are computed again")
+        report(f"{path} is damaged or not a file of fuselog; its samples are computed again")
     points = compute_set(name, report)
     try:
         write_sets(path, {name: points}, "fuselog on demand")
     except BadInput as error:
-        report(f"{error}; its samples are not kept")
+        report(f"{error}; its samples are not stored")
     return points
 
 

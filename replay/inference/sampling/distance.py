@@ -61,7 +61,7 @@ def lcd_distance(points: Array, weights: Array | None = None) -> float:
     if weights is None:
         weights = np.full(len(points), 1 / len(points))
     if weights.shape != points.shape[:1] or not abs(weights.sum() - 1) < 1e-9:
-        raise BadInput(f"{len(points)} samples need as many weights, whose sum must be 1")
+        raise BadInput(f"{len(points)} samples need the same number of weights, with sum 1")
     return lcd_distance_and_gradient(points, weights)[0]
 
 

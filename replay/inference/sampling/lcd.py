@@ -89,7 +89,7 @@ def check_count(dimension: int, count: int, symmetric: bool) -> None:
         kind = "symmetric samples" if symmetric else "samples"
         raise BadInput(
             f"{count} {kind} cannot have a regular covariance in {dimension} dimensions; "
-            f"take {least} or more"
+            f"give {least} or more"
         )
 
 

@@ -219,7 +219,7 @@ class BackMemory(NamedTuple):
 @lru_cache(maxsize=64)
 def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> OverRuns:
     """Make the loop of `backward_pass` over all runs, which is compiled when first called."""
-    return compile_over_runs(backward_pass(kinds, correct), title="a smoother's way back")
+    return compile_over_runs(backward_pass(kinds, correct), title="the backward pass of a smoother")
 
 
 class GoBack(Protocol):

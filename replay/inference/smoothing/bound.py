@@ -127,15 +127,15 @@ class BoundFilter(Filter):
         """List the topics needed before the start; raise BadInput if the log has no truth."""
         if self.truth not in topics:
             raise BadInput(
-                f"estimator {self.name}: a bound needs the true states, and there is no topic "
-                f"{self.truth}; give a log with a truth, such as a simulated one"
+                f"estimator {self.name}: a bound needs the true states, but the log has no topic "
+                f"{self.truth}; use a log with truth, such as a simulated one"
             )
         return (*super().static(topics), self.truth)
 
     @property
     def why_in_sequence(self) -> str:
         """See `Filter.why_in_sequence`."""
-        return "a bound is that of all messages in the order of their stamps"
+        return "a bound is only defined for messages in the order of their stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """Make the state at every run's prior; see `Filter.start`."""
@@ -260,7 +260,7 @@ class BoundFilter(Filter):
 
 
 POSTERIOR_BOUND = Method(
-    "posterior Cramer-Rao bound, which no filter gets below; that of smoothers is bound:smoother",
+    "posterior Cramer-Rao bound; bound applies to filters, bound:smoother to smoothers",
     BoundParameters,
     bound_steps,
     lacks=FILTERS["ekf"].lacks,

@@ -145,8 +145,8 @@ class IteratedSmoother(Smoother):
         _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
         if not np.array_equal(reached, way.offsets):
             raise BadInput(
-                f"estimator {self.name}: start = motion: the prior cannot be moved along all of a run; "
-                "choose another start"
+                f"estimator {self.name}: start = motion: the prior cannot be propagated through a whole "
+                "run; choose another start"
             )
         mean: Floats = moved.mean
         return mean

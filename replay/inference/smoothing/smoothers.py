@@ -74,13 +74,13 @@ def parse_forward(text: str) -> Forward:
     """Parse `SmootherParameters.forward`; raise BadInput if it is invalid."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     rest_on = before.removesuffix(":")
-    name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
+    name, variant = named_filter(rest_on, "smoother", "that a smoother can use")
     if not has_lag:
         return Forward(name, variant, FOREVER_NS)
     found = re.fullmatch(rf"(\d+)({'|'.join(UNITS_NS)})", lag)
     if found is None or int(found[1]) == 0:
         raise BadInput(
-            f"lag={lag} is not a lag; give a whole number above zero and its unit, one of "
+            f"lag={lag} is not a valid lag; give a positive whole number and its unit, one of "
             f"{', '.join(UNITS_NS)}, as in smoother:ekf:lag=500ms"
         )
     return Forward(name, variant, int(found[1]) * UNITS_NS[found[2]])
@@ -130,7 +130,7 @@ class Smoother(Filter):
     @property
     def why_in_sequence(self) -> str:
         """Reason why a smoother cannot reprocess late messages: it uses later messages in any case."""
-        return "a smoother uses later messages in any case; replay it in the order of the stamps"
+        return "a smoother uses later messages anyway; replay it in the order of the stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """Make the state at every run's prior; see `Filter.start`."""
@@ -263,7 +263,7 @@ def _smoother_of(name: str, variant: str) -> Method:
     def lacks(model: Model) -> str:
         motions = (model.modes or {"": model.motion}).values()
         if name == "analytic" and not all(motion.linear for motion in motions):
-            return "exact moments of its motion with the state before it"
+            return "exact moments of its motion together with the state before it"
         return inner.lacks(model)
 
     return replace(SMOOTHING, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
@@ -275,8 +275,8 @@ def _made_for(parameters: SmootherParameters) -> Method:
 
 
 SMOOTHING = Method(
-    "Rauch-Tung-Striebel smoother; the filter follows the name, as in smoother:ukf, and after it, if "
-    "wanted, a lag, as in smoother:ekf:lag=500ms",
+    "Rauch-Tung-Striebel smoother; the filter follows the name, as in smoother:ukf, and "
+    "optionally a lag, as in smoother:ekf:lag=500ms",
     SmootherParameters,
     no_steps,
     lacks=FILTERS["ekf"].lacks,

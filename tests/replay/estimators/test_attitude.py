@@ -94,7 +94,7 @@ def test_a_disturbed_field_is_kept_out_by_the_gate_and_turns_the_heading_without
     ("field", "message"),
     [
         (np.full(3, np.nan), "no magnetic field in its first 1 s"),
-        (np.array([0.0, 0.0, 40.0]), "parallel at the start, which determines no heading"),
+        (np.array([0.0, 0.0, 40.0]), "parallel at the start, so they do not determine"),
     ],
 )
 def test_a_start_without_heading_is_refused(field, message):

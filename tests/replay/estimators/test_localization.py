@@ -394,7 +394,7 @@ def test_a_robot_with_odometry_and_fixes_needs_no_prior() -> None:
     outputs = replayed("ekf", runs, gate_probability=1.0)
     reasons = sentences_of(outputs["started"].stream)
     assert set(reasons) == {
-        "the log has no prior (/robot1/prior): it begins where its path fits the first fixes"
+        "the log has no prior (/robot1/prior): the estimate starts where the path fits the first fixes"
     }
     assert len(reasons) == 100
     errors = errors_of(outputs["pose"], [*map(Truths, runs)])

@@ -243,7 +243,7 @@ def test_bad_input_is_refused_in_one_sentence():
     bad = MemorySource({**source.streams, "/prior": replace(prior, columns=singular)}, source.run, "bad")
     with pytest.raises(BadInput, match="not positive definite"):
         estimates([bad], ["lrkf:ukf"])
-    with pytest.raises(BadInput, match="take 3 or more"):
+    with pytest.raises(BadInput, match="give 3 or more"):
         bind("lrkf:s2kf-2", [source], {})
     with pytest.raises(BadInput, match="not a sampling"):
         bind("lrkf:foo", [source], {})

@@ -73,7 +73,7 @@ def test_after_a_gap_of_the_unit_all_but_its_biases_is_found_again(method: str):
     counted = skipped(found)
     assert len(counted) == 2  # fixes and velocities
     for reason, count in counted.items():
-        assert "nothing is known while inertial is silent for longer than inertial_gap_s" in reason
+        assert "the state is unknown while inertial is missing for longer than inertial_gap_s" in reason
         assert count == pytest.approx(6 * 15, abs=6)
     early, late = [], []
     for run, source in enumerate(sources):
@@ -96,7 +96,7 @@ def test_what_is_no_number_is_passed_over_and_counted():
     found = outputs(INERTIAL, "ekf", [drive(spoiled)])
     assert len(found["failure"].stream) == 0
     counted = skipped(found)
-    assert counted["topic /body/inertial: it is not finite"] == 1
+    assert counted["topic /body/inertial: the control is not finite"] == 1
     assert sum(count for reason, count in counted.items() if "/body/fix" in reason) == 1
     assert np.isfinite(found["state"]["mean"]).all()
 
@@ -126,7 +126,7 @@ UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
     ("scales", "words"),
     [
         ({"specific_force_mps2": 1 / 9.80665}, "gravity reads 1.0.* it looks like g"),
-        ({"turn_rate_radps": 180 / np.pi}, "at rest it turns by .* looks like deg/s"),
+        ({"turn_rate_radps": 180 / np.pi}, "turn rate at rest is .* looks like deg/s"),
         (
             {"specific_force_mps2": UPSIDE_DOWN, "turn_rate_radps": UPSIDE_DOWN},
             "points down .* mounting_roll_rad=3.14159",
@@ -193,7 +193,7 @@ def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, go
         assert last_s == pytest.approx(26.0)
         assert not ((times_s > 20.01) & (times_s < 22.99)).any()
     else:
-        assert failures == ["what drives the motion is silent for too long"]
+        assert failures == ["the control is missing for too long"]
         assert last_s == pytest.approx(20.0)
 
 

@@ -94,7 +94,7 @@ def test_a_robot_begins_at_its_first_pose() -> None:
     """There it is as uncertain as the pose says, and no more was assumed than is told."""
     found = outputs(ROBOT, "ekf", [log(odometry(), seen())])
     told = sentences_of(found["started"].stream)
-    assert told[0] == "the log has no prior (/prior): it begins at the first message of /pose"
+    assert told[0] == "the log has no prior (/prior): the estimate starts at the first message of /pose"
     assert [each.split(":")[0] for each in told[1:]] == [
         "no channel states forward_noise_density",
         "no channel states turn_noise_density",
@@ -162,7 +162,9 @@ def test_odometry_alone_begins_at_zero() -> None:
     """Also the model of odometry alone, which takes no fixes. A sighting needs its map all the same."""
     for model, others in ((ROBOT, ()), (RECKONING, (fix(), seen()))):
         found = outputs(model, "ekf", [log(odometry(), *others)])
-        assert sentences_of(found["started"].stream)[0].endswith("it begins at zero, where its frame is")
+        assert sentences_of(found["started"].stream)[0].endswith(
+            "at zero, the origin of its frame"
+        )
         end = found["pose"]["mean"][-1]
         wanted = (0.0, 0.0, 0.0)
         for _ in range(STEPS - 1):
@@ -203,7 +205,9 @@ def test_sightings_need_a_prior_which_nothing_overrules() -> None:
 
 def test_poses_without_a_covariance() -> None:
     source = log(odometry(), seen(known=False))
-    with pytest.raises(BadInput, match=r"begins nowhere: .*--set sigma_fix_m=...; give --set sigma_hea"):
+    with pytest.raises(
+        BadInput, match=r"can replace it: .*--set sigma_fix_m=...; give --set sigma_hea"
+    ):
         outputs(ROBOT, "ekf", [source])
     found = outputs(ROBOT, "ekf", [source], sigma_fix_m=0.3, sigma_heading_rad=0.05)
     assert len(found["skipped"]) == 0
@@ -276,7 +280,7 @@ def test_a_message_that_says_nothing_does_not_drive_and_is_counted() -> None:
     made = outputs(ROBOT, "ekf", [log(odometry(), half)], topics={"turn_rate": "inertial"})
     assert np.isfinite(made["pose"]["mean"]).all()
     skipped = sentences_of(made["skipped"].stream)
-    assert skipped == ["topic /inertial: it is not finite"] * STEPS
+    assert skipped == ["topic /inertial: the control is not finite"] * STEPS
 
 
 def test_of_two_samples_of_one_stamp_both_drive() -> None:
@@ -318,7 +322,9 @@ def test_headings_are_a_sensor() -> None:
 
 def test_a_pose_and_a_fix_in_planes_that_have_nothing_to_do_with_each_other() -> None:
     source = log(odometry(), seen(), fix())
-    with pytest.raises(BadInput, match=r"/fix says where on earth, /pose in frame map, and no channel"):
+    with pytest.raises(
+        BadInput, match=r"on earth, /pose positions in frame map, and no channel"
+    ):
         bound(ROBOT, "ekf", [source])
     for left_out, streams in (("fix", ("/odometry", "/pose")), ("pose", ("/odometry", "/fix"))):
         (only,) = bound(ROBOT, "ekf", [source], topics={left_out: ""})

@@ -163,9 +163,9 @@ def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
 @pytest.mark.parametrize(
     ("augmentable", "words"),
     [
-        (("delay_s",), "estimator test: augmentable is a tuple; it is a mapping from parameter to kind"),
-        ({"dellay_s": "linear"}, "'dellay_s' is no parameter of the model; did you mean 'delay_s'"),
-        ({"delay_s": "metres"}, "delay_s is of kind 'metres'; known are linear and angle"),
+        (("delay_s",), "augmentable is a tuple; expected a mapping from parameter to kind"),
+        ({"dellay_s": "linear"}, "'dellay_s' is not a parameter of the model; did you mean 'delay_s'"),
+        ({"delay_s": "metres"}, "delay_s is of kind 'metres'; expected linear or angle"),
     ],
 )
 def test_what_is_no_list_of_what_can_be_estimated_is_one_sentence(augmentable: Any, words: str) -> None:
@@ -187,13 +187,13 @@ def test_particles_say_that_a_parameter_is_constant() -> None:
         "one": {**given, "estimate_drift": drifts},
         "none": {**given, "estimate_drift": drifts, "estimate_time_s": comes_back},
     }
-    words = "is constant, and particles have only the values that were drawn at the start"
+    words = "is constant, so particles keep the values that were drawn at the start"
     said = [each.partition(words) for each in fl.replay(log, own).losses if words in each]
     assert [first for first, _, _ in said] == [
         "still robot1: bias_range_m, forward_scale ",
         "one robot1: forward_scale ",
     ]
-    assert all("give estimate_drift, or take a Gaussian filter" in mend for _, _, mend in said)
+    assert all("give estimate_drift, or use a Gaussian filter" in mend for _, _, mend in said)
 
 
 @pytest.mark.usefixtures("uncompiled")

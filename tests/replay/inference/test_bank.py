@@ -208,7 +208,7 @@ def test_members_agree_by_the_squared_distance_of_their_means(share: float):
 def test_what_has_no_angle_is_refused():
     from fuselog.replay.families.ranging.model import RANGING_POSITION
 
-    with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, across which"):
+    with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, along which"):
         modelled(RANGING_POSITION, "bank:ekf")
     with pytest.raises(BadInput, match="'pf' is not a filter for the members of a bank"):
         modelled(ROLLER, "bank:pf")

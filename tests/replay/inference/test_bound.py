@@ -324,7 +324,7 @@ def alone(sources: Sequence[MemorySource]) -> list[Any]:
 @pytest.mark.usefixtures("uncompiled")
 def test_a_bound_without_truth_is_refused_in_one_sentence() -> None:
     source = target(0, truth=False)
-    with pytest.raises(BadInput, match=r"a bound needs the true states, and .* /truth; give"):
+    with pytest.raises(BadInput, match=r"a bound needs the true states, but .* /truth; use"):
         bound(CV, "bound", [source])
     short = target(0)
     cut = [
@@ -332,7 +332,7 @@ def test_a_bound_without_truth_is_refused_in_one_sentence() -> None:
     ]
     found = outputs(CV, "bound", [memory_source(Recording(cut), short.run)])
     assert len(found["state"]) == 19
-    assert "the truth is not known here" in str(found["failure"].stream.metadata)
+    assert "the truth is unknown at this time" in str(found["failure"].stream.metadata)
 
 
 def test_the_way_back_is_the_smoothers_where_what_is_predicted_is_singular() -> None:

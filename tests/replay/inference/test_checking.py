@@ -26,7 +26,7 @@ MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "
 
 
 @pytest.mark.paper
-@pytest.mark.filterwarnings("ignore:.* does not add up")
+@pytest.mark.filterwarnings("ignore:.* is not additive")
 @pytest.mark.parametrize("name", MODELS)
 def test_right_models_pass(name: str) -> None:
     """All that are registered, and those of the tests: angles, an axis, a quaternion, all noises."""
@@ -157,7 +157,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a state's angle declared linear": (
         replace(VEHICLE_A, state=LINEAR_HEADING),
-        "heading_rad is declared linear, but nothing changes when it is a full turn on",
+        "heading_rad is declared linear, but nothing changes after a full turn",
     ),
     "a state's angle declared linear, wrapped by its motion": (
         moving(half_wrapped, state=LINEAR_HEADING),
@@ -165,7 +165,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a number declared an angle": (
         moving(as_if_linear),
-        "as_if_linear .*heading_rad is of kind angle, but x_m is another a full turn on",
+        "as_if_linear .*heading_rad is of kind angle, but x_m differs after a full turn",
     ),
     "a quaternion with a sign": (
         replace(ATTITUDE, sensors=COMPASS),
@@ -185,13 +185,13 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "no derivative": (
         with_speed(measure=by_math),
-        "by_math .* it uses math.* of a number that is not known before; write np",
+        "by_math .* it uses math.* on a number that is only known later; write np",
     ),
     "too many components": (with_speed(measure=pair), "pair .* returns 2 components; 1 are needed"),
-    "a negative variance": (with_speed(noise=negative), "negative .* gives a negative variance, -0.01"),
+    "a negative variance": (with_speed(noise=negative), "negative .* a negative variance, -0.01"),
     "an indefinite covariance": (
         replace(VEHICLE_A, motion=Motion(vehicle_a.move, indefinite)),
-        "indefinite .* gives a negative variance, -1",
+        "indefinite .* returns a negative variance, -1",
     ),
     "a kind that does not exist": (
         replace(VEHICLE_A, state={**vehicle_a.STATE, "x_m": "metres"}),
@@ -203,19 +203,19 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a step that is not found again": (
         replace(VEHICLE_A, correct=Correction(along_heading, moved_well, stepped_twice, moved_well)),
-        "stepped_twice .* does not find the step of moved_well",
+        "stepped_twice .* does not return the step that moved_well",
     ),
     "estimable without kinds": (
         replace(VEHICLE_A, augmentable=("sigma_speed_mps",)),
-        "augmentable is a tuple; it is a mapping from parameter to kind, such as",
+        "augmentable is a tuple; expected a mapping from parameter to kind, such as",
     ),
     "an estimable that is no parameter": (
         replace(VEHICLE_A, augmentable={"sigma_sped_mps": "linear"}),
-        "'sigma_sped_mps' is no parameter of the model; did you mean 'sigma_speed_mps'",
+        "'sigma_sped_mps' is not a parameter of the model; did you mean 'sigma_speed_mps'",
     ),
     "an estimable orientation": (
         replace(VEHICLE_A, augmentable={"sigma_speed_mps": "axis"}),
-        "sigma_speed_mps is of kind 'axis'; known are linear and angle",
+        "sigma_speed_mps is of kind 'axis'; expected linear or angle",
     ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),
@@ -258,9 +258,9 @@ def test_noise_of_the_step_is_noticed(case: str) -> None:
     def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
         return tuple(SHARES[case](duration_s) for _ in range(VEHICLE_A.tangent))
 
-    with pytest.warns(UserWarning, match=r"noise \(test_checking.py, line \d+\): .* does not add up"):
+    with pytest.warns(UserWarning, match=r"noise \(test_checking.py, line \d+\): .* is not additive"):
         said = check_model(replace(VEHICLE_A, motion=replace(VEHICLE_A.motion, noise=noise)))
-    assert "add up" in said[-1]
+    assert "not additive" in said[-1]
 
 
 def test_noise_of_the_control_is_looked_at_too() -> None:

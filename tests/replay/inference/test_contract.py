@@ -77,7 +77,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "half a quaternion": (
         replace(VEHICLE_A, state=dict.fromkeys(vehicle_a.STATE, "quaternion")),
-        ("quaternion (four side by side)",),
+        ("quaternion (four in a row)",),
     ),
     "kind of what is measured": (
         with_sensor(SPEED, measured={"speed_mps": "axis"}),
@@ -85,7 +85,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "no noise": (
         with_sensor(SPEED, noise=None),
-        ("sensor speed", "states no noise", "`covariance`"),
+        ("sensor speed", "has no noise", "`covariance`"),
     ),
     "a covariance of nothing": (
         with_sensor(SPEED, covariance="covariance_m2"),
@@ -107,7 +107,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "a sensor that reads a control that is held": (
         replace(with_sensor(SPEED, control=HELD), control=HELD),
-        ("sensor speed", "held from message to message", "interpolated=True"),
+        ("sensor speed", "held between messages", "interpolated=True"),
     ),
     "what it reads": (
         with_sensor(SPEED, read=lambda stream: np.zeros((len(stream), 2))),
@@ -208,10 +208,10 @@ def test_a_sensor_that_fits_no_topic(registered: dict[str, Model]) -> None:
     """One is left out; without any, or without the map or the prior, the model does not fit."""
     assert fit(changed("/speed", None))[0].streams == ("/sighting",)
     assert fit(changed("/landmarks", None))[0].streams == ("/speed",)
-    with pytest.raises(BadInput, match=r"vehicle-a comes nearest and lacks /prior .*of x_m, y_m"):
+    with pytest.raises(BadInput, match=r"vehicle-a is the closest one, but lacks /prior .*of x_m, y_m"):
         fit(changed("/prior", None))
     registered["vehicle-a"] = replace(registered["vehicle-a"], by_name=True)
-    with pytest.raises(BadInput, match=r"is taken only by its name: --model vehicle-a"):
+    with pytest.raises(BadInput, match=r"is only used if it is named: --model vehicle-a"):
         fit(SOURCE)
     registered["vehicle-a"] = with_sensor(SPEED, topic="velocity")
     with pytest.raises(BadInput, match=r"does not fit this log: .*vehicle-a"):

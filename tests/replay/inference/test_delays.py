@@ -141,7 +141,7 @@ def test_delays_serve_smoothers_and_refuse_to_rewind():
     [delayed] = bound(held, "ekf", [trolley()], fix_delay_s=0.1)
     assert isinstance(delayed, Recursive)
     assert delayed.out_of_sequence is not None
-    with pytest.raises(BadInput, match=r"put where they were measured.*--late wait"):
+    with pytest.raises(BadInput, match=r"moved to their times of measurement.*--late wait"):
         delayed.out_of_sequence(10**9)
 
 
@@ -175,7 +175,7 @@ def test_where_the_control_is_silent_for_too_long_all_is_unknown(block_messages:
     assert last_ns <= (2.0 if end_s == 3.5 else 3.0) * 1e9
     [failed] = found["failure"].stream["reason"]
     reasons = json.loads(found["failure"].stream.metadata["reasons"])
-    assert reasons[failed] == "what drives the motion is silent for too long"
+    assert reasons[failed] == "the control is missing for too long"
     allowed = outputs(TROLLEY, "ekf", [log], block_messages, unit_gap_s=5.0)
     assert len(allowed["failure"].stream) == 0
     assert allowed["state"].stream.publish_time_ns[-1] - EPOCH_NS == 4.75e9
@@ -195,4 +195,4 @@ def test_a_sample_that_is_not_finite_is_as_if_it_had_not_come_and_counted():
     assert np.abs(found["innovation"]["innovation"]).max() < 0.02
     skipped = found["skipped"].stream
     assert len(skipped) == 2
-    assert "topic /unit: it is not finite" in skipped.metadata["reasons"]
+    assert "topic /unit: the control is not finite" in skipped.metadata["reasons"]

@@ -171,7 +171,7 @@ def test_an_origin_that_no_channel_states_is_the_first_fix_and_is_told(uncompile
     spread = np.tile([1.0, 1.0], (len(STAMPS), 1))
     found = outputs(PLANE, "ekf", [log(PLANE, geodetic(place, spread, {}))])
     assert sentences_of(found["started"].stream) == [
-        "no channel states the origin of the plane: it is the first fix of /fix"
+        "no channel states the origin of the plane: the first fix of /fix is used"
     ]
     origin = found["origin"].stream
     assert (origin["latitude_deg"][0], origin["longitude_deg"][0]) == tuple(place[0, :2])
@@ -228,7 +228,7 @@ def test_a_topic_may_stand_for_another(uncompiled: None) -> None:
     assert_array_equal(found, wanted)
     assert bound(PLANE, "ekf", [source]) == []
     for names, words in (
-        ({"fixx": "/gps/place"}, "topics.fixx: no model asks for it; did you mean 'fix'"),
+        ({"fixx": "/gps/place"}, "topics.fixx: no model has a topic of this name; did you mean 'fix'"),
         ({"fix": "/gps/plaec"}, "topics.fix = /gps/plaec: the log has no such topic; did you mean"),
     ):
         with pytest.raises(BadInput, match=words):

@@ -454,8 +454,8 @@ BAD: dict[str, tuple[Mapping[str, Any], str]] = {
     ),
     "smoother": ({"filter": "smoother"}, "'smoother' is not a filter for the modes of an imm"),
     "variant": ({"filter": "ekf:9"}, "filter ekf has no variants; give 'imm:ekf' without ':9'"),
-    "mode": ({"mode": "steady"}, "parameter 'mode' is 'steady'; imm takes all modes of a model"),
-    "modes": ({"mode": ["steady", "agile"]}, "imm takes all modes of a model; leave out `mode`"),
+    "mode": ({"mode": "steady"}, "parameter 'mode' is 'steady'; imm uses all modes of a model"),
+    "modes": ({"mode": ["steady", "agile"]}, "imm uses all modes of a model; leave out `mode`"),
     "rate": (
         {"calms_per_s": -0.5},
         "the rate from mode agile to steady is -0.5 per second; give zero or more",

@@ -377,7 +377,7 @@ def test_a_measurement_that_no_particle_explains_ends_the_run() -> None:
     values[3] = 30.0
     found = outputs(with_likelihood(nowhere), "particles", [scalar.source(values)], particles=20)
     assert len(found["state"]) == 3
-    assert "no particle explains what was measured" in str(found["failure"].stream.metadata)
+    assert "no particle explains the measurement" in str(found["failure"].stream.metadata)
 
 
 @pytest.mark.usefixtures("uncompiled")

@@ -88,7 +88,7 @@ def test_arrays_that_a_function_fills_are_what_it_gives():
 
 # --- what is refused ---------------------------------------------------------------------------------
 
-NUMBER, WHERE = "of a number that is not known before", "np.where"
+NUMBER, WHERE = "on a number that is only known later", "np.where"
 TABLE = [1.0, 2.0]
 CLOCK = time.perf_counter
 
@@ -112,28 +112,31 @@ def into_floats(x: Any) -> Any:
 REFUSED = {
     "int()": (lambda x: int(x), rf"it uses int\(\) {NUMBER}; write np.floor or np.trunc"),
     "float()": (lambda x: float(x), rf"it uses float\(\) {NUMBER}; leave the number as it is"),
-    "math.*": (lambda x: math.sin(x), rf"it uses math\.\* {NUMBER}; write np\.\* of it"),
+    "math.*": (lambda x: math.sin(x), rf"it uses math\.\* {NUMBER}; write np\.\* instead"),
     "an index": (lambda x: TABLE[x], rf"it uses an index {NUMBER}; write np\.interp"),
     "an index of an array": (lambda x: np.ones(3)[x], rf"it uses an index {NUMBER}; write np\.interp"),
     "np.take": (lambda x: np.take(TABLE, x), rf"it uses int\(\) {NUMBER}; .* np\.choose for an index"),
     "an array of float": (into_floats, rf"it uses an array of float {NUMBER}; .* np\.array\(\[a, b\]\)"),
     "no end": (
         ends_never,
-        r"there are more than 256 ways through .*; write .* a fixed number of rounds",
+        r"there are more than 256 paths through .*; write .* a fixed number of iterations",
     ),
-    "many ways": (in_many_ways, r"there are more than 256 ways through .*; write np\.clip or np\.where"),
+    "many ways": (
+        in_many_ways,
+        r"more than 256 paths through .*; write np\.clip or np\.where",
+    ),
     "a reduction": (lambda x: np.add.reduce(x), r"it uses np\.add\.reduce; write it with operators"),
     "an option": (lambda x: np.sin(x, where=True), r"it uses np\.sin with where; write np\.where"),
     "a function": (lambda x: np.heaviside(x, 0.0), rf"it uses np\.heaviside {NUMBER}; write it with"),
-    "a table": (lambda x: np.interp(x, [0.0, x], TABLE), r"it uses np\.interp of a table that is not"),
-    "mixed arrays": (lambda x: np.sin(np.array([x, 1.0]))[0], r"it uses np\.sin of an array in which"),
+    "a table": (lambda x: np.interp(x, [0.0, x], TABLE), r"it uses np\.interp on a table that is only"),
+    "mixed arrays": (lambda x: np.sin(np.array([x, 1.0]))[0], r"it uses np\.sin on an array with some"),
     "two results": (
         lambda x: x if x > 0.0 else (x, x),
-        r"it returns a number on one way and a tuple of 2",
+        r"it returns a number on one path and a tuple of 2",
     ),
-    "a clock": (lambda x: x + CLOCK(), r"it gives something else when it is called again; a clock"),
-    "chance": (lambda x: x + random.random(), r"it gives something else when it is called again"),
-    "chance of a number": (lambda x: np.random.default_rng(1).normal(x), r"it uses .* of a number that"),
+    "a clock": (lambda x: x + CLOCK(), r"it returns another result when it is called again; clocks"),
+    "chance": (lambda x: x + random.random(), r"it returns another result when it is called again"),
+    "chance of a number": (lambda x: np.random.default_rng(1).normal(x), r"it uses .* on a number that"),
 }
 
 
@@ -212,7 +215,7 @@ KINDS: dict[str, Callable[..., Any]] = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.filterwarnings("ignore:.*the noise does not add up")  # which is that of a step
+@pytest.mark.filterwarnings("ignore:.*the noise is not additive")  # which is that of a step
 def test_any_callable_is_a_models_function(kind: str):
     model = replace(SCALAR, sensors=(replace(VALUE, measure=KINDS[kind]),))
     check_model(model)

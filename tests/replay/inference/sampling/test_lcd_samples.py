@@ -112,5 +112,5 @@ def test_flat_sets_cannot_be_corrected():
 )
 def test_the_fewest_samples_are_enough(dimension: int, least: int, symmetric: bool) -> None:
     check_count(dimension, least, symmetric)
-    with pytest.raises(BadInput, match=f"take {least} or more"):
+    with pytest.raises(BadInput, match=f"give {least} or more"):
         check_count(dimension, least - 1, symmetric)

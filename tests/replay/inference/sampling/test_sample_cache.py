@@ -94,7 +94,7 @@ def test_a_damaged_file_is_computed_again_and_mended(folder, content):
     only_file(folder).write_bytes(content)
     said = []
     assert np.array_equal(cached_set(SMALL, said.append), expected)
-    assert "damaged or not ours" in said[0]
+    assert "damaged or not a file of fuselog" in said[0]
     assert np.array_equal(cached_set(SMALL, pytest.fail), expected)
 
 
@@ -111,7 +111,7 @@ def test_a_cache_that_cannot_be_written_is_told_and_not_needed(tmp_path, monkeyp
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "file"))
     said = []
     assert np.array_equal(cached_set(SMALL, said.append), compute_set(SMALL))
-    assert "are not kept" in said[-1]
+    assert "are not stored" in said[-1]
 
 
 def test_a_failed_write_leaves_nothing(folder, monkeypatch):
@@ -135,6 +135,6 @@ def test_processes_may_share_a_cache(folder):
 
 
 def test_impossible_sets_are_refused(folder):
-    with pytest.raises(BadInput, match="take 5 or more"):
+    with pytest.raises(BadInput, match="give 5 or more"):
         cached_set(SetName(4, 4))
     assert not folder.exists()

@@ -130,8 +130,8 @@ def test_bad_names_are_refused_in_one_sentence(name, reason):
         ("gf-3", 0, "dimension of 1 or more"),
         ("s2kf-50", -2, "dimension of 1 or more"),
         ("ukf:kappa=-2", 2, "give more than -2"),
-        ("s2kf-8", 8, "take 9 or more"),
-        ("s2kf-15:symmetric", 8, "take 16 or more"),
+        ("s2kf-8", 8, "give 9 or more"),
+        ("s2kf-15:symmetric", 8, "give 16 or more"),
     ],
 )
 def test_dimensions_that_a_sampling_cannot_serve(name, dimension, reason):
