@@ -67,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: Options = setting.options
     label = next(iter(experiment.estimators), None)
     if label is None:
-        raise BadInput("study acoustic-recordings needs an estimator, such as ekf")
+        raise BadInput("study acoustic-recordings needs an estimator such as ekf")
     runner = Runner(experiment, setting)
     sources = runner.obtain()
     replayed = runner.replay(sources)
@@ -153,8 +153,8 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
             continue
         if len(delays[name]) != len(known.delay_s):
             raise BadInput(
-                f"options.published.{name}: {len(known.delay_s)} delays for {len(delays[name])} "
-                "microphones that heard it; give one for each"
+                f"options.published.{name} has {len(known.delay_s)} delays for {len(delays[name])} "
+                "microphones that heard the sound; give one for each"
             )
         found[f"published.delay_s.{name}"] = known.delay_s
         found[f"published.off_s.{name}"] = float(np.abs(delays[name] - np.array(known.delay_s)).max())
@@ -212,7 +212,7 @@ def _chart(simulated: pd.DataFrame) -> Chart:
 
 
 ACOUSTIC_RECORDINGS = Study(
-    "where sounds in recordings came from, beside known places and published differences",
+    "positions of sounds in recordings, compared with known positions and published differences",
     study,
     Options,
 )

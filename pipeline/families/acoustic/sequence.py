@@ -145,7 +145,7 @@ def _chart(shots: pd.DataFrame) -> Chart:
 
 
 ACOUSTIC_SEQUENCE = Study(
-    "shots of one moving shooter as one problem, beside single shots, with wrong detections",
+    "shots of one moving shooter estimated jointly and singly, with wrong detections",
     study,
     Options,
 )

@@ -206,4 +206,4 @@ def _metrics_of_maps(maps: pd.DataFrame) -> dict[str, Any]:
     return values
 
 
-ACOUSTIC = Study("where shots came from, by three kinds of measurements", study, AcousticOptions)
+ACOUSTIC = Study("positions of shooters by three kinds of measurements", study, AcousticOptions)

@@ -1,1 +1,1 @@
-"""Studies biometric scores: fusion, and verification in sequence; begin with `study`."""
+"""Studies of biometric scores: fusion, and sequential verification; begin with `study`."""

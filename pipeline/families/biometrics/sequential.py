@@ -111,8 +111,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     }
     if len(ratios) < 2:
         raise BadInput(
-            "study biometrics-sequential watches a matcher by the others: give a score-mixture of all "
-            "pairs with the names of two matchers or more as its subsets"
+            "study biometrics-sequential monitors each matcher by the others: give a score-mixture of "
+            "all pairs with at least two matchers as its subsets"
         )
     rng = np.random.default_rng(experiment.seed)
     count = len(next(iter(ratios.values())))
@@ -133,7 +133,7 @@ def _matrix(fused: Fused) -> Floats:
     """Return ratios (users, users) by probe and gallery entry; raise BadInput if pairs are missing."""
     if not (fused.is_ratio and fused.is_complete):
         raise BadInput(
-            "study biometrics-sequential needs log-likelihood ratios of all pairs: give a score-mixture "
+            "study biometrics-sequential needs log-likelihood ratios of all pairs; give a score-mixture "
             'with pairs = "all"'
         )
     users = int(fused.gallery.max()) + 1
@@ -254,9 +254,8 @@ def watched(
         steady = [np.sort(reference.ratio[reference.is_genuine == kind]) for kind in (False, True)]
         if min(map(len, steady)) == 0 or len(seen.ratio) < options.watched_probes:
             raise BadInput(
-                f"study biometrics-sequential: the other matchers are certain of {len(seen.ratio)} "
-                "probes "
-                f"of {size} to watch {matcher} by; lower options.label_ratio, or give other matchers"
+                f"study biometrics-sequential: the other matchers can label only {len(seen.ratio)} of "
+                f"{size} probes to monitor {matcher}; lower options.label_ratio or give other matchers"
             )
         for fault in ("none", *FAULTS):
             probes = options.watched_probes if fault == "none" else options.fault_probes
@@ -386,5 +385,7 @@ def _chart_of_tests(table: pd.DataFrame, options: Options) -> Chart:
 
 
 BIOMETRICS_SEQUENTIAL = Study(
-    "verification by probe after probe, and matchers that fail or drift", study, Options
+    "sequential verification by several probes, and detection of matchers that fail or drift",
+    study,
+    Options,
 )

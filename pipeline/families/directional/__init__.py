@@ -1,1 +1,1 @@
-"""Studies axes, orientations and headings on the torus; begin with `bingham`."""
+"""Studies of axes, orientations and headings on the torus; begin with `bingham`."""

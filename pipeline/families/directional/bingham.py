@@ -83,12 +83,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _stated(experiment: Experiment) -> AxisParameters:
     """Return the scenario's parameters; raise BadInput if it has neither axes nor orientations."""
     if not experiment.record:
-        raise BadInput(f"experiment '{experiment.title}': names no scenario; give it in [record]")
+        raise BadInput(f"experiment '{experiment.title}' has no scenario; add it in [record]")
     name, values, label = load_scenario(experiment.record.scenario)
     kind = load("recorders", name, Recorder).parameters
     if not issubclass(kind, AxisParameters):
         raise BadInput(
-            f"study bingham: scenario {label} has neither axes nor orientations; give one that has"
+            f"study bingham: scenario {label} has neither axes nor orientations; give the scenario axis "
+            "or orientation"
         )
     return build(kind, merge(values, experiment.record.parameters), f"scenario {label}")
 
@@ -150,5 +151,5 @@ def error_figure(errors_deg: dict[str, dict[str, Floats]]) -> Figure:
 
 
 BINGHAM = Study(
-    "the Bingham filter beside Kalman filters, with both kinds of noise", study, BinghamOptions
+    "the Bingham filter compared with Kalman filters, with both kinds of noise", study, BinghamOptions
 )

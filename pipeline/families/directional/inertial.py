@@ -29,7 +29,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for name, rows in trials.groupby("estimator", sort=False)
     }
     if not means:
-        raise BadInput("no estimates during movement with truth; give a trial with both")
+        raise BadInput("there are no estimates during movement with truth; give a trial that has both")
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
     for trial, estimator, rmse_deg, _ in trials.to_numpy():

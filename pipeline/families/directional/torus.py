@@ -120,7 +120,7 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
     """Study propagation, figure 3; see `fuselog.pipeline.runs.experiment.Study`. `runs` are random."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
-        raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")
+        raise BadInput("study torus-propagation uses no data; leave out record, import and estimators")
     drawn_bytes = experiment.runs * len(options.correlations) * options.random_samples * 2 * 8
     require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)  # as drawn, and moved
     outcome = Outcome()
@@ -250,10 +250,12 @@ def filter_figure(errors_rad: dict[str, dict[str, Floats]]) -> Figure:
 
 
 TORUS_PROPAGATION = Study(
-    "five samples on the torus beside the UKF's and random ones, moved and refitted",
+    "propagation of five samples on the torus, compared with the UKF's and random samples",
     study_propagation,
     PropagationOptions,
 )
 TORUS_FILTER = Study(
-    "the recursive toroidal filter beside unscented filters and a grid", study_filter, FilterOptions
+    "the recursive toroidal filter compared with unscented filters and a grid filter",
+    study_filter,
+    FilterOptions,
 )

@@ -92,7 +92,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Fit densities and predict winds; see `fuselog.pipeline.runs.experiment.Study`."""
     options: Options = setting.options
     if experiment.estimators:
-        raise BadInput("study torus-real has filters of its own: leave out estimators")
+        raise BadInput("study torus-real runs its own filters; leave out estimators")
     runner = Runner(experiment, setting)
     (source,) = runner.obtain()
     outcome = Outcome(input_sha256=hash_streams([source]))
@@ -369,5 +369,5 @@ def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged
 
 
 TORUS_REAL = Study(
-    "wrapped normals and von Mises densities fitted to dihedrals, and winds predicted", study, Options
+    "wrapped normal and von Mises densities of dihedrals, and predictions of winds", study, Options
 )

@@ -175,8 +175,8 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     sensors = len(options.paper.sensor_position_m[number - 1])
     if recorder != "optical-los" or len(values.get("bias_deg", [])) != sensors:
         raise BadInput(
-            f"scenario {name}: is not an optical-los scenario with bias_deg of {sensors} sensors; give "
-            "one"
+            f"scenario {name} is not an optical-los scenario with bias_deg for {sensors} sensors; give "
+            "such a scenario"
         )
     bias_deg = (chosen.bias_deg * np.array(values["bias_deg"])).tolist()
     values = merge(values, {"sigma_rad": chosen.sigma_rad, "bias_deg": bias_deg})
@@ -234,7 +234,7 @@ def _judged(
 
 
 def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
-    """Return what an estimator of biases knows about a scenario before the measurements."""
+    """Return an estimator's prior knowledge of a scenario: sensors, attitudes, noise, known biases."""
     sensors = np.array(parameters.sensor_position_m)
     sigma = np.full((len(sensors), 2), parameters.sigma_rad)
     known = known_biases(range(1, len(sensors) + 1), estimator)

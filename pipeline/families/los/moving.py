@@ -239,5 +239,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 LOS_MOVING = Study(
-    "moving lines of sight: what tells biases and clocks, beside the bound over time", study, Options
+    "moving lines of sight: observability of biases and clocks, and errors against the bound",
+    study,
+    Options,
 )

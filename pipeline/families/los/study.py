@@ -205,5 +205,7 @@ def _metrics(case: Case) -> dict[str, Any]:
 
 
 LOS = Study(
-    "positions and attitude biases from lines of sight, against the paper's tables", study, LosOptions
+    "positions and attitude biases from lines of sight, compared with the paper's tables",
+    study,
+    LosOptions,
 )

@@ -97,7 +97,7 @@ def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int
         if getattr(options, name) not in numbers:
             raise BadInput(
                 f"options.{name} = {getattr(options, name)} is not one of the robots "
-                f"{', '.join(map(str, numbers))} of {source.name}; name one of them"
+                f"{', '.join(map(str, numbers))} of {source.name}; give one of these"
             )
     return numbers
 
@@ -192,7 +192,7 @@ def _chart(table: pd.DataFrame) -> Chart:
 
 
 COOPERATIVE_STRESS = Study(
-    "robots that share seldom, leave, or start at a wrong place: errors and consistency",
+    "robots that rarely share, leave, or start at a wrong position: errors and consistency",
     study,
     CooperativeStressOptions,
 )

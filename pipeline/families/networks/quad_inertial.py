@@ -159,8 +159,8 @@ def flight_of(name: str, source: MemorySource) -> Flight:
     topics = sorted(topic for topic in source.topics if re.fullmatch(r"/imu\w+/inertial", topic))
     if not topics or not {"/truth", "/fix"} <= source.topics.keys():
         raise BadInput(
-            f"{name}: lacks /truth, /fix or inertial units such as /imu1/inertial; give a log that has "
-            "them"
+            f"{name}: has no /truth, no /fix or no inertial unit such as /imu1/inertial; give a log "
+            "that has all of them"
         )
     truth = source["/truth"]
     time_ns, place = truth.publish_time_ns, truth["state"][:, :3]
@@ -368,5 +368,5 @@ def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
 
 
 QUAD_INERTIAL = Study(
-    "several inertial units on one body, whose clocks are off", study, QuadInertialOptions
+    "several inertial units with clock offsets on one body", study, QuadInertialOptions
 )

@@ -175,7 +175,7 @@ def traces_of_equation_17() -> dict[str, float]:
 
 
 NETWORKS = Study(
-    "sensor networks: what each fusion rule costs in accuracy, consistency and bytes",
+    "sensor networks: cost of each fusion rule in accuracy, consistency and bytes",
     study,
     NetworkOptions,
 )

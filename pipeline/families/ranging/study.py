@@ -54,8 +54,8 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
     found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
     if not found:
         raise BadInput(
-            f"{setting.data}: has no {pattern}, nor has a folder in it; give the recording's folder "
-            "or one above it"
+            f"{setting.data}: has no {pattern} in it or below; give the recording's folder or one "
+            "above it"
         )
     return found
 

@@ -146,5 +146,7 @@ def error_chart(steps: pd.DataFrame) -> Chart:
 
 
 EXTENDED_TARGET = Study(
-    "sampling filters against exact moments: updates by points of an extended target", study, Options
+    "sampling filters compared with exact moments: updates with points of an extended target",
+    study,
+    Options,
 )

@@ -73,7 +73,9 @@ def ensembles(
     BadInput if the reference is not among the estimators.
     """
     if REFERENCE not in experiment.estimators:
-        raise BadInput(f"this study compares with the estimator '{REFERENCE}'; add it to the experiment")
+        raise BadInput(
+            f"this study compares with the estimator '{REFERENCE}'; add that estimator to the experiment"
+        )
     for number in range(options.data_seeds):
         again = experiment.model_copy(update={"seed": experiment.seed + number})
         runner = Runner(again, setting)

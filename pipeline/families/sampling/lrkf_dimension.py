@@ -102,7 +102,7 @@ def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
         if kind.startswith("lrkf:")
     }
     if not found:
-        raise BadInput("study lrkf-dimension compares samplings: give estimators such as lrkf:ukf")
+        raise BadInput("study lrkf-dimension compares samplings; give estimators such as lrkf:ukf")
     return found
 
 
@@ -267,7 +267,7 @@ def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Pan
 
 
 LRKF_DIMENSION = Study(
-    "sampling filters over dimension and number of samples: errors of moments, drives and time",
+    "sampling filters by dimension and number of samples: errors of moments, drives and CPU time",
     study,
     Options,
 )

@@ -129,5 +129,7 @@ def error_chart(steps: pd.DataFrame, case: str) -> Chart:
 
 
 REACTOR = Study(
-    "sampling filters against exact moments: nonlinear prediction in a batch reactor", study, Options
+    "sampling filters compared with exact moments: nonlinear prediction in a batch reactor",
+    study,
+    Options,
 )

@@ -62,7 +62,8 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
     ]
     if not tables:
         raise BadInput(
-            "no tracks to judge: the log has no identities, or no estimator gives tracks; give both"
+            "there are no tracks to evaluate: the log has no identities, or no estimator gives tracks; "
+            "give a log with identities and a tracker"
         )
     return pd.concat(tables).rename(columns={"target": "mmsi"})
 
@@ -99,4 +100,4 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
     return Chart(panels=[above, below])
 
 
-AIS = Study("tracks of reports without identities, against the identities", study, AisOptions)
+AIS = Study("tracks of reports without identities, evaluated by the identities", study, AisOptions)

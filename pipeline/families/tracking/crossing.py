@@ -93,4 +93,4 @@ def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: 
                 outcome.measure(f"{label}.growth_of_change_m.{case}", growth)
 
 
-CROSSING = Study("associations over clutter and probability of detection", study, CrossingOptions)
+CROSSING = Study("associations by clutter and detection probability", study, CrossingOptions)

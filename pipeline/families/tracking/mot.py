@@ -39,12 +39,12 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
     for topic in wanted:
         if topic not in fitting:
             raise BadInput(
-                f"{log.path}: topic {topic}: has neither tracks nor a truth in the plane; export it "
+                f"{log.path}: topic {topic} has neither tracks nor a truth in the plane; export it "
                 "as csv"
             )
     if not wanted:
         raise BadInput(
-            f"{log.path}: has no tracks and no truths in the plane to export to mot; export it as csv"
+            f"{log.path}: has neither tracks nor truths in the plane to export as mot; export it as csv"
         )
     source = LogSource(log)
     truths = [topic for topic in wanted if _is_truth(log.topics[topic])]
@@ -54,8 +54,8 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
             sizes = f"{topic.rpartition('/')[0]}/set"
             if sizes not in log.topics:
                 raise BadInput(
-                    f"{log.path}: topic {topic}: there is no {sizes} that states how many tracks there "
-                    "are at a time; export it as csv"
+                    f"{log.path}: topic {topic} has no topic {sizes} with the number of tracks at each "
+                    "time; export it as csv"
                 )
             streams = source.read([sizes, topic])
             lines = list(_track_lines(streams[sizes], streams[topic], source.epoch_ns))

@@ -69,7 +69,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: ScalingOptions = setting.options
     if not experiment.record or set(options.methods) != set(experiment.estimators):
         raise BadInput(
-            f"experiment '{experiment.title}': give [record], and a method for every estimator"
+            f"experiment '{experiment.title}': add [record], and options.methods for every estimator"
         )
     rows, sources = [], []
     for count in setting.progress(options.vehicles, "numbers of vehicles", len(options.vehicles)):
@@ -160,5 +160,5 @@ def _chart(table: pd.DataFrame) -> Chart:
 
 
 VEHICLES_SCALING = Study(
-    "time and error of cooperative vehicles' filters over the number of vehicles", study, ScalingOptions
+    "time and error of cooperative vehicles' filters by the number of vehicles", study, ScalingOptions
 )

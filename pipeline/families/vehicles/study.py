@@ -182,7 +182,7 @@ def _chart(case: Case) -> Chart:
 
 
 VEHICLES = Study(
-    "total errors of cooperative vehicles by method, against bounds and the paper",
+    "total errors of cooperative vehicles by method, compared with bounds and the paper",
     study,
     VehiclesOptions,
 )

@@ -1,1 +1,1 @@
-"""Records scores of biometric matchers; begin with `simulator`."""
+"""Simulator and importer of scores of biometric matchers; begin with `simulator`."""

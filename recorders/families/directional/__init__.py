@@ -1,1 +1,1 @@
-"""Records axes, orientations and headings; begin with `orientation`."""
+"""Simulators and importers of axes, orientations and headings; begin with `orientation`."""

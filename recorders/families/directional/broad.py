@@ -25,7 +25,7 @@ DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement":
 
 
 class BroadParameters(Parameters):
-    """Limits of what is rejected and reported.
+    """Tolerance of true quaternions, and the gaps to report.
 
     Attributes:
         unit_tolerance: largest deviation of a true quaternion's length from 1.

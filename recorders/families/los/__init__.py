@@ -1,1 +1,1 @@
-"""Records lines of sight from optical sensors to targets; begin with `simulator`."""
+"""Simulators of lines of sight from optical sensors to targets; begin with `simulator`."""

@@ -1,1 +1,1 @@
-"""Simulates ranges of radio tags to anchors; begin with `simulator`."""
+"""Simulator of ranges from radio tags to anchors; begin with `simulator`."""

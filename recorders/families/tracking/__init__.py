@@ -1,1 +1,1 @@
-"""Records many targets: crossing ways, reports of vessels, ferries; begin with `crossing`."""
+"""Recorders of many targets: crossing targets, vessel reports, ferries; begin with `crossing`."""

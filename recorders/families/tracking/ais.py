@@ -37,7 +37,7 @@ NO_COURSE, NO_SPEED = 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """The origin of the tangent plane, and the limits of what is reported as unlikely.
+    """The origin of the tangent plane, and the limits for notes about unlikely reports.
 
     Attributes:
         origin_deg: latitude and longitude of the tangent plane's origin; if not set, the median of the

@@ -1,1 +1,1 @@
-"""Simulates vehicles that sensors of other vehicles see; begin with `simulator`."""
+"""Simulators of vehicles with fixes and a roadside sensor; begin with `simulator`."""

@@ -1,1 +1,1 @@
-"""Fuses biometric scores, and judges verification; begin with `estimators`."""
+"""Fusion of biometric scores, and evaluation of verification; begin with `estimators`."""

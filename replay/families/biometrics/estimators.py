@@ -74,7 +74,7 @@ class RuleParameters(Subsets):
 
 
 class LearnerParameters(Subsets):
-    """What a fusion learns from, and what it scores.
+    """Training data of a fusion, and the pairs that it scores.
 
     Attributes:
         seed: seed of folds and impostors.
@@ -94,7 +94,7 @@ class LearnerParameters(Subsets):
 
 
 class ClassifierParameters(LearnerParameters):
-    """The classifier of scikit-learn, and what it learns from.
+    """A classifier of scikit-learn, and its training data.
 
     Attributes:
         classifier: name of the classifier.

@@ -22,7 +22,7 @@ IMPOSTORS_PER_USER = 2
 class Pairs(NamedTuple):
     """The comparisons to fuse: probe and gallery user (n,) of each, and the folds (users,) of users.
 
-    If the fold is None, nothing is learned.
+    If `fold` is None, the fusion does not learn.
     """
 
     probe: Integers

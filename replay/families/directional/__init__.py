@@ -1,1 +1,1 @@
-"""Filters axes, orientations and pairs of angles; begin with `estimators`."""
+"""Filters of axes, orientations and pairs of angles; begin with `estimators`."""

@@ -52,7 +52,7 @@ def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> St
     """Check vectors, normalize them to exactly unit length and return them as steps.
 
     Args:
-        offsets: (runs + 1,), where the rows of each run begin.
+        offsets: (runs + 1,), the first row of each run.
         increment: known turns (rows, d), unit vectors.
         measurement: unit vectors (rows, d), NaN if there is no measurement.
 

@@ -47,7 +47,7 @@ class HeadingModel(NamedTuple):
 
     Attributes:
         coupling_rad: c in the motion.
-        drift_rad: what is added in every step, (2,).
+        drift_rad: additional turns per step, (2,).
         system: covariance of w, (2, 2), rad^2.
         measurement: covariance of v, (2, 2), rad^2.
     """
@@ -80,11 +80,11 @@ Motion = Callable[..., tuple[Component, Component]]
 def make_heading_model(
     coupling_rad: float, drift_rad: ArrayLike, system: ArrayLike, measurement: ArrayLike
 ) -> HeadingModel:
-    """Make a heading model from checked numbers.
+    """Make a heading model after checking its numbers.
 
     Args:
         coupling_rad: c in the motion.
-        drift_rad: what is added in every step, (2,).
+        drift_rad: additional turns per step, (2,).
         system, measurement: covariances of w and v, (2, 2), rad^2.
 
     Raises BadInput if a covariance is not positive definite or a number is not finite.

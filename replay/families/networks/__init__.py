@@ -1,1 +1,1 @@
-"""Estimates in networks of nodes and robots that share estimates; begin with `estimator`."""
+"""Estimators for networks of nodes and robots that share estimates; begin with `estimator`."""

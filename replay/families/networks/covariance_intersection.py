@@ -105,7 +105,7 @@ def trace_slope(covariance: Floats, slope: Floats) -> None:
     """Compute P^2 / tr P; the criterion's gain by weight i is tr(I_i slope).
 
     Args:
-        covariance, slope: P and what is filled, (n, n).
+        covariance, slope: P and the result, (n, n).
     """
     trace = 0.0
     for row in range(len(covariance)):
@@ -125,7 +125,7 @@ def determinant_slope(covariance: Floats, slope: Floats) -> None:
     """Compute P / n; the criterion's gain by weight i is tr(I_i slope).
 
     Args:
-        covariance, slope: P and what is filled, (n, n).
+        covariance, slope: P and the result, (n, n).
     """
     size = len(covariance)
     for row in range(size):

@@ -73,7 +73,7 @@ def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
-        scanning: what is known of the sensor.
+        scanning: properties of the sensor.
     """
     runs, vehicles, detections = log_likelihood.shape
     gain = log_likelihood + scanning.log_odds_of_detection
@@ -106,7 +106,7 @@ def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
-        scanning: what is known of the sensor.
+        scanning: properties of the sensor.
     """
     runs = np.arange(len(log_likelihood))
     gain = log_likelihood + scanning.log_odds_of_detection

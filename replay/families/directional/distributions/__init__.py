@@ -1,1 +1,1 @@
-"""Computes with distributions on the torus, of axes and of orientations; begin with `bingham`."""
+"""Distributions of axes, of orientations and on the torus; begin with `bingham`."""

@@ -77,7 +77,7 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     """Compute the moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
 
     Args:
-        z: concentrations, none above 0.
+        z: nonpositive concentrations.
         mean: E(x_i^2), (d,), overwritten.
         covariance: Cov(x_i^2, x_j^2), (d, d), overwritten: the derivative of `mean` with respect to z.
 

@@ -1,1 +1,1 @@
-"""Estimates orientation from inertial and magnetic samples; begin with `estimators`."""
+"""Estimators of orientation from inertial and magnetic samples; begin with `estimators`."""

@@ -49,7 +49,7 @@ def test_a_watched_matcher_is_quiet_until_it_fails(drawn):
 
 def test_matchers_that_are_never_sure_watch_nothing(drawn):
     unsure = OPTIONS.model_copy(update={"label_ratio": 100.0})
-    with pytest.raises(BadInput, match=r"are certain of 0 probes of 60000 to watch face by; lower"):
+    with pytest.raises(BadInput, match=r"can label only 0 of 60000 probes to monitor face; lower"):
         list(watched(drawn, unsure, np.random.default_rng(2)))
 
 

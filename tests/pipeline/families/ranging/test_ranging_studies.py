@@ -61,7 +61,7 @@ def test_folders_without_a_recording_are_refused(navigation: Path, tmp_path: Pat
             run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     shutil.copy(navigation / "uwb_lias" / "UWB_dynamic_exp_mid.csv", tmp_path)
     _, experiment = load_experiment("uwb-pose", {}, {})
-    with pytest.raises(BadInput, match=r"has no motion_capture_dynamic_exp_mid.csv beside it"):
+    with pytest.raises(BadInput, match=r"motion_capture_dynamic_exp_mid.csv is missing in its folder"):
         run_experiment("uwb-pose", experiment, tmp_path / "out", data=tmp_path)
 
 
