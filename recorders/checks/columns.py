@@ -61,8 +61,8 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 field,
                 float(length),
                 f"{stream.topic}: {name} is frozen at {column[begin]:.6g} for {length} messages, from "
-                f"{first_s:.4g} s after its first stamp on, where {usual:.3g} are usual and others move",
-                otherwise="leave these messages out: fuselog cut LOG --start ... --end ...",
+                f"{first_s:.4g} s after its first stamp, while {usual:.3g} are usual and others change",
+                otherwise="cut out these messages: fuselog cut LOG --start ... --end ...",
             )
 
 
@@ -97,7 +97,7 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             field,
             code,
             f"{stream.topic}: {name} is {code:.6g} in {counts.max()} messages, each far from those "
-            "before and after it: a code of a missing value, which is taken for one",
+            "before and after it: a code for a missing value, which is used as a value",
             otherwise="missing = { COLUMN = [...] } in the table of the mapping",
         )
 
@@ -122,9 +122,9 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 stream.topic,
                 field,
                 step,
-                f"{stream.topic}: {name} is rounded to {step:.3g}, and its noise is "
-                f"{noise:.2g}: what is "
-                "smaller is lost, and its errors are not white",
+                f"{stream.topic}: {name} is rounded to {step:.3g}, but its noise is {noise:.2g}: "
+                "smaller "
+                "changes are lost, and its errors are not white",
                 otherwise="write it with more digits, or state a noise of at least "
                 f"{step / np.sqrt(12.0):.2g}",
                 severity="hint",
@@ -161,7 +161,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(count),
                 f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
                 f"{end:.6g}, {what}, the first {first_s:.4g} s after its first stamp",
-                otherwise="set the sensor to a larger range; leave these messages out",
+                otherwise="set the sensor to a larger range, or cut out these messages",
                 severity="likely" if is_end or is_sure else "hint",
                 time_ns=first_ns,
             )

@@ -46,8 +46,9 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                     f"the first {first_s:.4g} s after its first stamp",
                     otherwise="missing = [-1] in the mapping"
                     if is_unknown
-                    else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, a number "
-                    f"for each axis",
+                    else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, with a number for "
+                    "each "
+                    f"axis",
                     severity="hint" if words == SINGULAR else "fact",
                 )
                 break

@@ -39,7 +39,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 field,
                 float(len(stream)),
                 f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
-                "not measured, and a filter that this topic drives takes them for measurements",
+                "not measured, but a filter driven by this topic uses them as measurements",
                 otherwise="import only what was measured, a part of a unit as a VectorMeasurement",
             )
 
@@ -78,7 +78,7 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         -1.0 if is_down else float(np.radians(roll or pitch)),
         f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} "
         f"of {norm:.4g}, "
-        "where specific force points up along z",
+        "but specific force should point up along z",
         f"{stream.topic}.specific_force_z_scale=-1" if is_down else "",
         f"mounting_deg = [{roll}, {pitch}, {yaw}] in the mapping",
         "likely" if is_down else "hint",

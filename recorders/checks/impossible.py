@@ -62,10 +62,11 @@ def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Strea
             stream.topic,
             "",
             apart,
-            f"{stream.topic}: {int(rows.sum())} of its {len(stream)} stamps are years from most "
+            f"{stream.topic}: {int(rows.sum())} of its {len(stream)} stamps are years away from those "
+            "of most "
             f"messages of the log: the first, of message {row}, is {apart:.3g} years "
             f"{'before' if before_ns > 0 else 'after'} them",
-            otherwise="a replay leaves these messages out; mend the clock where the log is written",
+            otherwise="a replay leaves these messages out; correct the clock where the log is written",
             severity="fact",
         )
 
@@ -88,7 +89,7 @@ def apart(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "",
         apart_s,
-        f"{stream.topic}: its stamps {how.format(f'{apart_s:.4g}')}: no time is in both",
+        f"{stream.topic}: its stamps {how.format(f'{apart_s:.4g}')}: they have no time in common",
         f"{stream.topic}.delay_s={-round(apart_s, 3) if is_before else round(apart_s, 3)}",
         "its clock may be another",
     )
@@ -110,9 +111,10 @@ def restated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream.topic,
             number,
             float(times),
-            f"{stream.topic}: {number} {first} is stated {times} times, at different places: a replay "
-            "takes one of them",
-            otherwise="give each point a number of its own",
+            f"{stream.topic}: {number} {first} is stated {times} times, at different positions: a "
+            "replay "
+            "uses one of them",
+            otherwise="give each point its own number",
             severity="fact",
         )
 

@@ -58,7 +58,7 @@ def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         float(np.nanmedian(latitude)),
         f"its fixes are about 0, 0, {np.nanmedian(latitude):.3g} and {np.nanmedian(longitude):.3g} deg "
         "from it, "
-        "where there is only sea: they are in another unit than the mapping says",
+        "where there is only sea: their unit differs from that in the mapping",
         "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
     )
 
@@ -83,8 +83,8 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             f"{steps_m[first] / 1000:.4g} km in {span_s[first]:.3g} s, "
             f"{times_s[first] - times_s[0]:.4g} s after its "
             "first stamp",
-            "check the unit and the codes of missing values of its positions, whether its rows are "
-            "those of "
+            "check the unit and the codes of missing values of its positions, whether its rows belong "
+            "to "
             "several vehicles (`vehicle` in the mapping), and `time`",
         )
         return
@@ -95,10 +95,11 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "",
             float(back.mean()),
-            f"its fixes go to and fro, {np.median(steps_m):.3g} m from one to the next and "
-            f"{np.median(two_m):.3g} m to the one after it: they are two rows of fixes, sorted into "
-            "one another",
-            "`vehicle`, or `order` and `zone` of `time`, in the mapping; leave one recording out",
+            f"its fixes alternate, {np.median(steps_m):.3g} m from one to the next and "
+            f"{np.median(two_m):.3g} m to the one after it: they are two sequences of fixes, merged "
+            "into "
+            "one",
+            "`vehicle`, or `order` and `zone` of `time`, in the mapping; remove one recording",
         )
 
 
@@ -125,9 +126,9 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "quaternion",
             bent,
-            f"its heading is the same in all messages, while the course of the fixes turns by "
+            f"its heading is the same in all messages, but the course of the fixes turns by "
             f"{bent:.3g} rad: it was not measured",
-            "leave it out, or missing = { COLUMN = [...] } in the table of the mapping",
+            "remove it, or missing = { COLUMN = [...] } in the table of the mapping",
         )
         return
     rate = float(np.median(np.abs(wrap_angle(np.diff(angle)))[moving] / span_s[moving]))
@@ -136,7 +137,8 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "quaternion",
             rate,
-            f"its heading turns by {rate:.3g} rad/s, half of the time more, at {speed:.3g} m/s: that is "
+            f"its heading turns by {rate:.3g} rad/s, or more half of the time, at {speed:.3g} m/s: that "
+            "is "
             f"{rate * speed:.3g} m/s^2 sideways",
             "the unit of the angle in the mapping",
         )
@@ -167,7 +169,7 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     if EARLIEST_NS < first_ns < LATEST_NS:
         yield _stamps(
             stream,
-            f"its stamps begin on {_day(first_ns)}, before there were such logs",
+            f"its stamps begin on {_day(first_ns)}, before such logs existed",
             "`unit` and `zero` of `time` in the mapping",
         )
     days = np.unique(_day(stream.publish_time_ns))
@@ -192,8 +194,7 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             yield _stamps(
                 other,
                 f"it begins {hours} h after {stream.topic}, which has ended by then: a time zone is "
-                "stated for "
-                "one of them alone, or twice",
+                "stated for only one of them, or twice",
                 "`zone` or `utc_offset_h` of `time` in the mapping",
             )
             return

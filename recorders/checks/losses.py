@@ -93,7 +93,7 @@ def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]
             float(steps_s[longest]),
             f"{stream.topic}: is silent for {steps_s[longest]:.3g} s from "
             f"{_since(stream, int(begin_ns[longest]))} on, where the usual step is {usual_s:.3g} s",
-            otherwise="look for what is missing where the log is recorded",
+            otherwise="find the cause where the log is recorded",
             severity="likely" if is_long and stream.schema.full_name in REGULARS else "hint",
             time_ns=int(begin_ns[longest]),
         )
@@ -115,9 +115,9 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "",
         float(same.sum()),
-        f"{stream.topic}: {int(same.sum())} of its {len(same) + 1} messages are there twice, with equal "
+        f"{stream.topic}: {int(same.sum())} of its {len(same) + 1} messages are duplicates, with equal "
         f"stamp and content, the first {_since(stream, first_ns)}: they count twice",
-        otherwise="leave them out where the log is written",
+        otherwise="remove them where the log is written",
         time_ns=first_ns,
     )
 

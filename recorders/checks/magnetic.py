@@ -31,19 +31,18 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         return
     given = next((unit for unit, ut in UNITS_UT.items() if EARTH_UT[0] <= norm * ut <= EARTH_UT[1]), "")
     factor = UNITS_UT.get(given, 0.0)
-    what = f"is in {given}" if given else "is in no unit that is known, or normalised, or of iron nearby"
+    what = f"is in {given}" if given else "is in an unknown unit, or normalised, or affected by iron"
     yield Finding(
         "magnetometer",
         stream.topic,
         FIELD,
         1.0 / factor if given else norm,
-        f"{stream.topic}: {FIELD} {what}: half of its lengths are above {norm:.3g}, and the "
-        f"Earth's field "
+        f"{stream.topic}: {FIELD} {what}: its median length is {norm:.3g}, but the Earth's field "
         f"has {EARTH_UT[0]:g} to {EARTH_UT[1]:g} uT",
         f"{stream.topic}.magnetic_field_scale={digits(factor)}" if given else "",
         f'units.{FIELD} = "{given}" in the mapping'
         if given
-        else "calibrate it: it tells only directions",
+        else "calibrate it: only its direction is usable",
         "likely" if given else "hint",
     )
 
@@ -64,8 +63,8 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream.topic,
             FIELD,
             share,
-            f"{stream.topic}: hard iron: in a full turn {FIELD} goes round a centre that is {share:.2g} "
-            f"of the radius, {circle.radius:.3g} uT, off zero",
+            f"{stream.topic}: hard iron: in a full turn, the centre of {FIELD} is {share:.2g} of the "
+            f"radius, {circle.radius:.3g} uT, away from zero",
             f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias={digits(float(circle.centre[axis]))}",
             f"offsets.{FIELD} = [{offsets}] in the mapping",
         )
@@ -75,7 +74,7 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream.topic,
             FIELD,
             circle.ratio,
-            f"{stream.topic}: soft iron: in a full turn {FIELD} goes along an ellipse whose axes are "
+            f"{stream.topic}: soft iron: in a full turn, {FIELD} follows an ellipse with axes of "
             f"{circle.ratio:.3g} to 1",
             otherwise="calibrate its axes",
         )

@@ -22,12 +22,11 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 stream.topic,
                 "",
                 0.0,
-                f"{stream.topic}: its {key} {stream.metadata[key]} says {kind}, where REP "
-                f"103 and fuselog "
+                f"{stream.topic}: its {key} {stream.metadata[key]} says {kind}, but REP 103 and fuselog "
                 f"have {ours}",
                 otherwise="mounting_deg = [180, 0, 0] in the mapping"
                 if kind == "FRD"
-                else "in the mapping exchange north and east, and give down the factor -1",
+                else "in the mapping swap north and east, and give down the factor -1",
                 severity="hint",
             )
 
@@ -43,9 +42,9 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "",
         0.0,
-        f"{stream.topic}: by REP 145 it is {raw.topic} again, beside an orientation that a filter made: "
-        "who uses both counts one unit twice",
-        otherwise=f"--set topics.inertial={raw.topic} at the replay takes one alone",
+        f"{stream.topic}: by REP 145 it repeats {raw.topic}, with an orientation from a filter: an "
+        "estimator that uses both counts one unit twice",
+        otherwise=f"--set topics.inertial={raw.topic} at the replay uses only one",
         severity="hint",
     )
 
@@ -67,8 +66,8 @@ def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "",
         0.0,
-        f"{stream.topic}: it is alone in its namespace, while {other.topic}, which says the "
-        f"same, is with "
+        f"{stream.topic}: it is alone in its namespace, but {other.topic}, which has the same messages, "
+        f"is with "
         f"{spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
         otherwise=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
         f"them; at the import "

@@ -48,12 +48,12 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         return
     if largest[0] > 90.0:
         is_exchanged = largest[1] <= 90.0
-        what = "are exchanged" if is_exchanged else "are out of range"
+        what = "are swapped" if is_exchanged else "are out of range"
         yield _place(
             stream,
             largest[0],
             f"latitude and longitude {what}: a latitude is {largest[0]:.6g} deg",
-            "in the mapping exchange the sources of latitude_deg and longitude_deg",
+            "in the mapping swap the sources of latitude_deg and longitude_deg",
         )
     elif largest[1] > 180.0:
         yield _place(
@@ -68,7 +68,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         yield _place(
             stream,
             float(zero.sum()),
-            f"{int(zero.sum())} of {len(stream)} fixes are at 0, 0, where there was none, the first "
+            f"{int(zero.sum())} of {len(stream)} fixes are at 0, 0, which means no fix, the first "
             f"{first_s:.4g} s after its first stamp",
             "missing = [0] in the mapping",
         )
@@ -93,11 +93,11 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
         yield _place(
             stream,
             as_is.spread / other.spread,
-            f"latitude and longitude are exchanged: so fixes move {other.value:.4g} m for "
-            f"each metre of the "
-            f"wheels (spread {other.spread:.2g}), as they are {as_is.value:.4g} m (spread "
+            f"latitude and longitude are swapped: after swapping, fixes move {other.value:.4g} m for "
+            "each "
+            f"metre of the wheels (spread {other.spread:.2g}), as recorded {as_is.value:.4g} m (spread "
             f"{as_is.spread:.2g})",
-            "in the mapping exchange the sources of latitude_deg and longitude_deg",
+            "in the mapping swap the sources of latitude_deg and longitude_deg",
             is_fact=False,
         )
 
@@ -126,7 +126,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             worst_m,
             f"{stream.topic}: its altitude leaps {len(leaps)} times, by up to {abs(worst_m):.4g} m from "
             f"one fix to the next, the first {first_s:.4g} s after its first stamp",
-            otherwise="take one altitude throughout, above the ellipsoid or above the sea",
+            otherwise="use one altitude throughout, above the ellipsoid or above the sea",
         )
 
 
@@ -152,8 +152,8 @@ def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             yield _place(
                 stream,
                 as_is.value,
-                f"latitude and longitude are {what}: so fixes move {other.value:.4g} m for each metre "
-                f"of the wheels, as they are {as_is.value:.4g} m",
+                f"latitude and longitude are {what}: corrected, fixes move {other.value:.4g} m for each "
+                f"metre of the wheels, as recorded {as_is.value:.4g} m",
                 "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
                 is_fact=False,
             )
@@ -195,10 +195,11 @@ def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                     other.topic,
                     "position_m",
                     -1.0,
-                    f"{other.topic}: its z points down (NED), ours up: it falls as the altitude of "
+                    f"{other.topic}: its z axis points down (NED), but ours up: it falls as the "
+                    "altitude of "
                     f"{stream.topic} rises (correlation {likeness:.3f})",
                     f"{other.topic}.position_z_scale=-1",
-                    "factors.position_m = [1, 1, -1] in the mapping, of north and east exchanged",
+                    "factors.position_m = [1, 1, -1] in the mapping, with north and east swapped",
                 )
 
 

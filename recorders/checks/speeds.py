@@ -93,7 +93,7 @@ def clocks(motion: BodyMotion) -> Iterator[Finding]:
             "",
             gain,
             f"{topic}: its clock {'gains' if gain > 0 else 'loses'} {100 * abs(gain):.2g} s in 100 s on "
-            f"that of {against}: only so their speeds stay alike",
+            f"that of {against}: only then do their speeds agree",
             f"{topic}.clock_gain={digits(gain)}",
         )
 
@@ -115,12 +115,12 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
             f"(in {ratio.windows} windows)"
         )
         if not is_unit:
-            what, mapping = f"is {factor:.3g} times what it must be", ""
+            what, mapping = f"is {factor:.3g} times the correct value", ""
         elif factor > 1.0:
-            what = f"is {factor:.4g} times too large, as {known[nearest]} taken for m/s"
+            what = f"is {factor:.4g} times too large, as when {known[nearest]} are read as m/s"
             mapping = f'units.{source.field} = "{known[nearest]}" in the mapping'
         else:
-            what = f"is {1 / factor:.4g} times too small, as m/s taken for {known[nearest]}"
+            what = f"is {1 / factor:.4g} times too small, as when m/s are read as {known[nearest]}"
             mapping = f'units.{source.field} = "m/s" in the mapping'
         yield Finding(
             "unit" if is_unit else "scale",
@@ -153,8 +153,9 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
             fixes.topic,
             "covariance_m2",
             ratio,
-            f"{fixes.topic}: at rest its errors are white and have {ratio:.3g} times the variance that "
-            f"it states ({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
+            f"{fixes.topic}: at rest its errors are white and have {ratio:.3g} times the stated "
+            "variance "
+            f"({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
             f"{fixes.topic}.covariance_scale={digits(ratio)}",
         )
 

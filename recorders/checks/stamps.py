@@ -35,9 +35,9 @@ _CLOCKED = {
     schemas.ODOMETRY.full_name,
 }
 _USES = {
-    schemas.INERTIAL_SAMPLE.full_name: "estimators take the mean of both; deployed filters and those "
-    "of others take them one by one, and one of both may have no effect",
-    schemas.ODOMETRY.full_name: "the first of both holds for no time, and has no effect",
+    schemas.INERTIAL_SAMPLE.full_name: "estimators use the mean of both; deployed and foreign filters "
+    "use them one by one, and one of the two may have no effect",
+    schemas.ODOMETRY.full_name: "the first of the two holds for no time, so it has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
@@ -70,7 +70,8 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     yield _stamps(
         stream,
         10.0**power,
-        f"its stamps are {10 ** abs(power):.0e} times too {how}, by their unit: it would come at "
+        f"its stamps are {10 ** abs(power):.0e} times too {how}, because of their unit: the rate would "
+        "be "
         f"{rate_hz:.3g} Hz",
         'time = { unit = "ms" }, or "s", "us", "ns", whichever the column has',
     )
@@ -89,7 +90,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         began_again = not is_late and -steps_ns.min() > AGAIN * usual_ns and count <= FEW_FALLS
         behind_s = 1e-9 * float((np.maximum.accumulate(stamps_ns) - stamps_ns).max())
         how = (
-            "; its clock began again: it was restarted, rolled over, or is that of several vehicles"
+            "; its clock was restarted, rolled over, or is that of several vehicles"
             if began_again
             else f"; messages overtook one another, and are up to {behind_s:.3g} s behind" * is_late
         )
@@ -98,7 +99,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream.topic,
             "",
             float(count),
-            f"{stream.topic}: {count} of its {len(stream)} stamps go back, the first "
+            f"{stream.topic}: {count} of its {len(stream)} stamps go back in time, the first "
             f"{first_s:.4g} s after the earliest{how}",
             otherwise=f"replay them as they came, with --late rewind:{np.ceil(behind_s * 10) / 10:g}"
             if is_late
@@ -109,7 +110,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         )
         return
     things = _things(stream, streams)[rows]
-    use = _USES.get(stream.schema.full_name, "both are used, in the file's order")
+    use = _USES.get(stream.schema.full_name, "both are used, in file order")
     same = (np.diff(stamps_ns) == 0) & (np.diff(things) == 0)
     if same.any() and stream.schema.full_name in REGULARS:
         first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))
@@ -118,9 +119,10 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream.topic,
             "",
             float(same.sum()),
-            f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the stamp of the one "
-            f"before, the first {first_s:.4g} s after its first stamp: {use}",
-            otherwise="leave one of them out where the log is written",
+            f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the same stamp as "
+            "the "
+            f"previous one, the first {first_s:.4g} s after its first stamp: {use}",
+            otherwise="remove one of them where the log is written",
             severity="fact",
         )
 
@@ -136,9 +138,8 @@ def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         yield _stamps(
             stream,
             scatter / usual_s,
-            f"its steps scatter by {100 * scatter / usual_s:.2g} % of the usual "
-            f"{usual_s:.3g} s: they say "
-            "when it was written rather than measured",
+            f"its steps scatter by {100 * scatter / usual_s:.2g} % of the usual {usual_s:.3g} s: its "
+            "stamps say when it was written rather than measured",
             "time = { column = ... } of the sensor's own clock",
         )
 
@@ -188,7 +189,7 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             "",
             gain,
             f"{stream.topic}: its clock {'gains' if gain > 0 else 'loses'} {1e6 * abs(gain):.3g} us a "
-            f"second on the recorder's, in {span_s:.4g} s {1e3 * abs(gain) * span_s:.3g} ms",
+            f"second on the recorder's, {1e3 * abs(gain) * span_s:.3g} ms in {span_s:.4g} s",
             f"{stream.topic}.clock_gain={digits(gain)}",
             severity="hint",
         )
@@ -225,7 +226,7 @@ def _named_offset(offset_s: float, unix_s: float) -> str:
     gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
     for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
         if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:
-            return f"{name} runs {leap_s} s ahead of UTC then"
+            return f"{name} runs {leap_s} s ahead of UTC at that time"
     hours = round(offset_s / 3600.0)
     if 0 < abs(hours) <= FAR_H and abs(offset_s - 3600.0 * hours) <= ZONE_TOLERANCE_S:
         return f"a time zone {abs(hours)} h from UTC"

@@ -51,7 +51,7 @@ def signs(motion: BodyMotion) -> Iterator[Finding]:
         elif orientation and heading < 0 and (course > 0 or headed < 0):
             yield _compass(orientation, f"{source.topic} and the course turn")
         elif orientation and heading < 0 and headed > 0:
-            yield _sign(source, f"{orientation.topic} and the course turn the other way round")
+            yield _sign(source, f"{orientation.topic} and the course turn in the opposite direction")
     if orientation and headed < 0 and not motion.body.turns:
         yield _compass(orientation, "the course turns")
 
@@ -78,12 +78,12 @@ def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) ->
             course.topic,
             field,
             -1.0,
-            f"{course.topic}: its frame is mirrored, as where east and north are exchanged: the course "
+            f"{course.topic}: its frame is mirrored, as when east and north are swapped: the course "
             f"turns {ratio.value:.3g} rad for each rad of {source.topic}, which another sensor confirms",
-            otherwise=f"in the mapping exchange the columns of {field}",
+            otherwise=f"in the mapping swap the columns of {field}",
         )
         return
-    unless = "" if witness else f", unless the frame of {course.topic} has east and north exchanged"
+    unless = "" if witness else f", unless the frame of {course.topic} has east and north swapped"
     yield _sign(source, evidence + unless)
 
 
@@ -108,9 +108,9 @@ def _compass(orientation: Series, others: str) -> Finding:
         orientation.topic,
         orientation.field,
         -1.0,
-        f"{orientation.topic}: its heading goes clockwise, as a compass has it, and ours anticlockwise "
-        f"from east: {others} the other way round",
-        otherwise="in the mapping make it of attitude = { heading = ... }",
+        f"{orientation.topic}: its heading is clockwise, as a compass's, but ours is anticlockwise "
+        f"from east: {others} in the opposite direction",
+        otherwise="in the mapping make it from attitude = { heading = ... }",
     )
 
 
@@ -123,7 +123,7 @@ def degrees(motion: BodyMotion) -> Iterator[Finding]:
         )
         if ratio and ratio.sign and _is_degrees(ratio):
             assert motion.courses is not None
-            evidence = f"the course of {motion.courses.topic} turns {ratio.value:.3g} rad for each of it"
+            evidence = f"the course of {motion.courses.topic} turns {ratio.value:.3g} rad per unit of it"
             is_large = abs(ratio.value) < 1.0
         elif not (ratio and ratio.sign) and np.mean(rates > TOO_FAST_RADPS) > 1e-3:
             evidence, is_large = f"in rad/s it would be up to {rates.max():.3g}", True
@@ -131,7 +131,7 @@ def degrees(motion: BodyMotion) -> Iterator[Finding]:
             continue
         what = source.field.rpartition("_")[0]
         given, factor = ("deg/s", np.pi / 180.0) if is_large else ("rad/s", 180.0 / np.pi)
-        taken = "in deg/s" if is_large else "in rad/s, taken for deg/s"
+        taken = "in deg/s" if is_large else "in rad/s, read as deg/s"
         yield Finding(
             "unit",
             source.topic,
@@ -168,10 +168,11 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
                 orientation.field,
                 mean,
                 f"{orientation.topic}: its heading is {np.degrees(mean):.3g} deg anticlockwise of the "
-                f"course ({len(rest)} windows, spread {np.degrees(spread):.2g} deg): by the sensor's "
-                f"mounting, or north is magnetic{', or speeds have the wrong sign' * is_backwards}",
-                otherwise="in the mapping turn it back, by mounting_deg"
-                f"{', or the speeds, by factors' * is_backwards}",
+                f"course ({len(rest)} windows, spread {np.degrees(spread):.2g} deg): because of the "
+                "sensor's mounting, or of magnetic "
+                f"north{', or of a wrong sign of speeds' * is_backwards}",
+                otherwise="in the mapping rotate it by mounting_deg"
+                f"{', or change the sign of the speeds by factors' * is_backwards}",
             )
 
 
@@ -190,8 +191,9 @@ def mounting(motion: BodyMotion) -> Iterator[Finding]:
                 force.topic,
                 force.field,
                 found.angle_rad,
-                f"{force.topic}: it is mounted turned about the vertical: its horizontal forces are "
-                f"those of the course if turned by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
+                f"{force.topic}: it is mounted rotated about the vertical: its horizontal forces match "
+                "the "
+                f"course if rotated by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
                 otherwise=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
             )
 
@@ -224,15 +226,17 @@ def gravity(motion: BodyMotion) -> Iterator[Finding]:
             continue
         is_down = hangs(motion, force.topic)
         either = "" if is_down else ", or its forces have the wrong sign"
-        also = ", and its turn rate goes the other way round than the course" if is_down else ""
-        what, more = ("turn_rate", ", which turns the forces too") if is_down else ("specific_force", "")
+        also = ", and its turn rate is opposite to that of the course" if is_down else ""
+        what, more = (
+            ("turn_rate", ", which rotates the forces too") if is_down else ("specific_force", "")
+        )
         yield Finding(
             "gravity",
             force.topic,
             force.field,
             -1.0,
             f"{force.topic}: its z axis is down{either}: at rest the force along z is {mean[2]:.4g}, "
-            f"where specific force points up{also}",
+            f"but specific force should point up{also}",
             f"{force.topic}.{what}_z_scale=-1",
             f"mounting_deg = [180, 0, 0] in the mapping{more}, if its axes are forward, right, down",
         )
@@ -283,8 +287,8 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
                 orientation.topic,
                 orientation.field,
                 off,
-                f"{orientation.topic}: its quaternions are no unit ones: half of their lengths differ "
-                f"from 1 by {off:.3g} and more",
+                f"{orientation.topic}: its quaternions are not of unit length: half of their lengths "
+                f"differ from 1 by {off:.3g} or more",
                 otherwise="normalise them where the log is written",
             )
             continue
@@ -306,8 +310,9 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
                 orientation.topic,
                 orientation.field,
                 errors[stated] / errors[best],
-                f"{orientation.topic}: its quaternions are {best}, read as {stated}: so they turn as "
-                f"{rates.topic} does but for {errors[best]:.2g} rad/s, as they are {errors[stated]:.2g}",
+                f"{orientation.topic}: its quaternions are {best}, read as {stated}: then they turn "
+                "like "
+                f"{rates.topic} to within {errors[best]:.2g} rad/s, as read {errors[stated]:.2g} rad/s",
                 otherwise="in the mapping name its four columns in the order w, x, y, z",
             )
 

@@ -57,9 +57,7 @@ class Decoder:
             described.append((channel.message_encoding, schema and replace(schema, id=0)))
         encoding, schema = described[0]
         if any(other != described[0] for other in described):
-            raise BadInput(
-                f"{self._where} has channels of different schemas; give each a topic of its own"
-            )
+            raise BadInput(f"{self._where} has channels of different schemas; give each its own topic")
         if schema is None or schema.encoding != "protobuf" or encoding != "protobuf":
             raise BadInput(
                 f"{self._where} is {schema.name if schema else 'without a schema'} in the encoding "
@@ -80,7 +78,7 @@ class Decoder:
         if wrong or not kinds:
             raise BadInput(
                 f"{self._where}: this {self.schema.full_name} has no numeric field "
-                f"{', '.join(wrong) or 'at all'}; it was written with another schema, "
+                f"{', '.join(wrong) or 'at all'}; it was written with another schema; "
                 "record or import it again"
             )
 

@@ -53,7 +53,7 @@ class Impossible(NamedTuple):
         """Describe what is wrong with the component."""
         if np.isinf(self.value):
             return f"{self.name} is infinite"
-        return f"{self.name} is {self.value:.3g}, and can be {self.limit:.0e} at most"
+        return f"{self.name} is {self.value:.3g}, but can be at most {self.limit:.0e}"
 
 
 def impossible(stream: Stream) -> Iterator[Impossible]:
@@ -89,7 +89,7 @@ def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, C
     wrong = [(each.words, each.rows) for each in impossible(stream)]
     if span_ns is not None and stream.schema.full_name not in TIMELESS:
         outside = (stream.publish_time_ns < span_ns[0]) | (stream.publish_time_ns > span_ns[1])
-        wrong.append(("the stamp is years from those of most messages", outside))
+        wrong.append(("the stamp is years away from those of most messages", outside))
     kept = np.ones(len(stream) if wrong else 0, bool)
     for words, rows in wrong:
         found[words] += int(np.count_nonzero(rows & kept))

@@ -134,7 +134,7 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
     if log.loss_statement and not recover:
         count = len(log.container.regions)
         raise BadInput(
-            f"{log.loss_statement}; {count} whole {'chunk is' if count == 1 else 'chunks are'} "
+            f"{log.loss_statement}; {count} intact {'chunk is' if count == 1 else 'chunks are'} "
             "readable with --recover"
         )
     return log

@@ -176,18 +176,18 @@ def _contents(log: Log, region: Region, raw: bytes) -> Contents:
     try:
         contents = open_region(raw, region.offset)
     except Damaged as damage:
-        raise BadInput(f"{log.path}: {damage}; --recover reads what is whole") from damage
+        raise BadInput(f"{log.path}: {damage}; --recover reads the intact part") from damage
     for clock, span in contents.spans.items():
         if clock in region.spans and not region.spans[clock].holds(span):
             raise BadInput(
-                f"{log.path}: the chunk at byte {region.offset} has messages at times outside those "
-                "that its index states; --recover reads it without the index"
+                f"{log.path}: the chunk at byte {region.offset} has messages outside the span in its "
+                "index; --recover reads it without the index"
             )
     stated = log.container.channels.keys() if region.channel_ids is None else region.channel_ids
     for channel_id in contents.messages.keys() - stated:
         raise BadInput(
-            f"{log.path}: the chunk at byte {region.offset} has messages of channel {channel_id}, of "
-            "which its index does not list; --recover reads it without the index"
+            f"{log.path}: the chunk at byte {region.offset} has messages of channel {channel_id}, which "
+            "its index does not list; --recover reads it without the index"
         )
     return contents
 
@@ -240,6 +240,6 @@ def _check_counts(log: Log, topics: Sequence[str], counts: Mapping[str, int]) ->
         stated = log.topics[topic].messages
         if counts[topic] != stated:
             raise BadInput(
-                f"{log.path}: topic {topic} has {stated} messages by the file's statistics and "
+                f"{log.path}: topic {topic} has {stated} messages by the file's statistics, but "
                 f"{counts[topic]} by its index; --recover reads it without the index"
             )

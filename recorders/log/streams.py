@@ -106,7 +106,7 @@ class Stream:
             import polars as pl
         except ImportError:
             raise BadInput(
-                "polars is not installed: pip install polars, or take .pandas() or .arrow()"
+                "polars is not installed: run pip install polars, or use .pandas() or .arrow()"
             ) from None
         return pl.from_arrow(self.arrow())
 
@@ -215,7 +215,7 @@ def _misfit(schema: Schema, given: Mapping[str, ArrayLike]) -> str:
     own = [entry.name for entry in schema if entry.name != clock]
     if clock not in {entry.name for entry in schema}:
         return (
-            f"the schema {name} lacks the sensor's own clock, which every message has; declare "
+            f"the schema {name} lacks the sensor's own clock, which every message needs; declare "
             f'Field("{clock}", "time_ns") as its first field'
         )
     unknown = [each for each in given if each not in (clock, *own)]
@@ -262,7 +262,7 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
         raise BadInput(f"{what} is not numeric ({error})") from error
     if column.ndim != axes:
         raise BadInput(
-            f"{what} needs {axes} {'axis' if axes == 1 else 'axes'}, and has shape {column.shape}"
+            f"{what} needs {axes} {'axis' if axes == 1 else 'axes'}, but has shape {column.shape}"
         )
     if not is_kept:
         lost = given[np.argmax(column != given)]

@@ -151,20 +151,19 @@ class LogWriter:
             self._topics[stream.topic] = topic
         if topic.schema.descriptor_set != stream.schema.descriptor_set:
             raise BadInput(
-                f"{self.path}: topic {stream.topic} has {topic.schema.full_name} already and cannot "
-                "take "
-                f"{stream.schema.full_name}; use another topic"
+                f"{self.path}: topic {stream.topic} already has {topic.schema.full_name}, so it cannot "
+                f"take {stream.schema.full_name}; use another topic"
             )
         if topic.metadata != metadata:
             raise BadInput(
                 f"{self.path}: topic {stream.topic} changes its metadata between blocks; give every "
-                "block the same"
+                "block the same metadata"
             )
         if topic.messages == 0:
             topic.widths = widths
         elif len(stream) and topic.widths != widths:
             raise BadInput(
-                f"{self.path}: topic {stream.topic} has vectors of widths {topic.widths} and cannot "
+                f"{self.path}: topic {stream.topic} has vectors of widths {topic.widths}, so it cannot "
                 f"take {widths}; a stream has one width, so use another topic"
             )
 

@@ -202,7 +202,8 @@ def drive(given: CarParameters, rng: np.random.Generator | None = None) -> Car:
     compass_s = given.compass_step_s * np.arange(round(given.duration_s / given.compass_step_s) + 1)
     if not n or not len(fix_s):
         raise BadInput(
-            f"duration_s={given.duration_s:g}: has no step of the odometry, or no fix; make it longer"
+            f"duration_s={given.duration_s:g}: is too short for a step of the odometry or a fix; make "
+            "it longer"
         )
     sigmas = np.array([given.prior_sigma_m, given.prior_sigma_m, given.prior_sigma_rad])
     begin = np.zeros(3)

@@ -89,8 +89,8 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
     begin_s, end_s = parameters.rest_s, parameters.duration_s
     if begin_s >= end_s:
         raise BadInput(
-            f"rest_s is {begin_s:g} and duration_s {end_s:g}: after its rest the carrier has to move; "
-            "give a longer duration_s, or a shorter rest_s"
+            f"rest_s is {begin_s:g} and duration_s {end_s:g}: the body must move after its rest; give a "
+            "longer duration_s, or a shorter rest_s"
         )
     knots_s = np.linspace(begin_s, end_s, len(points))
     still = [(1, np.zeros(3)), (2, np.zeros(3))]

@@ -438,7 +438,7 @@ def test_what_is_wrong_with_messages_is_said() -> None:
     assert "position_m x is saturated: 30 of 300 messages are at" in told(fixes(clipped))
     rounded = np.cumsum(rng.normal(size=(3000, 2)), axis=0)
     rounded[:, 0] = np.round(rounded[:, 0] / 2.0) * 2.0
-    assert "position_m x is rounded to 2, and its noise is" in told(fixes(rounded))
+    assert "position_m x is rounded to 2, but its noise is" in told(fixes(rounded))
     late_ns = np.arange(300) * 10**9 + (np.arange(300) % 10 == 0) * 2_500_000_000
     late = told(fixes(place, log_time_ns=late_ns))
     assert late.endswith("and are up to 2 s behind; replay them as they came, with --late rewind:2")

@@ -58,7 +58,7 @@ PLANTED: dict[str, tuple[str, Change | str, str, str]] = {
     "repeated": (FIX, rows(lambda n: np.sort([*range(n), 40, 90])), "stamps", "there twice"),
     "a gap": (FIX, rows(lambda n: np.r_[0:120, 160:n]), "gap", "is silent for 20.5 s"),
     "a sign": (ODOMETRY, "turn rate's sign", "sign", "turn_radps has the wrong sign"),
-    "a unit": (ODOMETRY, "speed x 3.6", "unit", "3.6 times too large, as km/h taken for m/s"),
+    "a unit": (ODOMETRY, "speed x 3.6", "unit", "3.6 times too large, as when km/h are read as m/s"),
     "a delay": (FIX, "fixes 18 s late", "delay", "its stamps are 18 s late"),
 }
 
@@ -124,8 +124,8 @@ def test_wheels_that_turn_backwards_are_named_beside_the_compass() -> None:
     wheels = column("forward_mps", np.negative)(log.streams[ODOMETRY])
     [found] = fl.lint(replace(log, streams={**log.streams, ODOMETRY: wheels}))
     assert found.where == "/car/heading"
-    assert "or speeds have the wrong sign" in found.evidence
-    assert "or the speeds, by factors" in found.fix
+    assert "or of a wrong sign of speeds" in found.evidence
+    assert "or change the sign of the speeds by factors" in found.fix
     with pytest.warns(FutureWarning, match="Finding: 'words' is called 'sentence' now"):
         assert found.words == found.sentence  # what scripts of the release before ask for
 

@@ -91,8 +91,8 @@ def test_what_is_left_out_is_said_and_spoils_no_figure(
     losses = " ".join(said["bad"]["losses"])
     for words in (
         "/robot1/range_bearing: 1 message is left out: range_m is infinite",
-        "/robot1/truth: 1 message is left out: state x_m is 1e+160, and can be 1e+12 at most",
-        "/landmarks: 1 message is left out: position_m is 1e+308, and can be 1e+12 at most",
+        "/robot1/truth: 1 message is left out: state x_m is 1e+160, but can be at most 1e+12",
+        "/landmarks: 1 message is left out: position_m is 1e+308, but can be at most 1e+12",
     ):
         assert words.split(": ", 1)[0] in losses
         assert words.split(": ", 1)[1] in losses

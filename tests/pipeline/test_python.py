@@ -159,7 +159,7 @@ def test_streams_are_tables(monkeypatch: pytest.MonkeyPatch, recordings: list[fl
     assert prior.polars() == ("polars", prior.arrow())
     monkeypatch.setitem(sys.modules, "polars", None)
     with pytest.raises(
-        fl.BadInput, match=r"polars is not installed: pip install polars, or take \.pandas"
+        fl.BadInput, match=r"polars is not installed: run pip install polars, or use \.pandas"
     ):
         prior.polars()
 

@@ -303,7 +303,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     ),
     "silent": (rows(IMU, lambda n: np.r_[0:3000, 3100:n]), IMU, "gap", "is silent for 1.0"),
     "clock 1e-4 fast": (drifting, FIX, "clock drift", "gains 100 us a second"),
-    "wheels, latitude 8": (exchanged, FIX, "place", "exchanged: so fixes move 1"),
+    "wheels, latitude 8": (exchanged, FIX, "place", "swapped: after swapping, fixes move 1"),
     "sea and ellipsoid": (
         lambda s: column("/second", "altitude_m", lambda h: h - 47.0)(driving(s)),
         "/second",
@@ -320,7 +320,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         lambda s: column("/place", "position_m", lambda p: p[:, [1, 0, 2]] * [1, 1, -1])(driving(s)),
         "/place",
         "sign",
-        "its z points down (NED)",
+        "its z axis points down (NED)",
     ),
     "a frame's name": (framed, IMU, "name", "says FRD"),
     "raw and again": (
@@ -381,7 +381,9 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
     monkeypatch.setattr("fuselog.recorders.checks.lint.MOST", 0)
     found = fl.lint(tmp_path / "log.mcap")
     [words] = [each.evidence for each in found if "years" in each.evidence]
-    assert words.startswith(f"{IMU}: 1000 of its 1000 stamps are years from most messages of the log")
+    assert words.startswith(
+        f"{IMU}: 1000 of its 1000 stamps are years away from those of most messages of the log"
+    )
     assert main(["info", str(tmp_path / "log.mcap")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years from these" in said
@@ -412,8 +414,8 @@ def test_rows_that_are_there_twice_are_counted() -> None:
 def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
     """Ten samples get one stamp: they repeat, and their unit is right."""
     [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
-    assert "have the stamp of the one before" in found.evidence
-    assert "estimators take the mean of both; deployed filters and those of others" in found.evidence
+    assert "have the same stamp as the previous one" in found.evidence
+    assert "estimators use the mean of both; deployed and foreign filters" in found.evidence
     unit = clean(1)[IMU]
     stamps_ns = unit.publish_time_ns // 10**8 * 10**8
     wheels = make_stream(
@@ -424,7 +426,7 @@ def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
         turn_radps=unit["turn_rate_radps"][:, 1],
     )
     [found] = lint([{"/odometry": wheels}])
-    assert "the first of both holds for no time, and has no effect" in found.evidence
+    assert "the first of the two holds for no time, so it has no effect" in found.evidence
 
 
 def test_what_is_missing_is_not_frozen() -> None:
@@ -441,7 +443,7 @@ def test_what_is_missing_is_not_frozen() -> None:
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:
     for frame, ours, mend in (
         ("base_link_frd", "forward, left, up", "mounting_deg = [180, 0, 0]"),
-        ("odom_ned", "east, north, up", "exchange north and east"),
+        ("odom_ned", "east, north, up", "swap north and east"),
     ):
         [found] = frames(replace(clean(1)[IMU], metadata={"frame_id": frame}), {})
         assert found.evidence.endswith(f"fuselog have {ours}"), frame
@@ -495,7 +497,7 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
     table.to_csv(folder / "log.csv", index=False)
     fields = {name: columns for name, columns in fields.items() if columns}
     line = advice.partition(" in the mapping")[0].replace("[SIGMA, ...]", "[0.1, 0.1, 1.0]")
-    if "exchange the sources of" in advice:
+    if "swap the sources of" in advice:
         first, second, *_ = re.findall(r"\w+_deg", advice)
         fields[first], fields[second], line = fields[second], fields[first], ""
     time = 'time = { column = "t", unit = "ns" }'

@@ -110,7 +110,7 @@ def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole
     for cut in range(len(raw) - 1, 8, -23):
         path.write_bytes(raw[:cut])
         readable = [counts for end, counts in chunks if end <= cut]
-        assert f"{len(readable)} whole chunk" in refusal(path)
+        assert f"{len(readable)} intact chunk" in refusal(path)
         log, _, found = everything(path, recover=True)
         assert log.loss_statement.startswith(f"{path}: it")
         kept = readable[-1] if readable else Counter()
@@ -208,9 +208,9 @@ def test_what_does_not_fit_together_is_told_without_a_checksum(tmp_path):
     for place, sentence in {
         chunk + 25: "its size is wrong",  # the chunk's size when uncompressed
         chunk + 45: "its length is wrong",  # the length of the chunk's data
-        last_message + 1: "a record inside it is not whole",
-        raw.index(b"fuselog.Scan") - 4: "it is not whole",  # the length of the schema's name
-        raw.index(b"frame") - 8: "it is not whole",  # the length of the channel's metadata
+        last_message + 1: "a record in it is incomplete",
+        raw.index(b"fuselog.Scan") - 4: "it is incomplete",  # the length of the schema's name
+        raw.index(b"frame") - 8: "it is incomplete",  # the length of the channel's metadata
     }.items():
         damaged = bytearray(raw)
         damaged[place] += 1
@@ -251,8 +251,9 @@ def test_a_tail_of_zeros_is_lost_and_counted(tmp_path):
     raw = path.read_bytes()
     end = messages_by_chunk(raw)[1][0]
     path.write_bytes(raw[:end] + bytes(5000))
-    assert "it was cut off: its last 5000 bytes are not a whole record; 2 whole chunks are" in refusal(
-        path
+    assert (
+        "it was cut off: its last 5000 bytes are not a complete record; 2 intact chunks are"
+        in refusal(path)
     )
 
 
@@ -404,7 +405,7 @@ def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
     raw[-8:] = bytes(8)
     path.write_bytes(raw)
     statement = open_log(path, recover=True).loss_statement
-    assert statement.endswith(f"its last {len(raw) - second} bytes are not a whole record")
+    assert statement.endswith(f"its last {len(raw) - second} bytes are not a complete record")
 
 
 @pytest.mark.parametrize(

@@ -403,7 +403,7 @@ def test_topics_of_others_do_not_hinder_ours(tmp_path):
         "/bare": "is without a schema in the encoding 'protobuf'",
         "/torn": "the description of fuselog.Bearing is damaged",
         "/nameless": "the description of fuselog.Range is damaged",
-        "/two": "has channels of different schemas; give each a topic of its own",
+        "/two": "has channels of different schemas; give each its own topic",
         "/old": "this fuselog.Bearing has no numeric field target_id, bearing_rad; it was written",
         "/words": "this other.Words has no numeric field at all",
         "/noise": "a message cannot be read as fuselog.Bearing .*; leave the topic out",

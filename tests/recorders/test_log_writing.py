@@ -139,7 +139,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         child.send_signal(signal.SIGKILL)  # noqa: TID251
     (part,) = tmp_path.glob(".run.mcap.*.part/new.mcap")
     with pytest.raises(
-        BadInput, match=r"new\.mcap: it was cut off.*whole chunks are readable with --recover$"
+        BadInput, match=r"new\.mcap: it was cut off.*intact chunks are readable with --recover$"
     ):
         open_log(part)
     log = open_log(part, recover=True)
@@ -162,7 +162,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         ),
         ({"log_time_ns": [10, -20]}, "log_time is before 1970"),
         ({"log_time_ns": [10]}, "log_time has 1 values for 2 messages"),
-        ({"publish_time_ns": [[10, 20]]}, r"publish_time_ns needs 1 axis, and has shape \(1, 2\)"),
+        ({"publish_time_ns": [[10, 20]]}, r"publish_time_ns needs 1 axis, but has shape \(1, 2\)"),
         (
             {"publish_time_ns": [0.1 * 3 * 1e9, 20]},
             r"holds 300000000\.0+6, which int64 cannot hold; round the values",
@@ -223,11 +223,11 @@ def test_a_stream_changed_after_it_was_made_is_checked_again(tmp_path):
 @pytest.mark.parametrize(
     ("later", "sentence"),
     [
-        ({"value": [[1.0, 2.0, 3.0]]}, r"widths \{'value': 2\} and cannot take \{'value': 3\}"),
+        ({"value": [[1.0, 2.0, 3.0]]}, r"widths \{'value': 2\}, so it cannot take \{'value': 3\}"),
         ({"metadata": {"frame": "map"}}, "changes its metadata between blocks"),
         (
             {"schema": schemas.TRUTH_STATE, "state": [[1.0]]},
-            "has fuselog.VectorMeasurement already and cannot take fuselog.TruthState; use another "
+            "already has fuselog.VectorMeasurement, so it cannot take fuselog.TruthState; use another "
             "topic",
         ),
         (
@@ -236,7 +236,7 @@ def test_a_stream_changed_after_it_was_made_is_checked_again(tmp_path):
                     "VectorMeasurement", "Ours is another.", (Field("sensor_time_ns", "time_ns"),)
                 )
             },
-            "has fuselog.VectorMeasurement already and cannot take fuselog.VectorMeasurement",
+            "already has fuselog.VectorMeasurement, so it cannot take fuselog.VectorMeasurement",
         ),
     ],
 )

@@ -98,6 +98,6 @@ def test_a_seed_gives_the_same_streams_and_way_points_are_passed():
     with pytest.raises(BadInput, match="way_points_m has 2 points; give three points or more"):
         streams(way_points_m=points[:2])
     with pytest.raises(
-        BadInput, match="rest_s is 30 and duration_s 30: after its rest the carrier has to"
+        BadInput, match="rest_s is 30 and duration_s 30: the body must move after its rest"
     ):
         streams(duration_s=30.0, rest_s=30.0)

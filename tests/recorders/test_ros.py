@@ -722,7 +722,7 @@ def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
     head = (11).to_bytes(4, "little") + b"camera.yaml"
     path.write_bytes(path.read_bytes().replace(head, b"\xff" * 3 + head[3:], 1))
     _, notes = imported(path)
-    assert "its name is not whole" in notes["lost (1)"]
+    assert "its name is incomplete" in notes["lost (1)"]
     assert notes["not taken, attachment camera.yaml"].startswith("1, ")
 
 

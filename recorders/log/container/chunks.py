@@ -108,7 +108,7 @@ def open_region(raw: bytes, offset: int) -> Contents:
         data = np.frombuffer(_uncompressed(raw) if raw[0] == Opcode.CHUNK else raw, np.uint8)
         found = scan(data)
         if found.end != len(data):
-            raise ValueError("a record inside it is not whole")
+            raise ValueError("a record in it is incomplete")
         declarations = [next(read_records(data.data, place)) for place in found.declarations.tolist()]
     except MemoryError:
         raise Damaged(
@@ -179,7 +179,7 @@ def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
             if opcode in _RECORDS:
                 yield _RECORDS[opcode].read(ReadDataStream(_Whole(data[start - length : start])))
         except _UNREADABLE as error:
-            raise Damaged(f"a record is damaged ({str(error) or 'it is not whole'})") from error
+            raise Damaged(f"a record is damaged ({str(error) or 'it is incomplete'})") from error
 
 
 class _Whole(io.BytesIO):

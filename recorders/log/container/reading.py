@@ -170,7 +170,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
         except Damaged as damage:
             found.damages.append(str(damage))
     if place.opcode != Opcode.DATA_END:
-        damage_at_end = f"it was cut off: its last {size - place.end} bytes are not a whole record"
+        damage_at_end = f"it was cut off: its last {size - place.end} bytes are not a complete record"
     elif place.end != summary.start:
         damage_at_end = _behind(file, size, place.end, summary) or damage_at_end
     if damage_at_end:
@@ -204,7 +204,7 @@ def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
 def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
     """Yield what the summary lists but the data section lacks (`chunks`, metadata), and the reverse."""
     for offset in sorted(chunks):
-        yield f"there is no chunk at byte {offset}, where its index states one"
+        yield f"there is no chunk at byte {offset}, although its index lists one"
     for entry in summary.records:
         if isinstance(entry, records.MetadataIndex) and entry.name not in found.metadata:
             yield f"its metadata record '{entry.name}' is missing"
@@ -314,7 +314,7 @@ def _stated_places(summary: _Summary) -> list[_Place]:
 def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> None:
     """Add the contents of one record or run of the data section. Raises Damaged."""
     if place.opcode == _LOST:
-        raise Damaged(f"its bytes {place.offset} to {place.end} are not a whole record")
+        raise Damaged(f"its bytes {place.offset} to {place.end} are not a complete record")
     entry = index.chunk(place)
     if entry is not None:
         span = Span(entry.message_start_time, entry.message_end_time)
@@ -347,7 +347,7 @@ def _attachment_name(file: BinaryIO, place: _Place) -> str:
         *_, length = _ATTACHMENT_HEAD.unpack(head)
         if start + length <= place.length:
             return read_bytes(file, place.offset + start, length).decode(errors="replace")
-    raise Damaged(f"the attachment at byte {place.offset} is damaged (its name is not whole)")
+    raise Damaged(f"the attachment at byte {place.offset} is damaged (its name is incomplete)")
 
 
 def _declare(found: Container, declarations: Iterable[Any]) -> None:
