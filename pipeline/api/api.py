@@ -1,7 +1,7 @@
-"""Offers in Python what the commands do: logs, recordings, experiments, lists.
+"""Python functions for what the commands do: logs, recordings, experiments, lists.
 
-Everything raises BadInput as the commands do, with the same sentences. docs/python.md shows how to use
-it; `fuselog.pipeline.api.replays` has the replay.
+All of them raise BadInput with the same messages as the commands. docs/python.md shows how to use them;
+the replay is in `fuselog.pipeline.api.replays`.
 """
 
 from collections import Counter
@@ -43,13 +43,13 @@ from fuselog.replay.foreign.naming import allowed
 
 @without_warnings_of_numbers()
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
-    """Record a run of a scenario, in memory: it reads and replays like a log, and can be written.
+    """Record a run of a scenario in memory; it can be read and replayed like a log, and written.
 
     Args:
-        scenario: a name (`scenarios` has them), or a TOML file.
+        scenario: a name from `scenarios`, or a TOML file.
         seed: of the random numbers.
-        run: which run of the seed; scenario, parameters, seed and run give the same streams.
-        parameters: what differs from the scenario's own.
+        run: number of the run; scenario, parameters, seed and run determine the streams.
+        parameters: values that differ from the scenario's defaults.
 
     Returns:
         The recording, which maps every topic to its stream.
@@ -65,15 +65,15 @@ def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters
 
 @without_warnings_of_numbers()
 def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySource:
-    """Import real data, as their publishers lay them out, into memory.
+    """Import real data, in the layout of their publishers, into memory.
 
     Args:
         importer: a registered name, such as "mrclam"; `fuselog scenarios` lists them.
-        path: the file or folder that it reads.
+        path: the file or folder to read.
         parameters: of the importer.
 
     Returns:
-        The recording, which reads and replays like a log.
+        The recording, which can be read and replayed like a log.
 
     Raises BadInput for an unknown importer or parameter, or data that it cannot read.
     """
@@ -82,13 +82,14 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
 
 @without_warnings_of_numbers()
 def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
-    """Write a recording, or streams of your own, as a log; it appears whole or not at all.
+    """Write a recording, or streams of your own, as a log; the file appears only when it is complete.
 
     Args:
-        path: the MCAP file; a log of ours that is there is replaced.
-        streams: a recording, or streams, one for every topic.
+        path: the MCAP file; an existing log that fuselog wrote is replaced.
+        streams: a recording, or streams, one per topic.
 
-    Raises BadInput where a stream breaks its schema, or what is in the place is no log of ours.
+    Raises BadInput if a stream violates its schema, or if the existing file is not a log that fuselog
+    wrote.
     """
     check_files([(Path(path), LOG)], {})
     if isinstance(streams, MemorySource):
@@ -104,11 +105,11 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
 
 @dataclass(frozen=True, repr=False)
 class ResultFolder(Showing):
-    """Represents a result folder, and what its result.json says.
+    """A result folder and the content of its result.json.
 
     Attributes:
-        folder: where it is.
-        result: what its result.json says: metrics, tables, claims.
+        folder: the path of the folder.
+        result: the content of result.json: metrics, tables, claims.
     """
 
     folder: Path
@@ -125,17 +126,17 @@ class ResultFolder(Showing):
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Return a row per metric: estimator, quantity, case, value."""
+        """Return a table with a row per metric: estimator, quantity, case, value."""
         return summary_table(self.result.metrics)
 
     @property
     def claims(self) -> pd.DataFrame:
-        """Return a row per statement of a paper: the print, what we measured, our verdict, and why."""
+        """Return a table with a row per claim: the statement, our measurement, the verdict, and why."""
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """Return all tables by name."""
+        """Read all tables, by name."""
         paths = sorted((self.folder / "tables").glob("*.parquet"))
         return {path.stem: read_table(path) for path in paths}
 
@@ -157,29 +158,30 @@ def run(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     progress: Progress = no_progress,
 ) -> ResultFolder:
-    """Run an experiment into a result folder.
+    """Run an experiment and write its result folder.
 
     Args:
-        experiment: a name (`experiments` has them), or a TOML file; or as it was read.
-        runs: how many, if not as many as the experiment says.
-        seed: another than the experiment's.
-        data: the real data, where the experiment imports any.
-        out: the folder, by default out/ and the experiment's name.
-        logs: of how many runs the logs are kept.
-        errors: whether every single error is kept.
-        workers: processes that share the runs; a script that asks for more than one guards its own
-            work with `if __name__ == "__main__":`, as they import it. None stands for all cores where
-            that pays.
-        scheduler: a Dask scheduler whose workers share them, or `local:N`.
-        executor: anything else that works on them, whose workers see this machine's files.
+        experiment: a name from `experiments`, a TOML file, or an experiment that was read.
+        runs: number of runs; by default the experiment's.
+        seed: by default the experiment's.
+        data: the real data, if the experiment imports any.
+        out: the result folder; by default out/ and the experiment's name.
+        logs: number of runs whose logs are kept.
+        errors: whether all individual errors are kept.
+        workers: number of processes that share the runs; a script that uses more than one must guard its
+            own code with `if __name__ == "__main__":`, because the processes import it. None uses all
+            cores if that is worthwhile.
+        scheduler: a Dask scheduler whose workers share the runs, or `local:N`.
+        executor: any other executor whose workers can read this machine's files.
         set: entries of the experiment, parameters of its scenario, or of its estimators by label:
             `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
-        progress: is told how it goes.
+        progress: wraps iterables to report progress.
 
     Returns:
-        The folder, with the metrics, claims and tables in it.
+        The result folder, with metrics, claims and tables.
 
-    Raises BadInput where it cannot be run, or the folder holds something else than a result.
+    Raises BadInput if the experiment cannot be run, or the folder contains something other than a
+    result.
     """
     stated = _stated(experiment)
     found = stated.with_settings(allowed(set or {}), _given(runs=runs, seed=seed))
@@ -219,17 +221,17 @@ def sweep(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     progress: Progress = no_progress,
 ) -> ResultFolder:
-    """Run an experiment at all points of a grid into a result folder, whose table `sweep` has them.
+    """Run an experiment at all points of a grid and write a result folder.
 
     Args:
-        experiment: a name (`experiments` has them), or a TOML file; or as it was read.
+        experiment: a name from `experiments`, a TOML file, or an experiment that was read.
         over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`; or
-            as `parse_over` has them.
-        runs: how many at each point, if not as many as the experiment says.
-        seed: another than the experiment's.
-        samples: so many points are drawn instead of taking the whole grid.
-        sampling: how they are drawn, "sobol" or "random".
-        out: the folder, by default out/ and the experiment's name with -sweep.
+            ranges from `parse_over`.
+        runs: number of runs at each point; by default the experiment's.
+        seed: by default the experiment's.
+        samples: number of points to sample instead of using the whole grid.
+        sampling: "sobol" or "random".
+        out: the result folder; by default out/ and the experiment's name with -sweep.
         workers: as for `run`.
         scheduler: as for `run`.
         executor: as for `run`.
@@ -237,9 +239,10 @@ def sweep(
         progress: as for `run`.
 
     Returns:
-        The folder, whose table `sweep` has a row per point, estimator and metric.
+        The result folder, whose table `sweep` has a row per point, estimator and metric.
 
-    Raises BadInput where it cannot be run, or the folder holds something else than a result.
+    Raises BadInput if the experiment cannot be run, or the folder contains something other than a
+    result.
     """
     stated, given = _stated(experiment), _given(runs=runs, seed=seed)
     own = allowed(set or {})
@@ -263,7 +266,7 @@ def _given(**entries: int | None) -> dict[str, int]:
 
 
 def _inputs(stated: Stated, experiment: Experiment) -> list[Path]:
-    """List the files that an experiment is read from: its logs, itself, its scenario."""
+    """List the files that define an experiment: its logs, its own file, its scenario."""
     scenario = "" if experiment.record is None else experiment.record.scenario
     tables = [Path(scenario)] if scenario.endswith(".toml") else []
     return [*experiment.files, *stated.files, *tables]
@@ -275,7 +278,7 @@ def _pool(
     executor: Executor | None,
     experiments: Sequence[Experiment],
 ) -> PoolFactory:
-    """Return who works on experiments; a scheduler has its own workers, and gets none beside."""
+    """Choose the workers for experiments; with a scheduler, the default of one process is ignored."""
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)
@@ -283,7 +286,7 @@ def _pool(
 
 
 class Catalog(Mapping[str, Entry]):
-    """Holds what there is of a kind, by name; for another name raises `UnknownName` with a near one."""
+    """All entries of a kind by name; an unknown name raises `UnknownName` with similar names."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind

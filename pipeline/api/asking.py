@@ -1,6 +1,6 @@
-"""Answers `--set NAME=?`: what a parameter means, its unit, what it accepts, and its default.
+"""Answers to `--set NAME=?`: a parameter's meaning, unit, accepted values and default.
 
-Every command names what takes its settings, by a key of `TAKERS`.
+Every command states what its settings are for by a key of `TAKERS`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,14 +27,14 @@ from fuselog.replay.inference.estimators import registered_models
 from fuselog.replay.inference.observability import OBSERVABILITY
 
 ASKED, OF_MODEL = "=?", " of "
-Entries = Sequence[Entry]  # what takes settings at once
+Entries = Sequence[Entry]  # entries that receive the same settings
 
 
 def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) -> None:
-    """Print what the parameters mean that `NAME=?` asks for; raises BadInput where there is none.
+    """Print the meaning of the parameters that `NAME=?` asks for; raises BadInput for an unknown name.
 
     Args:
-        texts: the settings, of which those that are no question are passed over.
+        texts: the settings; those that are not questions are skipped.
         takes: a key of `TAKERS`.
         options: the command's.
     """
@@ -49,12 +49,12 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
 
 
 def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> dict[str, str]:
-    """Return the parameters whose names begin so, with what each means, as far as these can be told.
+    """Find the parameters whose names begin with a text, with the meaning of each, for completion.
 
     Args:
-        begin: of a name.
+        begin: the beginning of a name.
         takes: a key of `TAKERS`.
-        options: the command's, as far as they are given.
+        options: those of the command that are known.
     """
     found: dict[str, str] = {}
     with suppress(BadInput, OSError):
@@ -66,7 +66,7 @@ def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> d
 
 
 def _of_topic(name: str) -> Iterator[list[object]]:
-    """Yield rows of what can be set of a topic: of one thing, or of all where none is named."""
+    """Yield rows on the settings of a topic: of the named setting, or of all."""
     topic, _, asked = name.rpartition(".")
     ending = asked.rpartition("_")[2]
     whole = [what for what in WHATS if what == asked]
@@ -75,9 +75,9 @@ def _of_topic(name: str) -> Iterator[list[object]]:
 
 
 def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
-    """List the rows of one name in a table; what is alike of several stands once.
+    """List the table rows of one name; identical rows of several entries are merged.
 
-    Of several takers the first has a name.
+    The first group of entries with that name is used.
     """
     for entries in takers:
         alike: dict[str, tuple[list[object], list[str]]] = {}
@@ -92,7 +92,7 @@ def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
 
 
 def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
-    """Return whose a parameter is; the model does not matter where all models have it alike."""
+    """Name the owners of a parameter; models are left out if it is the same for all of them."""
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
@@ -134,7 +134,7 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
 def _by_label(
     estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
 ) -> Iterator[Entries]:
-    """Yield estimators by label: first what a label begins, then what is set for all."""
+    """Yield estimators by label: first for settings with a label as prefix, then for all."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
         yield [replace(entry, prefix=f"{label}.") for entry in entries]
@@ -142,7 +142,7 @@ def _by_label(
 
 
 def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = None) -> list[Entry]:
-    """Return the parameters of an estimator: for each model that it may estimate, or else all."""
+    """List the parameters of an estimator for each model that it can estimate, or for `model` only."""
     own = {key: value for key, value in values.items() if key != "kind"}
     kind = values.get("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
@@ -162,7 +162,7 @@ def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = Non
 
 
 def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
-    """Yield the parameters of an experiment, its study, its scenario or importer, its estimators."""
+    """Yield the parameters of an experiment, its study, its scenario or importer, and its estimators."""
     named, labels = options["experiment"], options["labels"]
     if not named:
         raise BadInput(f"--set NAME{ASKED}: name an experiment, one that fuselog experiments lists")
@@ -196,5 +196,5 @@ TAKERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Entries]]] = {
     "experiment": _experiment,
     "constraints": _constraints,
     "observability": _observability,
-    "lint": lambda _: iter([()]),  # of topics alone
+    "lint": lambda _: iter([()]),  # has only settings of topics
 }

@@ -1,4 +1,4 @@
-"""Lists what there is to choose from: scenarios, estimators, metrics, experiments; with details."""
+"""Details of scenarios, estimators, models, metrics and experiments."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -30,10 +30,10 @@ from fuselog.replay.judging.metrics.measuring import Metric
 
 @dataclass(frozen=True, repr=False)
 class Entry:
-    """Describes one thing to choose: a line on it, more facts, its parameters, and values it sets.
+    """One thing to choose: a line of description, further facts, its parameters, and values it sets.
 
-    `stated` are the parameters that a log's channels state where they are not given; the names of all
-    begin with `prefix` where they are set.
+    `stated` are the parameters that a log's channels state if they are not set; `prefix` precedes the
+    names of all parameters when they are set.
     """
 
     name: str
@@ -55,21 +55,21 @@ class Entry:
 
 
 PARAMETER_COLUMNS = ("parameter", "default", "unit", "accepts", "meaning")
-Entries = dict[str, Callable[[], Entry]]  # by name, each made when it is asked for
+Entries = dict[str, Callable[[], Entry]]  # by name; each entry is made on demand
 
 
 def scenarios() -> Entries:
-    """List recorders, and the scenario files that ship."""
+    """List recorders, and the shipped scenario files."""
     return _registered("recorders", Recorder, _recorder) | _files("scenarios", _scenario)
 
 
 def estimators() -> Entries:
-    """List estimators with what they need of a log."""
+    """List estimators with their requirements on a log."""
     return _registered("estimators", Estimator, _estimator)
 
 
 def models() -> Entries:
-    """List models with what they are made of, and the methods that estimate them."""
+    """List models with their parts, and the methods that can estimate them."""
     return _registered("models", Model, _model)
 
 
@@ -79,7 +79,7 @@ def metrics() -> Entries:
 
 
 def experiments() -> Entries:
-    """List the experiments that ship."""
+    """List the shipped experiments."""
     return _files("experiments", _experiment)
 
 
@@ -93,7 +93,7 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print all about one entry of a list, or the whole list as JSON, where one that fails says why.
+    """Print the details of one entry, or the whole list as JSON; a failing entry shows its error.
 
     Raises BadInput if the one entry is unknown or does not load.
     """
@@ -113,12 +113,12 @@ def show(kind: str, name: str | None, *, as_json: bool) -> None:
 
 
 def methods() -> dict[str, dict[str, str]]:
-    """Say of every model which methods estimate it, or what it lacks for them."""
+    """Report which methods can estimate each model, or what the model lacks for them."""
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
 def show_formulas(name: str | None, *, as_json: bool) -> None:
-    """Print the formulas of a model; raises BadInput where none is named, or there is no such model."""
+    """Print the formulas of a model; raises BadInput if none is named, or it is unknown."""
     if name is None:
         raise BadInput("--formulas: give a model, as in fuselog models robot --formulas")
     if as_json:
@@ -129,13 +129,13 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
 
 
 def _methods_of(model: Model) -> dict[str, str]:
-    """Say of every method "yes", or what the model lacks for it."""
+    """Report "yes" for every method, or what the model lacks for it."""
     lacking = {name: method.lacks(model) for name, method in METHODS.items()}
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
 
 def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> Entries:
-    """Return an entry for every registered name."""
+    """Make an entry for every registered name."""
 
     def make(name: str) -> Entry:
         return described(name, load(kind, name, expected))
@@ -144,12 +144,12 @@ def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry
 
 
 def _files(kind: str, described: Callable[[str, Path], Entry]) -> Entries:
-    """Return an entry for every file that ships."""
+    """Make an entry for every shipped file."""
     return {name: partial(described, name, path) for name, path in shipped(kind).items()}
 
 
 def entry_or_why(name: str, make: Callable[[], Entry]) -> Entry:
-    """Return an entry, or if it does not load, one that says why."""
+    """Make an entry; if it does not load, make one with the error message."""
     try:
         return make()
     except BadInput as error:
@@ -198,13 +198,13 @@ def _model(name: str, model: Model) -> Entry:
 
 
 def stated_of(model: Model) -> set[str]:
-    """Return the parameters of a model that a log's channels state where they are not given."""
+    """Return the parameters of a model that a log's channels state if they are not set."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
     return own & {*number_fields(model.parameters)}
 
 
 def _listed(components: Mapping[str, str]) -> str:
-    """Join components, each with its kind unless that is linear."""
+    """Join components, each followed by its kind unless it is linear."""
     return ", ".join(
         name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
     )
@@ -251,7 +251,7 @@ def _print_details(entry: Entry) -> None:
 
 
 def rows_of(entry: Entry) -> list[list[object]]:
-    """Return each parameter's name, default, unit, what it accepts and what it means."""
+    """List each parameter's name, default, unit, accepted values and meaning."""
     if entry.parameters is None:
         return []
     return [
@@ -267,5 +267,5 @@ def rows_of(entry: Entry) -> list[list[object]]:
 
 
 def _default(value: object, *, is_stated: bool) -> object:
-    """Say in words what a parameter's default is, where it is what a log's channels state."""
+    """Return a parameter's default, or a phrase if a log's channels state it."""
     return "from the log" if value is None and is_stated else value

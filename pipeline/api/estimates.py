@@ -1,4 +1,4 @@
-"""Judges estimates logs by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
+"""Judgement of estimates logs against the truth of their source logs, as in `fuselog evaluate`."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -32,14 +32,14 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 
 @dataclass(frozen=True)
 class JudgedLogs:
-    """Holds the errors of estimates logs, judged by the truth.
+    """Estimates logs that were judged against the truth.
 
     Attributes:
-        sources: the estimates logs, and then the logs with the truth.
+        sources: the estimates logs, then the logs with the truth.
         estimators: settings by label, as the first estimates log states them.
         judge: of all runs.
-        compared: the estimates as trajectories, where these are compared.
-        coverage: what became of every topic.
+        compared: the estimates as trajectories, if they are compared.
+        coverage: how many messages of every topic were used.
     """
 
     sources: Sequence[LogSource]
@@ -60,20 +60,20 @@ def judge_estimates(
     recover: bool = False,
     gap_limit_s: float = 0.2,
 ) -> JudgedLogs:
-    """Judge estimates logs, a run each.
+    """Judge estimates logs, one run each.
 
     Args:
         estimates: the estimates logs.
-        logs: those with the truth; by default the ones that the estimates were replayed from.
-        comparison: entries of a `Comparison`, if any: positions are then compared as trajectories too,
-            and estimates are judged in their alignment with the truth.
+        logs: the logs with the truth; by default those that the estimates were replayed from.
+        comparison: entries of a `Comparison`, if any: positions are then also compared as trajectories,
+            and estimates are judged after alignment with the truth.
         out: a result folder to write.
-        metrics: which ones; none stands for all.
-        errors: whether the folder keeps every single error.
-        recover: read what is whole of logs that were cut off or damaged.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        metrics: their names; all if empty.
+        errors: whether the folder keeps all individual errors.
+        recover: read the intact part of truncated or damaged logs.
+        gap_limit_s: the longest gap over which the truth is interpolated.
 
-    Raises BadInput where a log has no estimates, is of another run, or there is nothing to judge.
+    Raises BadInput if a log has no estimates or is from another run, or if there is nothing to judge.
     """
     if errors and out is None:
         raise BadInput("--errors: errors are written into a result folder; give one with --out")
@@ -128,7 +128,7 @@ def judge_estimates(
 
 
 def _opened(path: Path, *, recover: bool) -> LogSource:
-    """Open an estimates log; raises BadInput where it is none."""
+    """Open an estimates log; raises BadInput if the file is not one."""
     try:
         log = open_log(path, recover=recover)
     except NotMcap as error:
@@ -146,7 +146,7 @@ def _compared(
     comparison: Mapping[str, Any],
     gap_limit_s: float,
 ) -> ComparedLogs:
-    """Compare the estimates as trajectories, aligned where that is asked for."""
+    """Compare the estimates as trajectories, with alignment if requested."""
     if not comparison:
         return ComparedLogs(estimates, {})
     if "time_offset_s" in comparison:

@@ -1,4 +1,4 @@
-"""Lints a log: finds what is wrong with it as it is written, before any filter."""
+"""Check of a log as it is written, before any filter."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,17 +17,17 @@ NOTHING = "nothing found by looking at the log alone"
 
 
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
-    """Return what is wrong with a log as it is written, the worst first and hints last.
+    """Find what is wrong with a log as it is written, the worst first and hints last.
 
     Args:
         log: a path, a log or a recording.
-        set: alterations of topics, such as {"/imu.delay_s": 0.1}, with which it is looked at.
+        set: changes of topics to check with, such as {"/imu.delay_s": 0.1}.
 
     Returns:
-        The findings, each with its topic, the evidence in a sentence, and what to do; none where all
-        is well.
+        The findings, each with its topic, the evidence in a sentence, and what to do; empty if nothing
+        is wrong.
 
-    Raises BadInput where the log cannot be read, or not be altered so.
+    Raises BadInput if the log cannot be read or changed in this way.
 
     >>> import fuselog as fl
     >>> run = fl.record("landmarks", seed=7, duration_s=2.0)
@@ -38,7 +38,7 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
 
 
 def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
-    """Print the findings of a log; returns whether there is none but hints."""
+    """Print the findings of a log; returns whether all of them are hints."""
     alterations, others = split_texts(settings)
     if others:
         raise BadInput(f"--set {others[0]}: lint has settings of topics alone, such as /imu.delay_s=0.1")

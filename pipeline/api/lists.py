@@ -1,8 +1,7 @@
-"""Lists what there is to choose from, without importing it.
+"""Lists of what there is to choose from, without importing it.
 
-What our modules and files say of themselves is kept in `data/lists.json`, which
-`python -m tests.lists` writes and a test compares. If another package registers a name, all are
-imported.
+The descriptions of our modules and files are stored in `data/lists.json`, which `python -m tests.lists`
+writes and a test compares. If another package registers a name, everything is imported instead.
 """
 
 import json
@@ -17,7 +16,7 @@ from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.registry import available
 
 KEPT = SHIPPED / "lists.json"
-# In which group the names of a list are registered; scenarios and experiments are files, too.
+# The entry-point group of each list; scenarios and experiments are also files.
 GROUPS = {
     "scenarios": "recorders",
     "estimators": "estimators",
@@ -26,7 +25,7 @@ GROUPS = {
     "metrics": "metrics",
     "experiments": "",
 }
-# What a name belongs to, by the module that defines it, in the order in which it is printed.
+# Title of each family by the module that defines a name, in printing order.
 FAMILIES = {
     r"fuselog\.replay\.inference\.": "Methods, for any model",
     r"fuselog\.\w+\.importers\.": "Real data",
@@ -47,7 +46,7 @@ FAMILIES = {
 
 
 def show_list(kind: str) -> None:
-    """Print the names of a kind ("scenarios", say) with a line on each, in families if there are any."""
+    """Print the names of a kind, such as "scenarios", with a line on each, grouped by family."""
     in_families = kind in ("scenarios", "models", "estimators")
     rows = by_family(kind) if in_families else listed(kind).items()
     print_table([kind.removesuffix("s"), "what"], [*rows])
@@ -62,13 +61,13 @@ def show_list(kind: str) -> None:
 
 
 def by_family(kind: str) -> Iterator[tuple[str, str]]:
-    """Yield a row for each family, and below it the names that belong to it, each with its line."""
+    """Yield a row for each family, followed by its names, each with its description."""
     lines, places = listed(kind), places_of(kind)
     order = [*FAMILIES]
 
     def family_of(name: str) -> int:
         place = places[name]
-        if name == place:  # a file, which belongs where its recorder does
+        if name == place:  # a file belongs to the family of its recorder
             place = places[read_toml(shipped(kind)[name])["recorder"]]
         return next(at for at, module in enumerate(order) if re.match(module, place))
 
@@ -78,7 +77,7 @@ def by_family(kind: str) -> Iterator[tuple[str, str]]:
 
 
 def listed(kind: str) -> dict[str, Any]:
-    """Return a line on each name; for the methods, their answers by model."""
+    """Return the description of each name; for the methods, their answers by model."""
     kept, places = json.loads(KEPT.read_text(encoding="utf-8"))[kind], places_of(kind)
     if kept.keys() >= {*places.values()}:
         return {name: kept[place] for name, place in places.items()}
@@ -86,9 +85,9 @@ def listed(kind: str) -> dict[str, Any]:
 
 
 def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
-    """Return what is listed as all that is listed says it, which imports all.
+    """Collect descriptions from the entries themselves, which imports all of them.
 
-    An entry that does not load says why; with `all_load` it raises BadInput.
+    An entry that does not load shows its error; with `all_load` it raises BadInput.
     """
     from fuselog.pipeline.api import catalog
 
@@ -101,6 +100,6 @@ def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
 
 
 def places_of(kind: str) -> dict[str, str]:
-    """Return where each name comes from: its entry point, or a file that has its name."""
+    """Return the origin of each name: its entry point, or a file of that name."""
     registered = available(GROUPS[kind]).items()
     return {name: entry.value for name, entry in registered} | {name: name for name in shipped(kind)}

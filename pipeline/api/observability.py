@@ -1,4 +1,4 @@
-"""Measures the observability of logs: makes a table for Python, and the command prints it."""
+"""Observability of logs: a table for Python, which the command prints."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -33,22 +33,22 @@ def observability(
     end_s: float | None = None,
     **parameters: Any,
 ) -> pd.DataFrame:
-    """Measure what the measurements of a log tell of a model's state, in units of what the prior tells.
+    """Measure how well a log's measurements determine a model's state, relative to the prior.
 
     Args:
-        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        logs: paths, opened logs, or recordings: one, or several with the same topics.
         model: a registered name, or a model of your own; by default the registered one that fits.
-        window_s: how long the windows are, in seconds; by default each run is one.
-        scales: what is worth one, by component, instead of the prior's standard deviation.
-        end_s: where the runs end, in seconds since each one's epoch.
+        window_s: length of the windows in seconds; by default each run is one window.
+        scales: unit of each component, instead of the prior's standard deviation.
+        end_s: end of the runs, in seconds since each one's epoch.
         parameters: of the model.
 
     Returns:
-        A row per run, case and window: its span, how many measurements it has, the rank and the
-        eigenvalues of the local Gramian, ascending, the direction of the least in state units and of
-        length one, and what that means in words.
+        A row per run, case and window: its span, the number of measurements, the rank and the
+        eigenvalues of the local Gramian in ascending order, the unit direction of the smallest one in
+        state units, and its meaning in words.
 
-    Raises BadInput where no model fits, or nothing is measured.
+    Raises BadInput if no model fits, or nothing is measured.
 
     >>> from fuselog.pipeline.api.api import record
     >>> table = observability(record("landmarks", duration_s=2.0), window_s=1.0)

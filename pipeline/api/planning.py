@@ -1,6 +1,6 @@
-"""Plans replays: logs, estimators, spans, starts, order. Python and the commands plan alike.
+"""Plans of replays (logs, estimators, spans, starts, order), for Python and for the commands.
 
-Nothing that takes long to import is needed for it: `fuselog replay` begins at once.
+Planning imports nothing slow, so `fuselog replay` starts quickly.
 """
 
 import warnings
@@ -37,16 +37,16 @@ Named = str | Estimator[Any] | Mapping[str, Kind]
 
 @dataclass(frozen=True)
 class Plan:
-    """Holds a replay that can begin.
+    """A replay that is ready to run.
 
     Attributes:
         sources: the spans of the runs.
         estimators: settings by label.
-        origins: what each run starts from, or none; see `origins_of`.
+        origins: what each run starts from, or empty; see `origins_of`.
         order: the clock that orders the messages.
-        late: what is done about messages that come late.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        metrics: their names; none stands for all.
+        late: how out-of-sequence messages are handled.
+        gap_limit_s: the longest gap over which the truth is interpolated.
+        metrics: their names; all if empty.
     """
 
     sources: Sequence[LogSource | MemorySource]
@@ -66,16 +66,16 @@ class Plan:
         companions: Companions | None = None,
         progress: Progress = no_progress,
     ) -> Pass:
-        """Replay into estimates logs, judged where there is truth.
+        """Replay the logs, write estimates logs, and judge the estimates if there is truth.
 
         Args:
-            estimates: for each run where its estimates go, and the log that they are of.
-            save: the file that the first run's timeline goes to.
-            connect: the Rerun viewer that it is streamed to.
-            companions: makes what is written beside the estimates for viewers.
-            progress: is told of every block.
+            estimates: for each run, the path of its estimates and its source log.
+            save: the file for the first run's timeline.
+            connect: the Rerun viewer to stream the timeline to.
+            companions: makes messages for other viewers, written next to the estimates.
+            progress: reports progress after every block.
 
-        Raises BadInput where no run can be replayed by one of the estimators.
+        Raises BadInput if an estimator cannot replay any run.
         """
         return replay_parts(
             cut_in_parts(self.sources, estimates, self.origins),
@@ -105,9 +105,9 @@ def plan_replay(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] | None = None,
 ) -> Plan:
-    """Check what a replay is asked for, and open its logs; see `fuselog.pipeline.api.replays.replay`.
+    """Check the arguments of a replay and open its logs; see `fuselog.pipeline.api.replays.replay`.
 
-    Raises BadInput where a setting makes no sense, a log cannot be read or has nothing in the span.
+    Raises BadInput if a setting is invalid, or a log cannot be read or has no messages in the span.
     """
     for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
         if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
@@ -126,16 +126,16 @@ def plan_replay(
 
 
 def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
-    """Open a log: a mapping of its topics to their streams, each read when it is asked for.
+    """Open a log as a mapping of its topics to their streams, which are read on demand.
 
     Args:
         path: an MCAP file.
-        recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
+        recover: read the intact part of a truncated or damaged log; a warning states what is missing.
 
     Returns:
         The log, which maps every topic to its stream.
 
-    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+    Raises BadInput if the file is missing or not MCAP, or if it is damaged and `recover` is False.
 
     >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
@@ -154,9 +154,9 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
 def sources_of(
     logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
 ) -> list[LogSource | MemorySource]:
-    """Return one log or several as sources, with topics altered where that is asked for.
+    """Open one log or several as sources, with changes of topics if requested.
 
-    Raises BadInput where there is none, or one is no log, or cannot be altered so.
+    Raises BadInput if there is none, or if one is not a log or cannot be changed in this way.
     """
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
@@ -177,7 +177,7 @@ def _source(log: Log) -> LogSource | MemorySource:
 def settings_of(
     estimators: Named | Iterable[Named],
 ) -> dict[str, dict[str, Any]]:
-    """Return the settings of each estimator by its label; raises BadInput where they are none."""
+    """Return the settings of each estimator by its label; raises BadInput if they are invalid."""
     are_several = isinstance(estimators, Iterable) and not isinstance(estimators, str | Mapping)
     listed: list[Any] = [*estimators] if are_several else [estimators]  # type: ignore[misc]
     chosen: dict[str, dict[str, Any]] = {}
@@ -213,7 +213,7 @@ def settings_of(
 
 
 def _labelled(named: Named) -> Mapping[str, Kind]:
-    """Return what stands under which label; a name and an estimator are labels of their own."""
+    """Map labels to estimators; names and estimators are their own labels."""
     if isinstance(named, str):
         return dict([shorthand(named)])
     return {named.label: named} if isinstance(named, Estimator) else allowed(named)

@@ -1,4 +1,4 @@
-"""Compiles kernels ahead of their first use: short recordings are replayed, on all cores."""
+"""Compilation of kernels before their first use, by replaying short recordings on all cores."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
@@ -25,18 +25,18 @@ from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.requirements import names_state
 
 USUAL = ("ekf", "ukf", "smoother:ekf")
-SHORT_S = (2.0, 12.0)  # the first that a scenario accepts
+SHORT_S = (2.0, 12.0)  # durations to try; the first that a scenario accepts is used
 Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """Describes one model by one method: the replayed scenario, how long that took, or why not.
+    """The result for one model and method: the replayed scenario and its time, or why there is none.
 
     Attributes:
         model, method: their registered names.
-        scenario: the one that was recorded and replayed.
-        took_s: how long the replay took with all that it compiled, in s.
-        why_not: the reason where the model was not replayed by this method; else empty.
+        scenario: the scenario that was recorded and replayed.
+        took_s: duration of the replay in s, including everything that it compiled.
+        why_not: the reason why the model was not replayed by this method; otherwise empty.
     """
 
     model: str
@@ -53,24 +53,24 @@ def precompile(
     *,
     workers: int | None = None,
 ) -> list[Precompiled]:
-    """Compile and keep what the first replay of models by methods would compile, and what reads its log.
+    """Compile and store the kernels that the first replay of models by methods needs.
 
-    A kernel is made for the sensors that a log has. So the registered scenarios that a model fits are
-    recorded, for seconds, and replayed. A log with other sensors compiles its own kernels when it is
-    first replayed, and so does a model that no scenario fits, or that is not registered.
+    A kernel is specific to the sensors of a log. Therefore short recordings of the registered scenarios
+    that fit a model are replayed. A log with other sensors compiles its own kernels on its first replay,
+    and so does a model that fits no scenario or is not registered.
 
     Args:
-        models: registered names (`models` has them), all by default.
-        methods: such as "smoother:ukf"; ekf, ukf and smoother:ekf by default. Where one of the two is
-            left out, methods that cannot estimate a model are left out too.
-        workers: processes, as many as there are cores by default; a script guards its own work with `if
-            __name__ == "__main__":`, as they import it.
+        models: names from `models`, all by default.
+        methods: such as "smoother:ukf"; ekf, ukf and smoother:ekf by default. If either argument is left
+            out, methods that cannot estimate a model are skipped.
+        workers: number of processes, by default one per core; a script must guard its own code with `if
+            __name__ == "__main__":`, because the processes import it.
 
     Returns:
-        A row for every model, method and scenario; of scenarios with the same sensors, the first.
+        A row for every model, method and scenario; of scenarios with the same sensors, only the first.
 
-    Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache where nothing
-    would be kept.
+    Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache that cannot
+    store kernels.
     """
     names = [models] if isinstance(models, str) else models
     chosen = [methods] if isinstance(methods, str) else methods
@@ -84,7 +84,7 @@ def precompile(
 
 
 def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> list[Precompiled]:
-    """Return the same for these pairs of a model and a method."""
+    """Compile the kernels for pairs of a model and a method; see `precompile`."""
     pairs = list(dict.fromkeys(pairs))
     for model, method in pairs:
         modelled(load("models", model, Model), method)
@@ -111,7 +111,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
 
 
 def show_precompiling(asked: Iterable[str], *, as_json: bool) -> None:
-    """Compile the pairs MODEL:METHOD, or usual methods of MODEL, or of all; print what was made."""
+    """Compile pairs MODEL:METHOD, the usual methods of MODEL, or of all models; print the result."""
     begun_s, before = perf_counter(), set(kept_files())
     pairs = [pair for text in asked for pair in _pairs_of(text)]
     made = precompile_pairs(pairs or _working(registered_models(), USUAL))
@@ -135,7 +135,7 @@ def _usual(models: Iterable[str]) -> list[Pair]:
 
 
 def _working(models: dict[str, Model], methods: Iterable[str]) -> list[Pair]:
-    """Choose the pairs that work together."""
+    """Choose the pairs whose method can estimate the model."""
     kinds = {method: method.partition(":")[0] for method in methods}
     for kind in kinds.values():
         if kind not in METHODS:
@@ -158,7 +158,7 @@ def _check_cache() -> None:
 
 
 def _scenarios() -> list[str]:
-    """List all that can be recorded."""
+    """List all scenarios that can be recorded."""
     names = [*available("recorders"), *shipped("scenarios")]
     return [
         name
@@ -172,12 +172,12 @@ def _all(executor: Executor, work: Callable[..., Any], asked: Iterable[tuple[Any
 
 
 def _fits(scenario: str, models: Iterable[str]) -> tuple[str, dict[str, Any]]:
-    """Find which of the models a scenario's log fits, and with which sensors each."""
+    """Find the models that fit a scenario's log, and the sensors of each."""
     topics, found = _recorded(scenario).topics, {}
     for name in models:
         model = load("models", name, Model)
         places = [each for each in topics_of(model, topics) if names_state(each.prior, model)]
-        if model.by_name:  # its topics are those of other models too: the prior alone tells
+        if model.by_name:  # other models have the same topics, so the prior decides
             places = [each for each in places if each.has_prior]
         if places:
             found[name] = tuple(sorted({tuple(own.topic for own, _ in each.sensors) for each in places}))
@@ -188,14 +188,14 @@ def _replayed(scenario: str, model: str, method: str) -> Precompiled:
     begun_s = perf_counter()
     try:
         replay(_recorded(scenario), {"precompiled": modelled(load("models", model, Model), method)})
-        chi2.sf(1.0, 1)  # what a command says of a replay compiles it, if the gate was used
+        chi2.sf(1.0, 1)  # compiled by a command's summary of a replay if the gate was used
     except BadInput as error:
         return Precompiled(model, method, scenario, perf_counter() - begun_s, str(error))
     return Precompiled(model, method, scenario, perf_counter() - begun_s)
 
 
 def _recorded(scenario: str) -> MemorySource:
-    """Make a short recording."""
+    """Make a short recording of a scenario."""
     recorder, values, _ = load_scenario(scenario)
     if "duration_s" in load("recorders", recorder, Recorder).parameters.model_fields:
         for duration_s in SHORT_S:

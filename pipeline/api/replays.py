@@ -1,7 +1,7 @@
-"""Replays as a function: takes logs and estimators, and answers all that can be asked of the result.
+"""Replay as a function: it takes logs and estimators and returns an object for all questions.
 
-The estimates are in a scratch folder for as long as the replay or one of its estimates is referred to:
-memory holds the metrics' sums, and what is asked for.
+Estimates are in a scratch folder, which exists as long as the replay or one of its estimates is
+referenced. Memory holds the sums of the metrics, and what is asked for.
 """
 
 import hashlib
@@ -59,31 +59,31 @@ def replay(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] | None = None,
 ) -> "Replay":
-    """Replay estimators over logs, and judge them where there is truth.
+    """Replay estimators over logs, and judge the estimates if there is truth.
 
     Args:
-        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
-        estimators: registered names, an `Estimator`, as `recursive`, `batch` and `modelled` make them,
-            or labels of your own with what they stand for: an `Estimator`, or settings, whose `kind` is
-            a name or an `Estimator`:
-            `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
-        start_s: where the replayed span begins, in seconds since each run's epoch.
-        end_s: where it ends.
-        start_from: what filters begin with at `start_s`: "truth", or the estimates log of an earlier
-            replay for each log.
-        start_sigma: how well the truth is known, by component; by default as the log's prior has it.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        arrival_order: go by log time, as the messages arrived.
-        late: what is done about messages that then come late, by their stamps: "drop", "wait:0.5" (in
-            seconds), "rewind:0.5"; by default they count as measured when they arrived.
-        set: parameters of all estimators that have them, and how topics are altered before they are
-            replayed: `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
-        metrics: which ones; none stands for all.
+        logs: paths, opened logs, or recordings: one, or several with the same topics.
+        estimators: registered names; an `Estimator` made by `recursive`, `batch` or `modelled`; or
+            labels of your own, mapped to an `Estimator` or to settings whose `kind` is a name or an
+            `Estimator`: `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
+        start_s: start of the replayed span, in seconds since each run's epoch.
+        end_s: end of the span.
+        start_from: initial state of filters at `start_s`: "truth", or for each log the estimates log of
+            an earlier replay.
+        start_sigma: standard deviations for a start from the truth, by component; by default the
+            prior's.
+        gap_limit_s: the longest gap over which the truth is interpolated.
+        arrival_order: process messages in order of log time, as they arrived.
+        late: how messages that arrive out of sequence are handled: "drop", "wait:0.5" (in seconds) or
+            "rewind:0.5"; by default they count as measured on arrival.
+        set: parameters of all estimators that have them, and changes of topics before the replay:
+            `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
+        metrics: their names; all by default.
 
     Returns:
-        The estimates of every run, and as tables their metrics, errors and innovations.
+        The estimates of every run, with tables of metrics, errors and innovations.
 
-    Raises BadInput where no run can be replayed by one of the estimators.
+    Raises BadInput if an estimator cannot replay any run.
 
     >>> from fuselog.pipeline.api.api import record
     >>> done = replay(record("landmarks", duration_s=2.0), ["ekf", {"sure": {"kind": "ekf"}}])
@@ -116,27 +116,27 @@ def replay(
 
 
 class _Scratch:
-    """Is referred to by all that is read of a scratch folder, which is removed with the last of it."""
+    """A token for a scratch folder, which is removed when the last reference to the token is gone."""
 
 
 @dataclass(frozen=True, repr=False)
 class _Estimated(LogSource):
-    """Represents the estimates of a run, whose file lasts as long as this."""
+    """The estimates of a run, whose file exists as long as this object."""
 
     scratch: _Scratch = field(default_factory=_Scratch)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay(Showing):
-    """Holds what estimators made of logs.
+    """The result of a replay.
 
     Attributes:
         logs: the runs.
-        estimates: for each of them a log of what was estimated, by topic.
-        settings: the estimators by label, as they were given.
-        done: the pass: its judge, all parameters, and how long each estimator worked.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        arrival_order, late: as they were given.
+        estimates: for each run a log of its estimates, by topic.
+        settings: the estimators by label, as given.
+        done: the pass over the logs: its judge, all parameters, and the time of each estimator.
+        gap_limit_s: the longest gap over which the truth is interpolated.
+        arrival_order, late: as given.
     """
 
     logs: Sequence[LogSource | MemorySource]
@@ -149,7 +149,7 @@ class Replay(Showing):
 
     @property
     def judge(self) -> Judge:
-        """Judge what the estimators are worth."""
+        """Return the judge, which holds the sums of all metrics."""
         return self.done.judge
 
     @property
@@ -163,9 +163,9 @@ class Replay(Showing):
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """Return a row per metric, by estimators: estimator, quantity, case, value, low, high.
+        """Return a table with a row per metric: estimator, quantity, case, value, low, high.
 
-        From `low` to `high` lie 95 % of the values of a consistent estimator; NaN where that is unknown.
+        `low` and `high` bound 95 % of the values of a consistent estimator; NaN if unknown.
         """
         metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
         intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
@@ -173,22 +173,22 @@ class Replay(Showing):
 
     @property
     def runs(self) -> pd.DataFrame:
-        """Return a row per estimator, case and run: estimates, RMSE of each quantity, mean NEES."""
+        """Return a table with a row per estimator, case and run: estimates, RMSE, mean NEES."""
         return self.judge.runs_table
 
     @property
     def steps(self) -> pd.DataFrame:
-        """Return a row per estimator, case and step, over runs: RMSE, mean NEES, its 95 % interval."""
+        """Return a table with a row per estimator, case and step: RMSE, mean NEES, its 95 % interval."""
         return joined(self.judge.steps.values())
 
     @property
     def times(self) -> pd.DataFrame:
-        """Return a row per estimator, case, run and span of time."""
+        """Return a table with a row per estimator, case, run and span of time."""
         return self.judge.times
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Return a row per estimate that has truth: error and sigma of every component, NEES."""
+        """Compute a table with a row per estimate with truth: error and sigma by component, NEES."""
         tables: list[pd.DataFrame] = []
 
         def keep(errors: Errors) -> None:
@@ -199,7 +199,7 @@ class Replay(Showing):
 
     @cached_property
     def innovations(self) -> pd.DataFrame:
-        """Return a row per predicted measurement: its NIS, its components, whether it was let in."""
+        """Read a table with a row per predicted measurement: NIS, components, and acceptance."""
         found = [
             innovations_of(gather([log.read([topic])[topic]]), run)
             for run, log in enumerate(self.estimates)
@@ -210,28 +210,28 @@ class Replay(Showing):
 
     @property
     def failures(self) -> list[str]:
-        """Return a sentence for every run that an estimator could not follow to the end, or at all."""
+        """Return a sentence for every run that an estimator did not complete."""
         return self.judge.failures
 
     @property
     def losses(self) -> list[str]:
-        """Return a sentence for what was not estimated throughout, and for measurements not used."""
+        """Return sentences on spans without estimates and on measurements that were not used."""
         return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
 
     @cached_property
     def alarms(self) -> list[Finding]:
-        """Return what makes the numbers doubtful, the worst first."""
+        """Return the warnings about the numbers, the worst first."""
         return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property
     def coverage(self) -> pd.DataFrame:
-        """Return what became of the logs' topics by estimator: messages, used, gated, skipped, why."""
+        """Return a table on the use of topics by estimators: messages, used, gated, skipped, why."""
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
-        """Draw RMSE and NEES over time of a `case` such as `robot1`, by default of the first.
+        """Draw RMSE and NEES over time for a `case` such as `robot1`, by default for the first.
 
-        Raises BadInput where there is no such case, or nothing was judged.
+        Raises BadInput if there is no such case, or nothing was judged.
         """
         charts = error_charts(self.judge)
         if not charts:
@@ -242,14 +242,14 @@ class Replay(Showing):
         return draw(charts[case])
 
     def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:
-        """Show the timeline of a run: in the notebook, else in the viewer; or write it to an .rrd file.
+        """Show the timeline of a run in the notebook or in the viewer, or write it to an .rrd file.
 
         Args:
-            run: which run.
-            focus: the case that is seen first, such as `robot3`.
+            run: the number of the run.
+            focus: the case to show first, such as `robot3`.
             save: the file to write; nothing is shown then.
 
-        Raises BadInput where there is no such run or case, no viewer, or the file cannot be written.
+        Raises BadInput if there is no such run or case, no viewer, or the file cannot be written.
         """
         from fuselog.replay.timeline import viewer
 
@@ -276,7 +276,7 @@ class Replay(Showing):
     def save(self, folder: str | Path) -> ResultFolder:
         """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder contains something other than a result of fuselog.
         """
         place = Path(folder)
         check_folder(place, {"input": self.paths})
@@ -304,7 +304,7 @@ class Replay(Showing):
 
     @property
     def input_sha256(self) -> str:
-        """Return the SHA-256 of what was replayed: of logs their files, of recordings their columns."""
+        """Compute the SHA-256 of the input: the files of logs, and the columns of recordings."""
         digest = hashlib.sha256()
         for log in self.logs:
             if isinstance(log, MemorySource):

@@ -1,4 +1,4 @@
-"""Evaluates trajectories, of two files or of the estimates that logs hold: numbers, tables, figures."""
+"""Evaluation of trajectories, from two files or from logs: numbers, tables, figures."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -45,12 +45,12 @@ AXES = "xyz"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """Holds an estimated trajectory against the true one.
+    """An estimated trajectory compared with the true one.
 
     Attributes:
-        estimate, truth: the trajectories, as they were given.
+        estimate, truth: the trajectories, as given.
         comparison: how they were compared.
-        compared: pose by pose; the estimate is aligned there.
+        compared: the comparison by pose, with the aligned estimate.
     """
 
     estimate: Trajectory
@@ -60,12 +60,12 @@ class Evaluation:
 
     @cached_property
     def metrics(self) -> dict[str, float]:
-        """Return APE and RPE, as `ape_translation_rmse_m`; how many poses and pairs they are of."""
+        """Compute APE and RPE, such as `ape_translation_rmse_m`, and the numbers of poses and pairs."""
         return trajectory_metrics([self.compared])
 
     @property
     def alignment(self) -> dict[str, Any]:
-        """Return what brings the estimate to the truth: rotation (w, x, y, z), translation, scale."""
+        """Return the transform that aligns the estimate: rotation (w, x, y, z), translation, scale."""
         rotation, translation_m, scale = self.compared.alignment
         quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
         return {
@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Return a sentence for what was mended or is in doubt, and if no time offset helps."""
+        """Return sentences on corrections and doubts, and on a time offset that was not found."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         notes = [in_vain] if sought and not self.compared.time_offset_s else []
@@ -84,7 +84,7 @@ class Evaluation:
 
     @property
     def poses(self) -> pd.DataFrame:
-        """Return a row per pose that has truth: stamp, aligned and true position, APE."""
+        """Return a table with a row per pose with truth: stamp, aligned and true position, APE."""
         done = self.compared
         columns: dict[str, Any] = {}
         if done.estimate.time_ns is not None:
@@ -98,7 +98,7 @@ class Evaluation:
 
     @property
     def pairs(self) -> pd.DataFrame:
-        """Return a row per pair of poses: the pose that it ends at, RPE."""
+        """Return a table with a row per pair of poses: its last pose and its RPE."""
         done = self.compared
         columns = {"last_pose": done.last, "rpe_translation_m": done.relative_m}
         if done.relative_deg is not None:
@@ -111,13 +111,13 @@ class Evaluation:
         return "\n".join([name, *self.notes, *values])
 
     def figure(self) -> "Figure":
-        """Return the path, its errors as colours, by matplotlib."""
+        """Draw the path with its errors as colours, in matplotlib."""
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:
         """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if the folder contains something other than a result of fuselog.
         """
         place = Path(folder)
         names = [self.estimate.name, self.truth.name]
@@ -141,7 +141,7 @@ class Evaluation:
             return ResultFolder(place, write_outcome(part, "evaluate", settings, outcome))
 
     def _hash(self) -> str:
-        """Hash the poses of both with SHA-256."""
+        """Hash the poses of both trajectories with SHA-256."""
         digest = hashlib.sha256()
         for each in (self.estimate, self.truth):
             for array in (each.time_ns, each.position_m, each.rotation):
@@ -166,26 +166,26 @@ def evaluate(
     format: str | None = None,  # noqa: A002
     truth_format: str | None = None,
 ) -> Evaluation:
-    """Evaluate an estimated trajectory by the true one, with the figures of evo.
+    """Evaluate an estimated trajectory against the true one, with the metrics of evo.
 
     Args:
-        estimate: a file of TUM, KITTI or EuRoC, or a trajectory in memory.
+        estimate: a TUM, KITTI or EuRoC file, or a trajectory in memory.
         truth: likewise.
-        align: the transform of the estimate that brings it nearest to the truth: "none", "yaw" (about
-            the vertical, and shifted), "se2" (likewise, the height left as it is), "se3", "sim3".
-        delta: over how much of the way relative errors are taken.
-        delta_unit: "m" of the estimate's path, "frames" or "s".
-        association: poses belong to the "nearest" in time, or the truth is "interpolated".
-        max_difference_s: up to which stamps belong together, for the nearest.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        align: the transform that aligns the estimate with the truth: "none", "yaw" (rotation about the
+            vertical axis, and translation), "se2" (the same, with the height unchanged), "se3", "sim3".
+        delta: the distance over which relative errors are computed.
+        delta_unit: of `delta`: "m" along the estimate's path, "frames" or "s".
+        association: match poses with the "nearest" in time, or with the "interpolated" truth.
+        max_difference_s: the largest time difference of matched poses, for "nearest".
+        gap_limit_s: the longest gap over which the truth is interpolated.
         time_offset_s: added to the estimate's stamps; "estimate" finds it.
-        format: of the estimate's file: "tum", "kitti", "euroc"; by default its content tells.
-        truth_format: of the truth's.
+        format: of the estimate's file: "tum", "kitti", "euroc"; by default detected from the content.
+        truth_format: of the truth's file.
 
     Returns:
         Both trajectories and their errors, absolute (APE) and relative (RPE), in m and degrees.
 
-    Raises BadInput where a file holds no trajectory, or the two cannot be compared.
+    Raises BadInput if a file contains no trajectory, or the two cannot be compared.
 
     >>> way = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0], [3, 3, 0]])
     >>> turned = Trajectory("turned", way @ [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]] + 5.0)
@@ -203,11 +203,11 @@ def evaluate(
 
 @dataclass(frozen=True)
 class ComparedLogs:
-    """Holds the estimates of logs as trajectories, compared with the truth.
+    """Estimates of logs as trajectories, compared with the truth.
 
     Attributes:
-        estimates: of every run, aligned with its truth.
-        compared: of every estimator and case, of the runs that have both estimates and truth.
+        estimates: of every run, aligned with the truth.
+        compared: by estimator and case, for the runs that have both estimates and truth.
     """
 
     estimates: Sequence[Source]
@@ -215,7 +215,7 @@ class ComparedLogs:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Return APE and RPE over all runs, as `estimator.ape_translation_rmse_m[.case]`."""
+        """Compute APE and RPE over all runs, as `estimator.ape_translation_rmse_m[.case]`."""
         return {
             metric_key(estimator, quantity, case): value
             for (estimator, case), runs in self.compared.items()
@@ -224,12 +224,12 @@ class ComparedLogs:
 
     @property
     def notes(self) -> list[str]:
-        """Return a sentence for what figures do not mean."""
+        """Return sentences on the limits of the numbers."""
         return [each for runs in self.compared.values() for run in runs for each in run.doubts]
 
     @property
     def figures(self) -> dict[str, "Chart | Figure"]:
-        """Return the figures of the first run, by case."""
+        """Draw the figures of the first run, by case."""
         cases: dict[str, dict[str, Compared]] = {}
         for (estimator, case), runs in self.compared.items():
             cases.setdefault(case, {})[estimator] = runs[0]
@@ -242,12 +242,12 @@ class ComparedLogs:
 def compare_logs(
     estimates: Sequence[LogSource], sources: Sequence[LogSource], comparison: Comparison
 ) -> ComparedLogs:
-    """Compare the estimated positions of logs with their truths, and align each run by itself.
+    """Compare the estimated positions of logs with their truths, and align each run separately.
 
     Memory holds the poses of all runs.
 
-    Raises BadInput as `compare`, where an alignment would turn a planar state out of its plane, and
-    without one where estimates and truth are in planes that cannot be compared.
+    Raises BadInput as `compare` does; if an alignment would tilt a planar state out of its plane; or if
+    estimates and truth without alignment are in local tangent planes that cannot be compared.
     """
     compared: dict[tuple[str, str], list[Compared]] = {}
     aligned: list[Source] = []
@@ -280,7 +280,7 @@ def compare_logs(
 def trajectory_figures(
     compared: Mapping[str, Compared], suffix: str = ""
 ) -> dict[str, "Chart | Figure"]:
-    """Draw figures as evo has them, of estimates by label: paths, errors, errors as colours."""
+    """Draw figures in the style of evo for estimates by label: paths, errors, and errors as colours."""
     figures: dict[str, Chart | Figure] = {
         f"trajectory{suffix}": _path_chart(compared),
         f"pose-errors{suffix}": _error_chart(compared),
@@ -291,7 +291,7 @@ def trajectory_figures(
 
 
 def _plane(truth: Trajectory) -> list[int]:
-    """Find the two axes along which the truth is widest: those of the ground, also for a camera."""
+    """Find the two axes with the largest extent of the truth: the ground plane, also for a camera."""
     return sorted(np.argsort(-np.ptp(truth.position_m, axis=0), kind="stable")[:2].tolist())
 
 
@@ -307,7 +307,7 @@ def _path_chart(compared: Mapping[str, Compared]) -> Chart:
 
 
 def _error_chart(compared: Mapping[str, Compared]) -> Chart:
-    """Draw APE at every pose, RPE at the last pose of every pair; over time, or by their number."""
+    """Draw APE at every pose and RPE at the last pose of every pair, over time or pose number."""
     timed = all(done.estimate.time_ns is not None for done in compared.values())
     x = Axis(label="time (s)" if timed else "pose")
     panels = []
@@ -336,7 +336,7 @@ def _places(done: Compared) -> np.ndarray:
 
 
 def error_along_path(done: Compared) -> "Figure":
-    """Draw the aligned path, its APE as colours, and the true one."""
+    """Draw the aligned path with its APE as colours, and the true path."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 

@@ -1,8 +1,8 @@
-"""Cuts an experiment into cells, works them off in any order, and merges them in their own.
+"""Cells of an experiment, which are processed in any order and merged in a fixed order.
 
-A cell is a part of the runs. What it gives depends on its description and on the code alone, so that it
-may be worked off anywhere, and once is enough: finished cells are kept until all are done, and the same
-command goes on from there after it was stopped; see `fuselog.pipeline.runs.checkpoints`.
+A cell is a part of the runs. Its result depends only on its description and on the code, so it can be
+computed anywhere, and only once: finished cells are kept until all are done, and the same command
+continues with them after an interruption; see `fuselog.pipeline.runs.checkpoints`.
 """
 
 import hashlib
@@ -36,22 +36,22 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge
 from fuselog.replay.foreign.naming import program_files
 
-# A cell whose workers died so often is given up.
+# A cell is abandoned after its workers died this many times.
 ATTEMPTS = 3
 _LOG = logging.getLogger("fuselog")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Holds the runs from `first` to `end` of an experiment.
+    """The runs from `first` to `end` (exclusive) of an experiment.
 
     Attributes:
-        experiment: all of it; nothing that decides lies in another file, but for its logs.
+        experiment: the complete experiment; its result depends on no other file except its logs.
         first, end: the runs.
-        logs: of how many of them the logs are kept.
-        draws: whether the timeline of the first is drawn.
-        errors: whether every single error is kept.
-        place: where the experiment's result will be.
+        logs: number of runs whose logs are kept.
+        draws: whether the timeline of the first run is drawn.
+        errors: whether all individual errors are kept.
+        place: final path of the experiment's result.
     """
 
     experiment: Experiment
@@ -64,7 +64,7 @@ class Cell:
 
     @property
     def runs(self) -> int:
-        """Return how many there are."""
+        """Return the number of runs."""
         return self.end - self.first
 
     @property
@@ -74,7 +74,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Return a hash of what decides about the result: this description, the data, and the code."""
+        """Return a hash of what determines the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
@@ -82,15 +82,15 @@ class Cell:
         return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
-        """Record or open the runs, replay and judge them; files go to the folder."""
+        """Record or open the runs, replay and judge them; files are written to the folder."""
         if setting is None:
             logs = self.first + self.logs
             setting = Setting(folder, self.place, logs=logs, draws=self.draws, errors=self.errors)
         return Runner(self.experiment, setting).judge(slice(self.first, self.end))
 
     def packed(self, folder: Path) -> bytes:
-        """Return the same as bytes for any process; raises BadInput where a metric prevents that."""
-        shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
+        """Process the cell and pickle the result; raises BadInput if a metric cannot be pickled."""
+        shutil.rmtree(folder, ignore_errors=True)  # left by a worker that was killed
         if self.draws or self.logs or self.errors:
             folder.mkdir()
         done = self.work_off(folder)
@@ -105,13 +105,13 @@ class Cell:
 
 @dataclass
 class Pace:
-    """Describes how a campaign goes, as its progress shows it.
+    """The progress of a campaign.
 
     Attributes:
         runs: of all cells.
-        done: those of the cells that are merged.
-        worked_off: those of them that no earlier campaign had kept.
-        workers: how many work at once.
+        done: runs of merged cells.
+        worked_off: runs of the cells that were computed now, not by an earlier campaign.
+        workers: number of workers.
     """
 
     runs: int
@@ -127,12 +127,12 @@ class Pace:
 
 
 def judge(experiment: Experiment, setting: Setting) -> Pass:
-    """Replay and judge all runs of an experiment, cell by cell; its files go to the setting's folder.
+    """Replay and judge all runs of an experiment, cell by cell; files go to the setting's folder.
 
-    Raises BadInput where there is an estimator that can follow no run, or workers die again and again.
+    Raises BadInput if an estimator cannot replay any run, or workers die repeatedly.
     """
     cells = cells_of(experiment, setting)
-    if len(cells) == 1 or setting.checkpoints is None:  # nothing to share, and nothing to go on with
+    if len(cells) == 1 or setting.checkpoints is None:  # nothing to distribute, and nothing to resume
         return cells[0].work_off(setting.folder, setting).check()
     (done,) = _merged([cells], setting)
     setting.checkpoints.hand_over([cell.key for cell in cells], setting.folder)
@@ -140,15 +140,15 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
 
 
 def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[Pass]:
-    """Return what replaying and judging leaves of each experiment, in their order; see `judge`.
+    """Replay and judge experiments, and yield the result of each in order; see `judge`.
 
-    Files stay where cells are kept.
+    Files stay in the folder of the cells.
     """
     return _merged([cells_of(experiment, setting) for experiment in experiments], setting)
 
 
 def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]:
-    """Merge what each part of the cells leaves, in their order."""
+    """Merge the results of the cells of each part, in order."""
     assert setting.checkpoints is not None
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
@@ -163,19 +163,19 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
-    for _ in finished:  # there are no more: progress and pool come to their ends
+    for _ in finished:  # exhausts the iterator, which ends progress and pool
         pass
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
-    """Return the cells: a cut that only the number of runs decides."""
+    """Divide an experiment into cells; the division depends only on the number of runs."""
     require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)
         parameters = merge(values, experiment.record.parameters)
         record = Record(scenario=recorder, parameters=parameters)
         experiment = experiment.model_copy(update={"record": record})
-    experiment = experiment.with_absolute_files()  # a worker may work in another folder
+    experiment = experiment.with_absolute_files()  # a worker may have another working directory
     cells, place = [], setting.place.resolve()
     for now in parts_of(experiment.runs):
         logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
@@ -187,10 +187,9 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
 def work_off(
     cells: Sequence[Cell], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
 ) -> Iterator[Pass]:
-    """Yield what cells leave, in their order; those that are kept are not worked off again.
+    """Yield the results of cells in order; cells that are already done are not computed again.
 
-    Memory holds what is handed out and what comes in. Raises BadInput where the workers of a cell died
-    again and again.
+    Memory holds the cells in progress. Raises BadInput if the workers of a cell died repeatedly.
     """
     checkpoints.begin()
     keys = [cell.key for cell in cells]
@@ -232,7 +231,7 @@ def work_off(
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     try:
                         error = future.exception()
-                    except CancelledError:  # by a scheduler that is not there any more
+                    except CancelledError:  # cancelled by a scheduler that has ended
                         error = BrokenExecutor("the scheduler has ended")
                     if isinstance(error, (*pool.lost, BrokenExecutor)):
                         lost = error
@@ -240,7 +239,7 @@ def work_off(
                     number = pending.pop(future)
                     pace.worked_off += cells[number].runs
                     checkpoints.write(keys[number], future.result())
-            if lost is not None:  # and with it all others of some executors
+            if lost is not None:  # some executors then lose all others as well
                 died.update(pending.values())
                 waiting.extendleft(sorted(pending.values(), reverse=True))
                 number, times = died.most_common(1)[0]

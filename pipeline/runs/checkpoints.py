@@ -1,15 +1,15 @@
-"""Keeps what a campaign that is not finished has done so far, in a folder beside its result.
+"""Storage of the finished cells of a campaign, in a folder next to its result.
 
     OUT.unfinished/
         fuselog.lock    held by the process that works on the campaign
-        KEY.bin         what a cell left, checked; KEY is a hash of its description and of the code
+        KEY.bin         the result of a cell, with a checksum; KEY hashes its description and the code
         KEY/            the files of that cell: logs and estimates of the first runs, the timeline
 
-What a cell left begins with its key, and states the SHA-256 of each of its files: whatever is not what
-that cell wrote is computed again. The folder may lie where others write, as in one that a team shares;
-it is this user's alone, and so is each file that is read.
+The result of a cell begins with its key and states the SHA-256 of each of its files: anything that
+differs from what the cell wrote is computed again. The folder may be in a place where others can write,
+such as a shared disk; the folder itself, and each file that is read, belongs to this user only.
 
-It is there when the campaign begins, and goes when the result is in place, or where nothing is kept.
+The folder is made when the campaign begins, and removed when the result is complete, or if it is empty.
 """
 
 import logging
@@ -32,21 +32,22 @@ from fuselog.recorders.errors import BadInput
 
 _LOCK, _SUFFIX = "fuselog.lock", ".bin"
 _KEY = re.compile(r"[0-9a-f]{64}")
-_LEFTOVER = re.compile(r"\.[0-9a-f]{64}\.bin\.[^.]+\.part")  # where a cell was being written
+_LEFTOVER = re.compile(r"\.[0-9a-f]{64}\.bin\.[^.]+\.part")  # a cell whose writing was interrupted
 _LOG = logging.getLogger("fuselog")
 
 
 class Checkpoints:
-    """Keeps a campaign's cells in a folder, whose lock is held."""
+    """The finished cells of a campaign, in a folder that is locked."""
 
     def __init__(self, folder: Path, lock: FileLock) -> None:
         self.folder = folder
         self._lock = lock
 
     def begin(self) -> None:
-        """Make the folder, if it is not there, and lock it.
+        """Make the folder if it does not exist, and lock it.
 
-        Raises BadInput where another process holds it, or it holds what is not ours.
+        Raises BadInput if another process has locked it, or it contains files that fuselog did not
+        write.
         """
         if self._lock.is_locked:
             return
@@ -75,20 +76,20 @@ class Checkpoints:
                 shutil.rmtree(path, ignore_errors=True)
 
     def place_of(self, key: str) -> Path:
-        """Return where the files of a cell go."""
+        """Return the folder for the files of a cell."""
         return self.folder / key
 
     def has(self, key: str) -> bool:
-        """Tell whether a cell is done, with all its files."""
+        """Test whether a cell is done and has all its files."""
         return self._left(key) is not None
 
     def read(self, key: str) -> Any:
-        """Read what a cell left; None where it is not done."""
+        """Read the result of a cell; None if it is not done."""
         left = self._left(key)
         return None if left is None else pickle.loads(left.pickled)
 
     def write(self, key: str, left: bytes) -> None:
-        """Keep what a cell left, pickled, beside the files that it wrote."""
+        """Store the pickled result of a cell, with hashes of the files that it wrote."""
         place = self.place_of(key)
         files = sorted(path for path in place.rglob("*") if path.is_file())
         hashes = {path.relative_to(place).as_posix(): hash_of(path) for path in files}
@@ -96,9 +97,9 @@ class Checkpoints:
         write_checked(self.folder / f"{key}{_SUFFIX}", content, "a cell")
 
     def hand_over(self, keys: Sequence[str], folder: Path) -> None:
-        """Put the files of all cells, in their order, into a folder; tables of errors are joined.
+        """Move the files of all cells to a folder, in order; tables of errors are joined.
 
-        Raises BadInput where they are not those that the cells wrote: somebody changed them meanwhile.
+        Raises BadInput if they differ from what the cells wrote.
         """
         tables: dict[Path, list[Path]] = {}
         for key in keys:
@@ -117,10 +118,10 @@ class Checkpoints:
             join_tables(parts, folder / name)
 
     def end(self, *, is_done: bool) -> None:
-        """Let go of the folder; it stays where there is something to go on with."""
+        """Unlock the folder; it is kept if there is something to resume."""
         if is_done and self.folder.is_dir():
-            with suppress(BadInput):  # of what others hold, or have put there
-                self.begin()  # cells of an earlier command that came to no end
+            with suppress(BadInput):  # locked by others, or with foreign files
+                self.begin()  # cells of an earlier command that did not finish
         if not self._lock.is_locked:
             return
         done = sum(1 for path in self.folder.iterdir() if path.suffix == _SUFFIX)
@@ -140,14 +141,14 @@ class Checkpoints:
         self._remove()
 
     def _remove(self) -> None:
-        """Let go of the folder and remove it, where nothing but the lock is in it."""
+        """Unlock the folder and remove it if it contains nothing except the lock."""
         self._lock.release()
         with suppress(OSError):
             (self.folder / _LOCK).unlink(missing_ok=True)
             self.folder.rmdir()
 
     def _left(self, key: str) -> "_Left | None":
-        """Return what this very cell left, if its files are those that it wrote."""
+        """Read the result of a cell, if its files are unchanged."""
         content = read_own(self.folder / f"{key}{_SUFFIX}")
         if content is None or not content.startswith(key.encode()):
             return None
@@ -161,7 +162,7 @@ class Checkpoints:
 
 
 class _Left(NamedTuple):
-    """Holds what a cell left, pickled, and the SHA-256 of its files by their paths in its folder."""
+    """The pickled result of a cell, and the SHA-256 of its files by path in its folder."""
 
     pickled: bytes
     files: dict[str, str]
@@ -169,7 +170,7 @@ class _Left(NamedTuple):
 
 @contextmanager
 def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
-    """Keep the cells of the campaign whose result goes to a place; they go when all went well."""
+    """Keep the cells of a campaign with this result folder; they are removed on success."""
     place = settled(place)
     folder = place.with_name(f"{place.name}.unfinished")
     checkpoints = Checkpoints(folder, FileLock(folder / _LOCK, timeout=0))
@@ -183,7 +184,7 @@ def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
 
 
 def _is_ours(path: Path) -> bool:
-    """Tell whether a member of the folder is what this module puts there."""
+    """Test whether a member of the folder was written by this module."""
     if path.is_symlink():
         return False
     is_cell = _KEY.fullmatch(path.stem) is not None
@@ -193,7 +194,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _copy(path: Path, place: Path) -> None:
-    """Copy a file to another place of the disk, without its bytes where the disk can do that."""
+    """Copy a file, by a hard link if possible."""
     try:
         os.link(path, place)
     except OSError:

@@ -1,4 +1,4 @@
-"""Records, replays and judges ensembles, in one streamed pass or whole in memory.
+"""Recording, replay and judgement of ensembles, in one streamed pass or whole in memory.
 
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
@@ -37,30 +37,30 @@ from fuselog.replay.judging.metrics.measuring import Metric, find_metrics, plus
 if TYPE_CHECKING:
     from fuselog.replay.timeline.show import Drawing
 
-# Every run of an ensemble has up to three files open while it is replayed from logs; systems allow 1024.
+# Every run replayed from logs has up to three files open; systems allow 1024.
 RUNS_AT_ONCE = 128
 
 Item = TypeVar("Item")
 Settings = Mapping[str, Mapping[str, Any]]
-# Is given items, what is done with them (asked again as it goes), and how many there are.
+# Takes items, a title (converted to text again for each item), and their number; yields the items.
 Progress = Callable[[Iterable[Any], object, int | None], Iterable[Any]]
 
 
 def no_progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:  # noqa: ARG001
-    """Return the progress bar of programs that show none."""
+    """Return the items unchanged, for programs that show no progress."""
     return items
 
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Holds some runs of an ensemble, replayed together.
+    """Some runs of an ensemble, which are replayed together.
 
     Attributes:
         sources: the runs.
-        first_run: the number of the first of them.
-        estimates: where the estimates of the first runs are written, and the log that each is of.
-        origins: what the runs start from where their spans begin after their priors, none or one each.
-        is_all: whether there are no other runs.
+        first_run: the number of the first run.
+        estimates: for the first runs, the path of the estimates and the source log.
+        origins: what runs start from if their spans begin after their priors; empty, or one per run.
+        is_all: whether the ensemble has no other runs.
     """
 
     sources: Sequence[Source]
@@ -71,7 +71,7 @@ class RunGroup:
 
 
 def parts_of(runs: int) -> Iterator[slice]:
-    """Yield the runs of an ensemble that are replayed together: a cut that only their number decides."""
+    """Yield slices of the runs to replay together; they depend only on the number of runs."""
     for first in range(0, runs, RUNS_AT_ONCE):
         yield slice(first, min(first + RUNS_AT_ONCE, runs))
 
@@ -81,7 +81,7 @@ def cut_in_parts(
     estimates: Sequence[tuple[Path, Path]],
     origins: Sequence[Origin] = (),
 ) -> Iterator[RunGroup]:
-    """Yield the parts of runs that are all at hand; `estimates` and `origins` are of all of them."""
+    """Yield groups of available runs; `estimates` and `origins` are those of all runs."""
     for now in parts_of(len(sources)):
         yield RunGroup(
             sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
@@ -90,18 +90,18 @@ def cut_in_parts(
 
 @dataclass
 class Pass:
-    """Holds what a streamed pass leaves.
+    """The result of a streamed pass over runs.
 
     Attributes:
         judge: of all runs.
-        parameters: of every estimator, defaults included, by label.
-        stated: those that are not given, as the first log's channels state them; see `stated_of`.
-        usages: what became of the measurements, by bound estimator.
-        untaken: topics that estimators do not take.
+        parameters: of every estimator by label, including defaults.
+        stated: parameters that the first log's channels state; see `stated_of`.
+        usages: how many measurements were used, by bound estimator.
+        untaken: topics that estimators do not use.
         left_out: impossible messages.
-        seconds: that each estimator took, by label.
-        refused: by estimator, why none of the runs can be replayed.
-        input_sha256: a hash of the data that went in, where it was asked for.
+        seconds: the time of each estimator, by label.
+        refused: by estimator, why it cannot replay any run.
+        input_sha256: a hash of the input data, if requested.
         meanings: of the parameters, in a few words, by label and name.
     """
 
@@ -118,12 +118,12 @@ class Pass:
 
     @property
     def coverage(self) -> list[Row]:
-        """Return what became of every topic."""
+        """Return how many messages of every topic were used."""
         return rows_of(self.usages, self.untaken, self.judge.doubts, self.left_out)
 
     @property
     def timings(self) -> dict[str, dict[str, float]]:
-        """Return what each estimator cost: seconds, and the messages that it was given."""
+        """Return the time of each estimator in seconds, and the number of its messages."""
         messages: Counter[str] = Counter()
         for name, usage in self.usages.items():
             messages[name.partition("/")[0]] += usage.given.total()
@@ -133,7 +133,7 @@ class Pass:
         }
 
     def merge(self, other: "Pass") -> None:
-        """Take in what a pass over later runs left."""
+        """Merge the result of a pass over later runs into this one."""
         self.judge.merge(other.judge)
         self.seconds = plus(self.seconds, other.seconds)
         for name, usage in other.usages.items():
@@ -143,7 +143,7 @@ class Pass:
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
-        """Return itself; raises BadInput where there is an estimator that could follow no run."""
+        """Return the pass itself; raises BadInput if an estimator could not replay any run."""
         for refusal in self.refused.values():
             raise refusal
         return self
@@ -164,25 +164,25 @@ def replay_parts(
     companions: Companions | None = None,
     progress: Progress = no_progress,
 ) -> Pass:
-    """Replay an ensemble part by part: block by block to the estimates logs, the judge and the timeline.
+    """Replay an ensemble part by part, and pass blocks to estimates logs, judge and timeline.
 
-    Memory holds the runs of a part, if they are in memory at all, and the blocks in hand.
+    Memory holds the current blocks, and the runs of a part if they are in memory at all.
 
     Args:
         parts: the runs.
         estimators: parameters by label.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        metrics: their names; none stands for all.
-        order: the clock to go by.
-        late: what is done about messages that come late, in the order of log time.
-        save: the file that the first run's timeline goes to.
-        connect: the receiver that it goes to; see `Drawing`.
-        on_errors: is handed the errors of every block.
-        block_messages: about how many messages of a run are in memory at once.
-        companions: makes what is written beside the estimates for viewers.
-        progress: is told of every block.
+        gap_limit_s: the longest gap over which the truth is interpolated.
+        metrics: their names; all if empty.
+        order: the clock that orders messages.
+        late: how out-of-sequence messages are handled in order of log time.
+        save: the file for the first run's timeline.
+        connect: the viewer for the timeline; see `Drawing`.
+        on_errors: called with the errors of every block.
+        block_messages: approximate number of messages of a run in memory at a time.
+        companions: makes messages for other viewers, written next to the estimates.
+        progress: reports progress after every block.
 
-    An estimator that can follow no run of any part is told of, see `Pass.check`.
+    An estimator that cannot replay any run is reported by `Pass.check`.
     """
     found, whole = find_metrics(metrics), None
     with _told(progress, "replaying") as tell:
@@ -209,7 +209,7 @@ def replay_parts(
                 ]
                 drawing = None
                 if part.first_run == 0 and (save or connect):
-                    from fuselog.replay.timeline.show import Drawing  # which takes long to import
+                    from fuselog.replay.timeline.show import Drawing  # slow to import
 
                     asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
                     first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)
@@ -253,7 +253,7 @@ def _judge_and_draw(judge: Judge, drawing: "Drawing | None", block: Mapping[str,
 
 @contextmanager
 def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
-    """Tell `progress` by a call of every step of a loop, instead of handing it the loop's items."""
+    """Report progress by a function to call at every step of a loop, instead of wrapping its items."""
     steps = iter(progress(repeat(None), title, None))
     next(steps)
     try:
@@ -265,9 +265,9 @@ def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
 
 @contextmanager
 def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
-    """Work on items in order, one at a time, while the caller, who hands them over, goes on.
+    """Process items in order in a background thread, one at a time; yields a function to submit them.
 
-    What the work raises is raised when the next item is handed over, or at the end.
+    An exception in the work is raised when the next item is submitted, or at the end.
     """
     with ThreadPoolExecutor(1) as pool:
         working: list[Future[None]] = []
@@ -285,15 +285,15 @@ def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], Non
 def bind_from(
     sources: Sequence[Source], estimators: Settings, origins: Sequence[Origin], order: Clock
 ) -> list[Bound]:
-    """Bind estimators to runs, each begun from its origin where there are any."""
+    """Bind estimators to runs, each started from its origin if there are origins."""
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
     return [start_from(each, sources, origins, order) for each in bound] if origins else bound
 
 
 def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
-    """Return the parameters of estimators by label, as JSON has them; those that are None are unused.
+    """Return the parameters of estimators by label as JSON values, without those that are None.
 
-    Those that topics have for themselves are in a table of the topic.
+    Parameters of individual topics are in a table of the topic.
     """
     return {
         each.name.partition("/")[0]: _as_set(each.parameters)
@@ -314,9 +314,9 @@ def _as_set(parameters: Parameters) -> dict[str, Any]:
 
 
 def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str]]:
-    """Return by label the parameters that are None and that channels of a log state: "VALUE (TOPIC)".
+    """Return by label the unset parameters that a log's channels state, as "VALUE (TOPIC)".
 
-    Of several topics that state the same value the first is named.
+    If several topics state the same value, the first is named.
     """
     found: dict[str, dict[str, dict[str, str]]] = {}
     for each in bound:
@@ -345,7 +345,7 @@ def replay_blocks(
     block_messages: int = BLOCK_MESSAGES,
     is_part: bool = False,
 ) -> Iterator[dict[str, Ragged]]:
-    """Iterate over a replay's outputs by topic, block by block; the last one says what was covered."""
+    """Iterate over a replay's outputs by topic, block by block; the last block states the coverage."""
     blocks = replay(
         sources,
         bound,
@@ -366,7 +366,7 @@ def by_topic(block: list[Ragged]) -> dict[str, Ragged]:
 def of_run(
     block: Mapping[str, Ragged], errors: Sequence[Errors], run: int
 ) -> tuple[dict[str, Any], list[Errors]]:
-    """Return what a timeline draws: the streams of one run, and its errors."""
+    """Select the streams and the errors of one run, for a timeline."""
     streams = {topic: rows.of_run(run) for topic, rows in block.items()}
     return streams, [errors_at(each, each.run == run) for each in errors]
 
@@ -380,17 +380,17 @@ def judge_logs(
     drawing: "Drawing | None" = None,
     on_errors: Callable[[Errors], None] | None = None,
 ) -> Judge:
-    """Judge the estimates that logs hold, block by block.
+    """Judge the estimates in logs, block by block.
 
     Args:
-        estimates: what was estimated of every run.
+        estimates: the estimates of every run.
         sources: the runs, with their truths.
-        metrics: what to compute.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        drawing: is handed what there is of the first run.
-        on_errors: is handed the errors of every block.
+        metrics: the metrics to compute.
+        gap_limit_s: the longest gap over which the truth is interpolated.
+        drawing: receives the data of the first run.
+        on_errors: called with the errors of every block.
 
-    Raises BadInput where one holds other estimates than the first.
+    Raises BadInput if a log has other estimates than the first.
     """
     held = [[each for each in source.topics if each.startswith("/estimates/")] for source in estimates]
     for source, topics in zip(estimates, held, strict=True):
@@ -419,9 +419,9 @@ def judge_logs(
 def estimates_metadata(
     source: Source, estimators: Settings, path: Path, log: Path, order: Clock = "publish_time"
 ) -> RunMetadata:
-    """Describe the estimates log at `path`: its run, estimators, alterations, span, clock and log.
+    """Describe the estimates log at `path`: its run, estimators, changes, span, clock and source log.
 
-    The log's place is stated relative to the estimates', so that both can be moved together.
+    The path of the source log is relative to the estimates log, so that both can be moved together.
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath(log.resolve(), path.resolve().parent)

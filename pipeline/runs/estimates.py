@@ -1,6 +1,6 @@
-"""States of an estimates log which log and estimators it is of, and hashes what a replay was given.
+"""Source logs and estimators of estimates logs, and hashes of the input of replays.
 
-Every error of estimates goes to tables from here, where it is asked for.
+Tables of all individual errors are also written here.
 """
 
 import hashlib
@@ -19,14 +19,14 @@ from fuselog.recorders.parsing import parse_json
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.evaluation import Errors, split_topic
 
-# Where every single error is, in a result's folder.
+# The folder of individual errors in a result folder.
 ERRORS = Path("tables", "errors")
 
 
 def log_of_estimates(estimates: Log) -> Path:
-    """Find the log that an estimates log was replayed from; raises BadInput where it is not found.
+    """Find the log that an estimates log was replayed from; raises BadInput if it is not found.
 
-    A recording that has estimates beside its sensors is itself what they are of.
+    A recording with both estimates and sensors is its own source log.
     """
     named = estimates.run.notes.get("log") if estimates.run else None
     if named is None and recorded_estimators(estimates):
@@ -46,11 +46,11 @@ def log_of_estimates(estimates: Log) -> Path:
 def source_of_estimates(
     estimates: Log, place: Path | None = None, *, recover: bool = False
 ) -> LogSource:
-    """Return the log that an estimates log is of, altered as it was for the replay.
+    """Open the source log of an estimates log, with the same changes as in the replay.
 
     Args:
         estimates: the estimates log.
-        place: where the log is, if not where the estimates state it.
+        place: the path of the source log, if it differs from what the estimates log states.
         recover: read the intact part of a damaged log.
     """
     log = open_log(place or log_of_estimates(estimates), recover=recover)
@@ -58,7 +58,7 @@ def source_of_estimates(
 
 
 def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
-    """Return parameters by label, in the order of the replay; none where the log does not say."""
+    """Return parameters by label, in the order of the replay; empty if the log does not state them."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get("estimators", "{}"))
@@ -68,15 +68,15 @@ def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
 
 
 def labels_of(estimates: Log | Source) -> list[str]:
-    """Return the estimators of which a log has estimates."""
+    """List the estimators whose estimates are in a log."""
     topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
     return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
 
 
 def recorded_estimators(log: Log | Source) -> list[str]:
-    """List the estimators whose estimates a recording has beside its sensors, as an autopilot's.
+    """List the estimators whose estimates a recording contains, such as an autopilot's.
 
-    An estimates log, which is of another log, has none of these.
+    An estimates log has a source log and therefore none of these.
     """
     notes = log.run.notes if log.run else {}
     has_sensors = any(not topic.startswith("/estimates/") for topic in log.topics)
@@ -84,7 +84,7 @@ def recorded_estimators(log: Log | Source) -> list[str]:
 
 
 def hash_streams(sources: Iterable[MemorySource]) -> str:
-    """Hash every column of every run with SHA-256: equal where the input data are equal."""
+    """Hash every column of every run with SHA-256; equal for equal input data."""
     digest = hashlib.sha256()
     for source in sources:
         add_to_hash(digest, source)
@@ -92,7 +92,7 @@ def hash_streams(sources: Iterable[MemorySource]) -> str:
 
 
 def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
-    """Take a run's columns into a hash."""
+    """Add a run's columns to a hash."""
     for stream in source.streams.values():
         for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
             digest.update(np.ascontiguousarray(array).data)
@@ -108,9 +108,9 @@ def hash_files(paths: Sequence[Path]) -> str:
 
 
 class ErrorTables:
-    """Writes every error of every estimate: a Parquet file per estimator and case.
+    """A context that writes all individual errors: one Parquet file per estimator and case.
 
-    They are written block by block, as they come; use it as a context.
+    They are written block by block, as they come.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -144,7 +144,7 @@ class ErrorTables:
 
 
 def join_tables(parts: Sequence[Path], place: Path) -> None:
-    """Write one Parquet file of the rows of several, in their order."""
+    """Write the rows of several Parquet files to one, in order."""
     import pyarrow.parquet
 
     files = [pyarrow.parquet.ParquetFile(part) for part in parts]

@@ -1,4 +1,4 @@
-"""Opens the workers of a campaign's cells: this process, others on this machine, a Dask cluster."""
+"""Workers for a campaign's cells: this process, others on this machine, a Dask cluster."""
 
 import hashlib
 import logging
@@ -28,24 +28,24 @@ from fuselog.recorders.compiling.compile import use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
 
-# With fewer runs, processes take longer to begin than they save.
+# With fewer runs, starting processes takes longer than they save.
 PAYING_RUNS = 1000
 PACKAGES = ("fuselog.recorders", "fuselog.replay", "fuselog.pipeline")
 
 
 class WorkerPool(NamedTuple):
-    """Holds an executor and what is known of its workers.
+    """An executor and the properties of its workers.
 
     Attributes:
-        executor: hands work to them.
-        workers: how many work at once.
-        require: raises BadInput unless all workers find these absolute paths as this process does.
-        lost: what a future raises whose worker died.
+        executor: distributes the work.
+        workers: how many tasks run concurrently.
+        require: raises BadInput unless all workers see these absolute paths as this process does.
+        lost: exceptions of a future whose worker died.
     """
 
     executor: Executor
     workers: int
-    require: Callable[[Sequence[Path]], None] = lambda _: None  # as on this machine
+    require: Callable[[Sequence[Path]], None] = lambda _: None  # trivial on this machine
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
@@ -56,9 +56,9 @@ PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 def pool_for(
     workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
 ) -> PoolFactory:
-    """Choose who works on so many runs: whom the options ask for, else all cores if that pays.
+    """Choose the workers for a number of runs: those the options ask for, else all cores if worthwhile.
 
-    An executor that is there does all of it. Raises BadInput where both options are given.
+    A given executor does all the work. Raises BadInput if both options are given.
     """
     if executor is not None:
         return pool_of(executor)
@@ -75,7 +75,7 @@ def pool_for(
 
 
 def pool_of(executor: Executor) -> PoolFactory:
-    """Return an executor that is there; it is given as much work at a time as there are cores."""
+    """Wrap an existing executor as a pool; it gets as many tasks at a time as there are cores."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -85,10 +85,10 @@ def pool_of(executor: Executor) -> PoolFactory:
 
 
 class InlineExecutor(Executor):
-    """Does the work when it is submitted, in the calling thread."""
+    """An executor that does the work on submission, in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do the work at once; the future has what it gave, or raised if that is no interrupt."""
+        """Do the work immediately; the future holds its result or its exception, except interrupts."""
         future: Future[Any] = Future()
         try:
             future.set_result(work(*args, **kwargs))
@@ -99,20 +99,20 @@ class InlineExecutor(Executor):
 
 @contextmanager
 def inline_pool() -> Iterator[WorkerPool]:
-    """Open a pool of the calling process alone, whose replay uses all cores."""
+    """Open a pool of the calling process only, whose replay uses all cores."""
     yield WorkerPool(InlineExecutor(), 1)
 
 
 @contextmanager
 def threads() -> Iterator[WorkerPool]:
-    """Yield threads of this process, one for each core: for work whose kernels run side by side."""
+    """Open a pool of threads, one per core, for work whose kernels run in parallel."""
     count = os.cpu_count() or 1
     with ThreadPoolExecutor(count) as pool:
         yield WorkerPool(pool, count)
 
 
 def processes(count: int) -> PoolFactory:
-    """Make a pool of so many processes, each on one core; they end with this one, however that ends."""
+    """Make a pool of `count` processes, each on one core, which end when this process ends."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -132,7 +132,7 @@ def processes(count: int) -> PoolFactory:
 
 
 def _begin_worker() -> None:
-    """Give each worker one core; an interrupt is the parent's to deal with, and its end theirs too."""
+    """Limit a worker to one core, ignore interrupts, and end it when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _use_one_core()
     keep_off_settings_here()
@@ -148,7 +148,7 @@ def _begin_worker() -> None:
 
 @cache
 def _use_one_core() -> None:
-    """Have kernels and linear algebra of this process use one core; warnings of numbers are left out."""
+    """Limit this process's kernels and linear algebra to one core, and ignore numeric warnings."""
     use_cores(1)
     import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
 
@@ -157,31 +157,31 @@ def _use_one_core() -> None:
 
 
 class DaskExecutor(Executor):
-    """Hands work to a Dask client; each thread of a worker uses one core.
+    """An executor that submits work to a Dask client; each worker thread uses one core.
 
-    Work brings this along, so that workers that are started later, or again, keep to it too.
+    The limit is applied with each task, so that it also holds for workers that start later or restart.
     """
 
     def __init__(self, client: Any) -> None:
         self._executor = client.get_executor(pure=False)
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Hand work to a worker."""
+        """Submit work to a worker."""
         future: Future[Any] = self._executor.submit(_on_one_core, work, *args, **kwargs)
         return future
 
 
 def _on_one_core(work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Do the work in a process that uses one core from now on."""
+    """Do the work in a process that is limited to one core from now on."""
     _use_one_core()
     return work(*args, **kwargs)
 
 
 def dask(scheduler: str) -> PoolFactory:
-    """Return the workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
+    """Make a pool of the workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
 
-    `local:N` begins N on this machine, which no other can reach. Raises BadInput when they are to begin
-    where no scheduler answers, its workers have other code than this process, or Dask is missing.
+    `local:N` starts N workers on this machine, unreachable from others. Opening the pool raises BadInput
+    if no scheduler answers, its workers have other code than this process, or Dask is missing.
     """
 
     @contextmanager
@@ -193,7 +193,7 @@ def dask(scheduler: str) -> PoolFactory:
             mend = "pip install 'fuselog[dask]'"
             raise BadInput(f"--scheduler {scheduler}: Dask is not installed; {mend}") from None
         for name in [each for each in logging.root.manager.loggerDict if each.startswith("distributed")]:
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is raised as well
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # errors are raised as well
         with ExitStack() as stack:
             address = scheduler
             if scheduler.startswith("local:"):
@@ -218,7 +218,7 @@ def dask(scheduler: str) -> PoolFactory:
 
 
 def _local_cluster(scheduler: str) -> Any:
-    """Start workers on this machine alone, of one thread each."""
+    """Start local workers with one thread each."""
     from distributed import LocalCluster
 
     count = scheduler.removeprefix("local:")
@@ -234,7 +234,7 @@ def _local_cluster(scheduler: str) -> Any:
 
 
 def _check_code(scheduler: str, client: Any) -> None:
-    """Raise BadInput unless there are workers, all with the code of this process."""
+    """Raise BadInput unless there are workers, all with the same code as this process."""
     try:
         there = client.run(version_of_code)
     except ImportError as error:
@@ -252,7 +252,7 @@ def _check_code(scheduler: str, client: Any) -> None:
 
 
 def _require_paths(scheduler: str, client: Any, paths: Sequence[Path]) -> None:
-    """Raise BadInput unless all workers find files and folders as this process does."""
+    """Raise BadInput unless all workers see files and folders as this process does."""
     for worker, found in client.run(states_of, paths).items():
         for path, own, there in zip(paths, states_of(paths), found, strict=True):
             if there != own:
@@ -264,7 +264,7 @@ def _require_paths(scheduler: str, client: Any, paths: Sequence[Path]) -> None:
 
 
 def states_of(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
-    """Return size and time of change of files, zeros for folders; None for what cannot be read."""
+    """Return size and modification time of files, zeros for folders, and None for unreadable paths."""
     found: list[tuple[int, int] | None] = []
     for path in paths:
         try:
@@ -280,7 +280,7 @@ def states_of(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
 
 @cache
 def version_of_code() -> str:
-    """Hash all that cells go through: our code, that of plug-ins, the versions of libraries."""
+    """Hash everything that determines the results of cells: our code, plug-ins, library versions."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         with resources.as_file(resources.files(package)) as folder:

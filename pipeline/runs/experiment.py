@@ -1,4 +1,4 @@
-"""Reads and runs experiments: scenario (or real data, or logs) x estimators x metrics, in TOML."""
+"""Experiments: a scenario (or real data, or logs), estimators and metrics, described in TOML."""
 
 import os
 import warnings
@@ -33,30 +33,30 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 
 
 class Experiment(Parameters):
-    """Describes one experiment as its TOML file says it.
+    """One experiment as described by its TOML file.
 
-    The runs are recorded from a scenario, imported, or logs that are there.
+    The runs are recorded from a scenario, imported, or existing logs.
 
     Attributes:
-        title: what it is, in a line.
-        text: more of it for the report, in Markdown.
-        study: name of the study that does its work.
+        title: a description in one line.
+        text: more text for the report, in Markdown.
+        study: name of the study that does the work.
         seed: seed of the recorded runs.
         runs: number of recorded runs.
         record: what to simulate.
         import_: what to import.
         logs: logs to replay.
-        estimators: parameters by label; `kind` names the estimator where the label is not its name,
-            `like` another label whose kind and parameters it has but for what it says itself.
-        alterations: how topics are altered before they are replayed, as `--set /TOPIC.WHAT` has it.
-        metrics: names of the metrics; without any, all that are registered.
+        estimators: parameters by label; `kind` names the estimator if the label is not its name, `like`
+            names another label whose kind and parameters are the defaults.
+        alterations: changes of topics before the replay, as for `--set /TOPIC.WHAT`.
+        metrics: names of the metrics; by default all registered ones.
         gap_limit_s: longest gap over which truth is interpolated.
-        arrival_order: whether messages are processed in the order in which they arrived.
-        late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
-        options: the study's own.
-        recordings: which recordings claims are of, by name, where the runs are no simulated ones.
-        claims: what is claimed of the metrics that it yields.
-        claims_of: name of another experiment whose claims are tried first.
+        arrival_order: whether messages are processed in order of arrival.
+        late: how out-of-sequence measurements are handled, as for `--late` of `fuselog replay`.
+        options: of the study.
+        recordings: the recordings that claims are about, by name, if the runs are not simulated.
+        claims: claims about the resulting metrics.
+        claims_of: name of another experiment whose claims are decided first.
     """
 
     title: str
@@ -74,7 +74,7 @@ class Experiment(Parameters):
     arrival_order: bool | None = None
     late: str | None = None
     options: dict[str, Any] = {}
-    # what is claimed changes nothing in what is run, and a result has it with its verdict
+    # claims do not affect the run, and a result contains them with their verdicts
     recordings: Annotated[dict[str, Recording], Field(exclude=True)] = {}
     claims: Annotated[list[StatedClaim], Field(exclude=True)] = []
     claims_of: Annotated[str, Field(exclude=True)] = ""
@@ -85,7 +85,7 @@ class Experiment(Parameters):
         spelt = {label: _spelt_out(label, stated) for label in stated}
         for label, values in stated.items():
             if "like" in values and spelt[label]["kind"] == label:
-                del spelt[label]["kind"]  # as a label that is a name needs none
+                del spelt[label]["kind"]  # a label that is a name needs none
         return spelt
 
     @model_validator(mode="after")
@@ -120,7 +120,7 @@ class Experiment(Parameters):
         return [Path(file) for file in self.logs.files] if self.logs else []
 
     def with_absolute_files(self) -> "Experiment":
-        """Return the experiment with paths of logs that hold in any folder."""
+        """Return the experiment with absolute paths of logs."""
         if not self.logs:
             return self
         return self.model_copy(
@@ -129,7 +129,7 @@ class Experiment(Parameters):
 
 
 def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
-    """Return an estimator's parameters with those of the one that it is like."""
+    """Return an estimator's parameters, completed by those of the estimator named by `like`."""
     values = stated[label]
     if "like" not in values:
         return values
@@ -143,19 +143,19 @@ def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) ->
 
 @dataclass(frozen=True)
 class Setting:
-    """States where and how an experiment runs.
+    """Where and how an experiment runs.
 
     Attributes:
-        folder: what is written goes there.
-        place: where the folder will be when it is whole.
-        data: what is imported.
-        logs: of how many runs the logs are kept.
+        folder: receives all written files.
+        place: the final path of the folder.
+        data: the data to import.
+        logs: number of runs whose logs are kept.
         draws: whether the first run's timeline is drawn.
-        errors: whether every single error is kept too.
+        errors: whether all individual errors are kept.
         options: of the study's own type.
-        progress: is told how it goes.
-        open_pool: who works off the cells of a campaign; by default this process.
-        checkpoints: where finished cells are kept until all are.
+        progress: reports progress.
+        open_pool: opens the workers for a campaign's cells; by default this process.
+        checkpoints: storage of finished cells until all are done.
     """
 
     folder: Path
@@ -172,14 +172,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """Describes a registered study, which does an experiment's work.
+    """A registered study, which does the work of an experiment.
 
     Attributes:
-        summary: what it does, in a line.
-        run: (experiment, setting) -> what it found; logs and timeline go to the setting's folder.
+        summary: a description in one line.
+        run: (experiment, setting) -> its outcome; logs and timeline go to the setting's folder.
         options: the type of the experiment's `options`.
-        is_campaign: whether it replays by `fuselog.pipeline.runs.campaigns` alone, so that others may
-            work on parts of the runs.
+        is_campaign: whether it replays only through `fuselog.pipeline.runs.campaigns`, so that the runs
+            can be distributed.
         runs: what the number of runs counts; empty if the study makes none.
     """
 
@@ -191,14 +191,14 @@ class Study:
 
 
 class Stated(NamedTuple):
-    """Holds what an experiment is before settings go over it.
+    """An experiment before settings are applied.
 
     Attributes:
-        name: what it is called.
-        source: what it was read from, as messages name it.
+        name: its name.
+        source: where it was read from, for messages.
         values: its entries.
-        folder: what its logs count from.
-        files: what else it was read from.
+        folder: the base of the paths of its logs.
+        files: other files that it was read from.
     """
 
     name: str
@@ -214,7 +214,7 @@ class Stated(NamedTuple):
 
     @property
     def _values(self) -> dict[str, Any]:
-        """Return its entries; the programs that it names may be run."""
+        """Return its entries; programs that they name are permitted."""
         stated = self.values.get("estimators")
         own = {"estimators": allowed_in(stated, self.folder)} if isinstance(stated, Mapping) else {}
         return {**self.values, **own}
@@ -224,7 +224,7 @@ class Stated(NamedTuple):
         return build(Experiment, self._values, f"experiment {self.source}")
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
-        """Return the experiment with settings and then `over` over it; see `load_experiment`."""
+        """Build the experiment with settings, and then `over`, applied; see `load_experiment`."""
         where = f"experiment {self.source}"
         own = _settings_of_experiment(self._as_written, settings)
         experiment = build(Experiment, {**merge(self._values, own), **over}, where)
@@ -243,10 +243,10 @@ class Stated(NamedTuple):
 def load_experiment(
     name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
 ) -> tuple[str, Experiment]:
-    """Return an experiment by its shipped name or its TOML file, with settings and then `over` over it.
+    """Load an experiment by its shipped name or TOML file, and apply settings and then `over`.
 
-    A setting goes to the entry of the experiment or to the estimator that its first word names, else to
-    the scenario's or importer's parameters, else to all estimators that have such a parameter:
+    A setting goes to the entry of the experiment or to the estimator named by its first word; otherwise
+    to the scenario's or importer's parameters; otherwise to all estimators that have such a parameter:
     `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`, `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)
@@ -254,7 +254,7 @@ def load_experiment(
 
 
 def read_experiment(name: str) -> Stated:
-    """Return an experiment by its shipped name or its TOML file, without settings."""
+    """Read an experiment by its shipped name or TOML file, without settings."""
     known = shipped("experiments")
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
@@ -263,7 +263,7 @@ def read_experiment(name: str) -> Stated:
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
-    """Return the experiment that replays logs; raises BadInput where no estimator is named."""
+    """Make the experiment that replays logs; raises BadInput if no estimator is named."""
     if not labels:
         raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
@@ -276,7 +276,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
-    """Find the files that patterns stand for, each once; raises BadInput where one stands for none."""
+    """Find the files that match patterns, without duplicates; raises BadInput if one matches none."""
     files: dict[str, None] = {}
     for pattern in patterns:
         place = Path(os.path.normpath(folder / pattern))
@@ -292,14 +292,14 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
 
 
 def given_files(experiment: Experiment, data: Path | None) -> list[Path]:
-    """List the files that an experiment imports, those of its folder of data, or the logs it replays."""
+    """List the files that an experiment reads: its data, the files in its data folder, or its logs."""
     if data is None or experiment.logs is not None:
         return experiment.files
     return sorted(path for path in data.rglob("*") if path.is_file()) if data.is_dir() else [data]
 
 
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Put settings where they belong; raises BadInput where one belongs nowhere."""
+    """Assign settings to the parts of an experiment; raises BadInput for an unknown one."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
     part, names = _parameters_of_source(experiment)
     own = parameters_by_label(experiment.estimators) if settings else {}
@@ -317,7 +317,7 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
             label for label, known in own.items() if ("of_topics" if is_of_topic(key) else key) in known
         ]:
             of_all = {"estimators": {label: {key: value} for label in takers}}
-            placed = merge(of_all, placed)  # what is set for one estimator counts more
+            placed = merge(of_all, placed)  # a setting of one estimator takes precedence
             continue
         else:
             known = sorted(names.union(entries, own, *own.values()))
@@ -330,7 +330,7 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
 
 
 def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
-    """Return which part of an experiment says where its data come from, and its parameters."""
+    """Return the name of the table that states the source of the data, and its parameters."""
     if experiment.import_:
         part, recorder = "import", experiment.import_.source
     elif experiment.record:
@@ -342,12 +342,12 @@ def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
 
 
 def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
-    """Return what claims may name: the number of the runs, and the numbers of a study's options."""
+    """Return the numbers that claims may name: the number of runs, and numeric options of the study."""
     return {"runs": experiment.runs, **{name: of for name, of in options if isinstance(of, int | float)}}
 
 
 def require_campaign(experiment: Experiment, mend: str) -> None:
-    """Raise BadInput where an experiment's study replays all runs together, in one process."""
+    """Raise BadInput if an experiment's study replays all runs together, in one process."""
     study: Study = load("studies", experiment.study, Study)
     if not study.is_campaign:
         raise BadInput(
@@ -367,7 +367,7 @@ def run_experiment(
     open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
+    """Run an experiment and write its folder, which appears only when complete; returns result.json."""
     if experiment.import_ and data is None:
         raise BadInput(f"experiment {name} needs real data: give its folder with --data")
     if data is not None and experiment.record:
@@ -396,7 +396,7 @@ def run_experiment(
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
     ):
-        # of runs that all failed there is no mean: a null in the results, not a warning
+        # if all runs failed there is no mean, which is null in the results and not a warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
         setting = Setting(
             folder=part,

@@ -1,8 +1,8 @@
-"""Starts replays elsewhere than at the log's own prior.
+"""Starts of replays at another state than the log's own prior.
 
-An estimator with a prior begins there. Where the replayed span begins later, that prior is of another
-time, and the state must come from elsewhere: from the truth, or from what an earlier replay estimated.
-The estimator is handed a prior made of that, and need not know.
+An estimator with a prior begins there. If the replayed span begins later, that prior does not apply, and
+the state must come from the truth or from the estimates of an earlier replay. The estimator receives a
+prior made from it, so it needs no special handling.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ from fuselog.replay.engine.vectors.tangent import named_now, tangent_components,
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
-# A run's prior at a time in ns, from an estimator's label and the log's own prior.
+# Computes a run's prior at a time in ns from an estimator's label and the log's own prior.
 Origin = Callable[[str, Stream, int], Stream]
 Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
 
@@ -38,9 +38,9 @@ Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
 def order_of(
     *, arrival_order: bool, late: str | None, origins: Sequence[str | Path] = ()
 ) -> tuple[Clock, Late | None]:
-    """Return the clock that orders a replay, and what is done about late messages.
+    """Choose the clock that orders a replay, and the handling of out-of-sequence messages.
 
-    Raises BadInput where `late` is none of the ways, or makes no sense with the others.
+    Raises BadInput if `late` is invalid, or conflicts with the other arguments.
     """
     found = None if late is None else parse_late(late, arrival_order=arrival_order)
     if found is not None and origins:
@@ -55,7 +55,7 @@ def order_of(
 def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:
     """Return the part of a run between two times in seconds, by the clock that orders the replay.
 
-    Raises BadInput where there is nothing in it.
+    Raises BadInput if it contains no messages.
     """
     if start_s is not None and end_s is not None and start_s >= end_s:
         raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end must be after the start")
@@ -81,16 +81,16 @@ def origins_of(
     order: Clock,
     gap_limit_s: float,
 ) -> list[Origin]:
-    """Find what each run starts from; none where that is not stated.
+    """Find what each run starts from; empty if no start is requested.
 
     Args:
         sources: the runs.
         origins: "truth", or the estimates log of an earlier replay of each run.
         sigmas: standard deviations by component, for the truth; see `from_truth`.
         order: the clock of the replay.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: the longest gap over which the truth is interpolated.
 
-    Raises BadInput where the replay begins with the runs, or an estimates log is of another run.
+    Raises BadInput if the replay begins with the runs, or an estimates log is from another run.
     """
     if origins and sources[0].start_ns is None:
         raise BadInput(f"--start-from {origins[0]}: needs a time; give --start too")
@@ -112,7 +112,7 @@ def origins_of(
 
 
 def check_same_run(estimates: Source, source: Source) -> None:
-    """Raise BadInput where estimates are of another run than the log's."""
+    """Raise BadInput if estimates are from another run than a log."""
     of, run = estimates.run, source.run
     if of and run and replace(of, notes={}) != replace(run, notes={}):
         raise BadInput(
@@ -124,10 +124,10 @@ def check_same_run(estimates: Source, source: Source) -> None:
 def start_from(
     bound: Bound, sources: Sequence[Source], origins: Sequence[Origin], order: Clock
 ) -> Bound:
-    """Return the estimator, begun from each run's origin where that run's span begins after its prior.
+    """Return the estimator, started from each run's origin if the run's span begins after its prior.
 
-    Raises BadInput where an origin has no state for a prior at the beginning of the span, or the log no
-    prior that it stands for.
+    Raises BadInput if an origin has no state for a prior at the beginning of the span, or if the log has
+    no prior to replace.
     """
     label = bound.name.partition("/")[0]
     for topic in bound.priors.keys() - sources[0].topics.keys():
@@ -158,16 +158,16 @@ def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clo
 def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
     """Start a run from its truth.
 
-    The covariance is that of the log's prior; `sigmas` are standard deviations of some of its components
-    in their place, which are then correlated with nothing.
+    The covariance is that of the log's prior; `sigmas` replace standard deviations of some components,
+    which are then uncorrelated with all others.
     """
     return partial(_true_state, source, order, gap_limit_s, sigmas)
 
 
 def from_estimates(estimates: Source) -> Origin:
-    """Start a run from mean and covariance that an earlier replay of it estimated last before.
+    """Start a run from the last mean and covariance that an earlier replay estimated before the start.
 
-    It is the estimate of the same label, else the only one that has the prior's components.
+    The estimate with the same label is used, otherwise the only one with the prior's components.
     """
     return partial(_estimated_state, estimates)
 
@@ -205,7 +205,7 @@ def _true_state(
 
 
 def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[str, float]) -> Floats:
-    """Replace some components' standard deviations in the covariance (t, t) of a prior."""
+    """Replace the standard deviations of some components in the covariance (t, t) of a prior."""
     names = [name for name, _ in tangent_components(list(components), list(components.values()))]
     covariance = prior["covariance"][0].reshape(len(names), len(names)).copy()
     given = named_now(sigmas, list(components), list(components.values()))
@@ -228,7 +228,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
     columns = match_components(stream.metadata, components, where)
     tangent = match_tangent(stream.metadata, components, where)
     times_ns = stream.publish_time_ns
-    # what has the stamp of the start is replayed, and must not be in the prior already
+    # messages with the stamp of the start are replayed and must not be in the prior already
     before = int(np.searchsorted(times_ns, start_ns, side="left"))
     if before == 0:
         raise BadInput(f"{where}: has no estimate before the start; give a later --start")
@@ -245,7 +245,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
 
 
 def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
-    """Find the estimate to begin a prior from: of the same thing, with all its components."""
+    """Find the estimate to replace a prior: of the same case, with all its components."""
     case = prior.topic.rpartition("/")[0].removeprefix("/")
     found = [
         name
@@ -265,7 +265,7 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
 
 
 def _components(prior: Stream, name: str) -> dict[str, Any]:
-    """Return names and kinds of a prior's components; raises BadInput where it names none."""
+    """Return names and kinds of a prior's components; raises BadInput if it names none."""
     found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
     if not found:
         raise BadInput(

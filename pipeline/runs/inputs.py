@@ -1,4 +1,4 @@
-"""Names where the runs of an experiment come from: a scenario, real data, or logs."""
+"""Sources of the runs of an experiment: a scenario, real data, or logs."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -14,11 +14,11 @@ from fuselog.recorders.registry import available
 
 
 class Record(Parameters):
-    """States what to simulate.
+    """What to simulate.
 
     Attributes:
         scenario: a scenario by name or TOML file.
-        parameters: what differs from its defaults, by name.
+        parameters: values that differ from its defaults, by name.
     """
 
     scenario: str
@@ -26,11 +26,11 @@ class Record(Parameters):
 
 
 class Import(Parameters):
-    """States what to import; the data's place comes from --data.
+    """What to import; the path of the data is given with --data.
 
     Attributes:
         source: name of the importer.
-        parameters: what differs from its defaults, by name.
+        parameters: values that differ from its defaults, by name.
     """
 
     source: str
@@ -38,36 +38,36 @@ class Import(Parameters):
 
 
 class Logs(Parameters):
-    """Names the logs to replay, one run each.
+    """The logs to replay, one run each.
 
     Attributes:
-        files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
-            estimates that lie beside the logs are left out.
+        files: files or patterns such as `drive-*.mcap`, relative to the folder of the experiment's file;
+            estimates logs among several matches are left out.
     """
 
     files: list[str] = []
 
 
 class Recording(Parameters):
-    """Identifies a recording that claims are of by what is in its files, wherever they lie.
+    """A recording that claims are about, identified by the content of its files.
 
     Attributes:
-        files: pattern of its files, such as `*_detections.json` or `path_9/*.csv`; what lies beside them
-            counts for nothing.
-        sha256: of the files together; see `digest_of`.
+        files: pattern of its files, such as `*_detections.json` or `path_9/*.csv`; other files are
+            ignored.
+        sha256: hash of the files together; see `digest_of`.
     """
 
     files: str
     sha256: str = ""
 
     def digest_of(self, files: Sequence[Path]) -> str:
-        """Compute SHA-256 of those of the files that are this recording's, decompressed; "" for none."""
+        """Hash the decompressed files that belong to this recording with SHA-256; "" for none."""
         digests = sorted(_digest(path) for path in files if path.match(self.files))
         return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 
 
 def _digest(path: Path) -> str:
-    from fuselog.recorders.importers.tables.files import (  # Arrow takes long to import
+    from fuselog.recorders.importers.tables.files import (  # Arrow is slow to import
         DAMAGED,
         open_decompressed,
     )
@@ -80,9 +80,9 @@ def _digest(path: Path) -> str:
 
 
 def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: str) -> dict[str, bool]:
-    """Tell of each recording by its name whether these files are it.
+    """Test for each recording by name whether these files are that recording.
 
-    Raises BadInput that names `where` where one states no hash.
+    Raises BadInput that names `where` if one states no hash.
     """
     digests = {name: recording.digest_of(files) for name, recording in recordings.items()}
     for name, digest in digests.items():
@@ -97,7 +97,7 @@ SHIPPED = resources.files("fuselog_data")
 
 
 def shipped(kind: str) -> dict[str, Path]:
-    """Return the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
+    """Find the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
         return {path.stem: path for path in sorted(folder.rglob("*.toml"), key=lambda path: path.name)}
 

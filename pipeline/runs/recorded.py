@@ -1,4 +1,4 @@
-"""Records, replays and judges ensembles whole in memory, where there is room."""
+"""Recording, replay and judgement of ensembles whole in memory, if there is room."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,13 @@ from fuselog.replay.judging.errors.evaluation import Errors, Innovations, split_
 from fuselog.replay.judging.judge import TIME_BINS, Judge
 from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure
 
-# Of a run that was judged, so much is kept at least: its sums over time.
+# Minimum number of bytes kept for a judged run: its sums over time.
 KEPT_BYTES = 8 * TIME_BINS
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """Holds an ensemble in memory, what estimators made of it, and how that compares with the truth.
+    """An ensemble in memory, the outputs of estimators, and their errors.
 
     `others` is what families judge: sets, regions, tracks.
     """
@@ -41,7 +41,7 @@ class Replayed:
 
     @property
     def judged(self) -> list[Errors | Innovations | Output]:
-        """Return all that metrics of estimates, innovations and messages judge."""
+        """Return everything that metrics of estimates, innovations and messages judge."""
         outputs = [
             Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
             for topic, rows in self.outputs.items()
@@ -49,7 +49,7 @@ class Replayed:
         return [*self.errors, *self.innovations, *outputs]
 
     def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
-        """Return the metrics of these names, of all where none is given; see `measure`."""
+        """Compute the metrics with these names, or all if none is given; see `measure`."""
         return measure(self.judged, find_metrics(names))
 
 
@@ -63,16 +63,15 @@ def record_ensemble(
     first_run: int = 0,
     all_runs: int = 0,
 ) -> Ensemble[MemorySource]:
-    """Record so many runs of a scenario, each from its own random stream of `seed`.
+    """Record `runs` runs of a scenario, each with its own random stream of `seed`.
 
-    Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
-    where there are more.
+    Raises BadInput if the first run shows that memory cannot hold them, or the sums kept of all runs.
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
     first = record(first_run)
     took_s = time.perf_counter() - begin_s
-    # replay lays the runs end to end, which holds every column twice; estimates come on top
+    # a replay concatenates the runs, which doubles every column; estimates need memory as well
     need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
     all_runs = max(runs, all_runs)
     require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
@@ -82,9 +81,9 @@ def record_ensemble(
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
-    """Raise BadInput with what something takes, where that is more memory than is free."""
+    """Raise BadInput with the required memory if it exceeds what is free."""
     time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
-    import psutil  # which takes long to import
+    import psutil  # slow to import
 
     there_bytes = psutil.virtual_memory().available
     if need_bytes > there_bytes:
@@ -127,7 +126,7 @@ def replay_in_memory(
     late: Late | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Ragged]:
-    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
+    """Replay estimators (label -> parameters) over an ensemble; return whole streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
@@ -137,6 +136,6 @@ def replay_in_memory(
 
 
 def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
-    """Judge a replay's outputs by the truth."""
+    """Judge a replay's outputs against the truth."""
     judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
     return Replayed(sources, outputs, judged.errors, judged.innovations, judged.others)

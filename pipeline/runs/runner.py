@@ -1,6 +1,6 @@
-"""Does what every study does: obtain runs, replay and judge them, keep the first logs, draw a run.
+"""The work common to all studies: obtain runs, replay and judge them, keep the first logs, draw a run.
 
-A study keeps what is its own: cases, claims, tables, figures.
+A study adds its own cases, claims, tables and figures.
 """
 
 import os
@@ -28,11 +28,11 @@ from fuselog.replay.judging.judge import Judge
 
 @dataclass(frozen=True)
 class Runner:
-    """Holds the runs of an experiment, in its setting.
+    """The runs of an experiment in its setting.
 
     Attributes:
-        experiment: what is run.
-        setting: where and how.
+        experiment: the experiment.
+        setting: where and how it runs.
     """
 
     experiment: Experiment
@@ -46,15 +46,15 @@ class Runner:
         first_run: int = 0,
         runs: int | None = None,
     ) -> list[MemorySource]:
-        """Return runs in memory: simulated, imported, or those of the logs.
+        """Load runs into memory: simulated, imported, or from logs.
 
         Args:
-            parameters: what differs in those of the scenario.
-            seed: another than the experiment's.
+            parameters: values that differ from the scenario's.
+            seed: by default the experiment's.
             first_run: the number of the first run.
-            runs: how many, by default those of the experiment.
+            runs: number of runs, by default the experiment's.
 
-        Raises BadInput where the experiment does not say what to record or to import.
+        Raises BadInput if the experiment does not state what to record or to import.
         """
         experiment, setting = self.experiment, self.setting
         if experiment.import_ and setting.data:
@@ -101,10 +101,10 @@ class Runner:
 
         Args:
             sources: the runs.
-            outputs: what the estimators gave, by topic.
-            folder: where logs and estimates go, in the setting's folder.
-            drawn: likewise where the timeline of the first run goes; None where none is wanted.
-            first_run: the number of the first of these runs, where they are a part of all.
+            outputs: the outputs of the estimators, by topic.
+            folder: the folder for logs and estimates, in the setting's folder.
+            drawn: likewise the folder for the timeline of the first run; None for no timeline.
+            first_run: the number of the first of these runs, if they are a part of all.
         """
         count = max(0, min(self.setting.logs - first_run, len(sources)))
         for run in self.setting.progress(range(count), "writing logs", count) if count else ():
@@ -119,7 +119,7 @@ class Runner:
     def draw(
         self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
     ) -> None:
-        """Draw the first of the runs `sources` with its `outputs` into `folder`."""
+        """Draw the timeline of the first of the runs `sources` with its `outputs` to `folder`."""
         from fuselog.replay.timeline.show import show
 
         place = self.setting.folder / folder
@@ -135,9 +135,9 @@ class Runner:
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """Do as `run` for all `cases`, by name what differs in the scenario's parameters.
+        """Run as `run` does for all `cases`, which map names to different scenario parameters.
 
-        What is kept goes to a folder of the case, but the first case's timeline is the experiment's.
+        Files go to a folder of the case, except that the first case's timeline is the experiment's.
         """
         for number, (name, differing) in enumerate(cases.items()):
             replayed = self.replay(self.obtain(differing))
@@ -145,7 +145,7 @@ class Runner:
             yield name, replayed
 
     def judge(self, now: slice) -> Pass:
-        """Judge the runs `now` in one streamed pass; the first ones' logs and timeline are written."""
+        """Judge the runs `now` in one streamed pass; logs and timeline of the first runs are written."""
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
@@ -182,18 +182,18 @@ class Runner:
         return done
 
     def _as_seen_from(self, path: Path, log: Path) -> Path:
-        """Return where a log seems to be from a file of the folder, so that it is found when moved."""
+        """Return a path to a log that is valid once the folder has been moved to its final place."""
         there = self.setting.place / path.relative_to(self.setting.folder)
         return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
 
     def _places(self, folder: str, run: int) -> tuple[Path, Path]:
-        """Return where a run's log and its estimates go."""
+        """Return the paths of a run's log and estimates."""
         name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
         return place / "logs" / name, place / "estimates" / name
 
 
 def _in_memory(source: LogSource) -> MemorySource:
-    """Read a log's streams, but for estimates and what is no columns."""
+    """Read a log's streams, except estimates and messages without columns."""
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
     return MemorySource(source.read(topics), run, source.name, rejections=source.rejections)

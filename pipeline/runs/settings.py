@@ -1,4 +1,4 @@
-"""Reads parameters of estimators as commands take them: --set, a settings file, own options."""
+"""Parameters of estimators as commands receive them: --set, a settings file, separate options."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,18 +14,18 @@ from fuselog.replay.engine.replaying.estimator import Bound, specified
 from fuselog.replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
 Settings = Mapping[str, Mapping[str, Any]]
-# Parameters of estimators that have an option of their own.
+# Parameters of estimators that have a separate option.
 OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
 def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, Any]]:
-    """Read parameters by estimator label from the tables of a TOML file; none without a file.
+    """Read parameters by estimator label from the tables of a TOML file; empty without a file.
 
     Args:
         path: the file.
-        labels: what was named of each estimator, such as its program.
+        labels: the settings that the command line gives for each estimator, such as its program.
 
-    Raises BadInput where the file has settings of another estimator, or names another program.
+    Raises BadInput if the file has settings of another estimator, or names another program.
     """
     tables = {} if path is None else of_file(read_toml(path))
     for label, table in tables.items():
@@ -41,7 +41,7 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
 
 
 def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Return the settings of topics among KEY=VALUE, by `/TOPIC.WHAT`; and the texts of all others."""
+    """Split KEY=VALUE texts into settings of topics, by `/TOPIC.WHAT`, and the texts of all others."""
     of_topics = [text for text in texts if _alters(text)]
     return parse_settings(of_topics), [text for text in texts if text not in of_topics]
 
@@ -54,10 +54,10 @@ def _alters(text: str) -> bool:
 def settings_of_estimators(
     labels: Sequence[str], texts: Sequence[str], file: Path | None, **options: Any
 ) -> dict[str, dict[str, Any]]:
-    """Return parameters by estimator label: those of a settings file, then KEY=VALUE, then options.
+    """Combine parameters by estimator label: a settings file, then KEY=VALUE texts, then options.
 
-    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter; so do
-    options that are not None. Raises BadInput where none has.
+    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter, and so
+    do options that are not None. Raises BadInput if no estimator has the parameter.
     """
     named = named_by(labels)
     base = read_settings(file, named)
@@ -67,9 +67,9 @@ def settings_of_estimators(
 
 
 def named_by(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the labels and settings that names stand for, such as `ekf` and `lib:./mine.so`.
+    """Return the labels and settings for names such as `ekf` and `lib:./mine.so`.
 
-    Raises BadInput where two programs have the same label.
+    Raises BadInput if two programs have the same label.
     """
     named: dict[str, dict[str, Any]] = {}
     for label, settings in map(shorthand, names):
@@ -79,9 +79,9 @@ def named_by(names: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return parameters by estimator label with others over them, see `settings_of_estimators`.
+    """Apply settings to parameters by estimator label; see `settings_of_estimators`.
 
-    Raises BadInput where no estimator has such a parameter.
+    Raises BadInput if no estimator has such a parameter.
     """
     labels, chosen, settings = list(base), dict[str, dict[str, Any]](), by_topic(settings)
     for label in labels:
@@ -110,9 +110,9 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 
 
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
-    """Return the names of the parameters that estimators have, from their settings by label.
+    """Return the names of the parameters of estimators, from their settings by label.
 
-    Raises BadInput where there is no such estimator.
+    Raises BadInput if there is no such estimator.
     """
     names: dict[str, set[str]] = {}
     for label, settings in estimators.items():
@@ -121,7 +121,7 @@ def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Read standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
+    """Read standard deviations by component from an option's COMPONENT=SIGMA texts."""
     sigmas: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
@@ -135,7 +135,7 @@ def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
 
 
 def meanings_of(bound: Sequence[Bound]) -> dict[str, dict[str, str]]:
-    """Return what the parameters of estimators mean, in a few words, by label and name."""
+    """Return the meanings of the parameters of estimators, in a few words, by label and name."""
     kinds = {each.name.partition("/")[0]: type(each.parameters) for each in bound if each.parameters}
     return {
         label: {name: in_few_words(meaning) for name, meaning in meanings(kind).items()}

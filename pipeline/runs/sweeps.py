@@ -1,4 +1,4 @@
-"""Runs sweeps: an experiment at many points of its parameters, a grid or samples."""
+"""Sweeps: an experiment at many points of its parameters, a grid or samples."""
 
 import itertools
 import math
@@ -39,22 +39,22 @@ if TYPE_CHECKING:
 
 Sampling = Literal["sobol", "random"]
 MOST_POINTS = 100_000
-# Where the middle of the runs lies: nine in ten of them.
+# Quantiles that bound the middle 90 % of the runs.
 LOW, HIGH = 0.05, 0.95
-# What is drawn, of what a result has; the rest is in the table.
+# Metrics that are drawn; the others are in the table.
 MOST_TICKS = 10
 DRAWN = ("position_rmse_m", "orientation_rmse_deg", "nees", "position_nees", "nis_per_component")
 
 
 class Over(NamedTuple):
-    """Describes a parameter that is swept.
+    """A parameter that is swept.
 
     Attributes:
-        key: as `--set` has it.
-        taken: the values that it takes on a grid.
-        ends: of a range, from which samples are drawn too; None of a list.
-        is_log: whether the range is even in the logarithm.
-        name: what it means, in a few words, where that is known.
+        key: as in `--set`.
+        taken: its values on a grid.
+        ends: of the range from which samples are drawn; None for a list.
+        is_log: whether the range is logarithmic.
+        name: its meaning in a few words, if known.
     """
 
     key: str
@@ -65,12 +65,12 @@ class Over(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Return what an axis says."""
+        """Return the label of its axis."""
         return label_of(self.key, self.name) if self.name else self.key
 
 
 def parse_over(text: str) -> Over:
-    """Read `KEY=LOW:HIGH:N` (even), `KEY=LOW:HIGH:logN` (in the logarithm) or `KEY=VALUE,VALUE,...`.
+    """Read `KEY=LOW:HIGH:N` (linear), `KEY=LOW:HIGH:logN` (logarithmic) or `KEY=VALUE,VALUE,...`.
 
     Raises BadInput for anything else.
 
@@ -87,7 +87,7 @@ def parse_over(text: str) -> Over:
 
 
 def over_of(key: str, values: Sequence[Any]) -> Over:
-    """Make a list of values, in the logarithm if they are even in it; raises BadInput for one twice."""
+    """Make a list of values, logarithmic if evenly spaced so; raises BadInput for duplicates."""
     if len({*map(str, values)}) < len(values) or not values:
         raise BadInput(f"sweep over {key}: give at least one value, and each once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]
@@ -121,9 +121,9 @@ def _value(text: str, key: str, stated: str) -> Any:
 def points_of(
     over: Sequence[Over], samples: int | None = None, sampling: Sampling = "sobol", seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Return the points: of the grid, the last parameter changing fastest, or samples of the ranges.
+    """Make the points of a grid, the last parameter changing fastest, or samples of the ranges.
 
-    Of a list, a sample takes one. Raises BadInput where there is nothing to sweep, or too much.
+    A sample takes one value of a list. Raises BadInput if there is nothing to sweep, or too much.
     """
     keys = [each.key for each in over]
     if not over or len(set(keys)) < len(keys):
@@ -138,7 +138,7 @@ def points_of(
         ]
     rng = np.random.default_rng(seed)
     if sampling == "sobol":
-        from scipy.stats import qmc  # which takes long to import
+        from scipy.stats import qmc  # slow to import
 
         sampler = qmc.Sobol(len(over), rng=rng)
         uniform = sampler.random_base2(math.ceil(math.log2(samples)))[:samples]
@@ -159,7 +159,7 @@ def _at(over: Over, share: float) -> Any:
 
 
 def settings_at(point: Mapping[str, Any]) -> dict[str, Any]:
-    """Nest values by keys such as `ekf.sigma_range_m` as tables in tables.
+    """Nest values with keys such as `ekf.sigma_range_m` as tables in tables.
 
     >>> settings_at({"ekf.sigma_range_m": 0.1, "robots": 2})
     {'ekf': {'sigma_range_m': 0.1}, 'robots': 2}
@@ -180,10 +180,10 @@ def run_sweep(
     open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Replay and judge an experiment at every point into a folder; returns result.json.
+    """Replay and judge an experiment at every point, and write a result folder; returns result.json.
 
-    Its metrics are lists, a number for each point; the table has them in long form. Raises BadInput
-    where an experiment is of a study that does more than judge, or cannot be run.
+    Its metrics are lists with a number for each point; the table has them in long form. Raises BadInput
+    if the study of the experiment does more than judge, or if the experiment cannot be run.
     """
     for experiment in experiments:
         if experiment.study != "localization":
@@ -221,9 +221,9 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """Return a row per metric: its value over all runs, and between what nine in ten runs lie.
+    """Tabulate the metrics at a point: the value over all runs, and the middle 90 % of the runs.
 
-    Of NEES and NIS also what it should be, and where it lies with 95 % if the estimator is consistent.
+    NEES and NIS also have their expected value, and the 95 % range of a consistent estimator.
     """
     runs, bounds = judge.runs_table, judge.bounds
     sizes = {
@@ -248,7 +248,7 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
 
 
 def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
-    """Return the errors of every run at a point, by which points are compared run by run."""
+    """Select the errors of every run at a point, for comparing points run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
     kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
@@ -257,7 +257,7 @@ def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
 
 
 def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
-    """Say in a few words what a parameter of an estimator or scenario means; empty if unknown."""
+    """Describe a parameter of an estimator or scenario in a few words; empty if unknown."""
     for label, words in done.meanings.items():
         name = key.removeprefix(f"{label}.")
         if name in experiment.estimators.get(label, {}):
@@ -270,7 +270,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
-    """Return every metric as a list, by point; null where a point has none."""
+    """Collect every metric as a list by point; NaN if a point has none."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
         values = dict(zip(rows["point"], rows["value"], strict=True))
@@ -279,7 +279,7 @@ def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
 
 
 def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
-    """Draw each quantity and case: a heat map over two numbers, else curves over every parameter."""
+    """Draw each quantity and case: a heat map over two numbers, or curves over every parameter."""
     numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
     grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
     figures: dict[str, Chart | Figure] = {}
@@ -287,7 +287,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
     for (quantity, case), rows in drawn.groupby(["quantity", "case"]):
         name = "-".join(filter(None, (str(quantity), str(case))))
         changes = rows.groupby("estimator")["value"].transform(np.ptp) > 0
-        shown = rows[changes] if changes.any() else rows  # what is the same everywhere is no picture
+        shown = rows[changes] if changes.any() else rows  # constant curves are not worth a picture
         is_map = len(over) == 2 and numbers and grid
         drawn_as = (
             heat_maps(shown, over, name) if is_map else curves(shown, over, str(quantity), str(case))
@@ -297,7 +297,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
 
 
 def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
-    """Draw the quantity over each parameter; where others are swept too, the mean over them."""
+    """Draw the quantity over each parameter, as the mean over other swept parameters."""
     panels = []
     for each in over:
         numbers = all(isinstance(value, int | float) for value in each.taken)
@@ -319,7 +319,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
 
 
 def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
-    """Draw the quantity over two parameters, a map per estimator; a cross where an error is least."""
+    """Draw the quantity over two parameters, a map per estimator; a cross marks the smallest error."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -338,7 +338,7 @@ def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
         for axis, places in ((axes.xaxis, own.columns), (axes.yaxis, own.index)):
             shown = range(0, len(places), -(-len(places) // 9))
             axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
-        axes.tick_params(axis="x", rotation=45)  # nine numbers side by side
+        axes.tick_params(axis="x", rotation=45)  # up to nine numbers in a row
         axes.set(xlabel=x.label, ylabel=y.label, title=label)
     figure.colorbar(picture, ax=figure.axes, label=label_of(name.partition("-")[0]))
     return figure
