@@ -28,26 +28,27 @@ STATED = "covariance_rad2"  # variances that a channel of orientations states
 ALL_TOPICS = "/*"
 # Alterations of a topic with their meanings; each corrects a fault and takes its number.
 WHATS = {
-    "delay_s": "The stamps are so late, and are taken back by it; messages that would be before 1970 "
+    "delay_s": "The delay of the stamps, which is subtracted; messages that would be before 1970 "
     "are left out.",
-    "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
-    "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
-    "FIELD_bias": "The field is too large by it, and is reduced by it.",
-    "FIELD_drift": "The field is too large by it for every s since the run's begin, and is reduced so.",
-    "FIELD_axes": "The order of the vector's entries: yx, where x and y are exchanged.",
-    "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, as `fuselog "
-    "ellipsoid` finds it.",
-    "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
-    "heading_bias": "The heading of orientations, or of a prior, is too large by it (rad); they have "
-    "heading_scale and heading_drift as well.",
-    "heading_convention": "north, where headings of orientations are a compass's, clockwise from there.",
-    "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
-    "Of positions where their zero lies in the plane, in m: it is added.",
-    "plane": "Of positions and states the origin of their plane, which counts as stated: latitude and "
-    "longitude in deg, altitude in m. /*.plane is of all topics of a plane that state none.",
-    "covers": "Of a truth: some, if the log has targets without a truth, so that tracks of these are "
-    "not false; or all, whatever the log states.",
-    "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
+    "clock_gain": "The clock of the stamps gains this many s per s from the start of the run.",
+    "FIELD_scale": "The field is multiplied by this factor; covariance_scale is a factor of variances.",
+    "FIELD_bias": "The field is too large by this bias, which is subtracted.",
+    "FIELD_drift": "The field's bias grows by this much per second from the start of the run, and is "
+    "subtracted.",
+    "FIELD_axes": "The order of the vector's entries: yx if x and y are swapped.",
+    "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, such as `fuselog "
+    "ellipsoid` finds.",
+    "FIELD_turn": "The vector is rotated about the vertical by this angle (rad), and is rotated back.",
+    "heading_bias": "The heading of orientations, or of a prior, is too large by this angle (rad); "
+    "orientations have heading_scale and heading_drift as well.",
+    "heading_convention": "north, if headings of orientations are a compass's, clockwise from north.",
+    "origin": "For geodetic fixes, the origin of the tangent plane: latitude and longitude in deg, "
+    "altitude in m. For positions, the position of their origin in the plane, in m, which is added.",
+    "plane": "For positions and states, the origin of their tangent plane, as if the log stated it: "
+    "latitude and longitude in deg, altitude in m. /*.plane sets all such topics that state none.",
+    "covers": "For a truth: some, if the log has targets without a truth, so that their tracks are not "
+    "false; or all, whatever the log states.",
+    "exchanged": "Two numbers that are swapped, such as 3,9; or the topic to swap this one with.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 
@@ -214,8 +215,8 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
         topic, dot, what = key.rpartition(".")
         if not dot or not what:
             raise BadInput(
-                f"--set {key}={value}: expected /TOPIC.WHAT=VALUE, such as /fix.delay_s=0.3; of a topic "
-                f"can be set: {', '.join(WHATS)}"
+                f"--set {key}={value}: expected /TOPIC.WHAT=VALUE, such as /fix.delay_s=0.3; WHAT is "
+                f"one of {', '.join(WHATS)}"
             )
         if topic not in source.topics:
             raise BadInput(
@@ -253,9 +254,9 @@ def _with(change: Change, given: _Setting) -> Change:
         delay_ns = 1e9 * given.number("delay_s", "seconds, such as 0.3 or 300 ms")
         return replace(change, delay_ns=change.delay_ns + delay_ns)
     if what == "clock_gain":
-        gain = given.number("clock_gain", "seconds that the clock gains a second, such as 1e-4")
+        gain = given.number("clock_gain", "seconds that the clock gains per second, such as 1e-4")
         if not abs(gain) < 1.0:
-            raise given.refused("seconds that the clock gains a second, less than 1, such as 1e-4")
+            raise given.refused("seconds that the clock gains per second, less than 1, such as 1e-4")
         return replace(change, gain=change.gain + gain)
     if what == "origin":
         return _origin(change, given)
@@ -291,7 +292,7 @@ def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | 
         return partial(_by, alter.heading_ramped(first_ns), -rate)
     if given.what == "heading_convention":
         if str(given.value) != "north":
-            raise given.refused("north, from where headings are clockwise")
+            raise given.refused("north, for headings clockwise from north")
         return partial(_by, alter.heading_from_north, 0.0)
     return None
 
@@ -303,7 +304,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
     if of_heading is not None:
         return of_heading
     if not name or what not in ENDINGS:
-        known = f"of a topic can be set {', '.join(WHATS)}"
+        known = f"settings of a topic are {', '.join(WHATS)}"
         raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
     full, (field_, entry) = _field(given, name)
     if what == "scale":
@@ -323,7 +324,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
     if what == "matrix":
         return _matrix(given, field_)
     if entry is not None or not field_.startswith(("position", "velocity")):
-        raise BadInput(f"--set {given.key}: only positions and velocities are turned, as position_turn")
+        raise BadInput(f"--set {given.key}: expected a position or velocity, such as position_turn")
     angle = given.number("turn_rad", "an angle in rad, such as 0.1 or 5 deg")
     return partial(_by, alter.turned(field_), -angle)
 
@@ -341,7 +342,7 @@ def _matrix(given: _Setting, field_: str) -> Callable[[Stream], Stream]:
     """Parse the matrix that multiplies a vector of three entries."""
     example = "nine numbers by rows, such as 1,0,0,0,1,0,0,0,1"
     if given.empty[field_].shape[1:] != (3,):
-        raise BadInput(f"--set {given.key}: {field_} is no vector of three entries; leave it out")
+        raise BadInput(f"--set {given.key}: {field_} is not a vector of three entries; remove it")
     numbers = [_plain(given, text, example) for text in given.several((9,), example)]
     return alter.mixed(field_, np.reshape(numbers, (3, 3)))
 
@@ -370,9 +371,7 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
         if len(fits) == 1:
             return fits[0], fields[fits[0]]
         if fits:
-            raise BadInput(
-                f"--set {given.key}: {name} may be {' or '.join(fits)}; write one of them in full"
-            )
+            raise BadInput(f"--set {given.key}: {name} may be {' or '.join(fits)}; give the full name")
     topic = given.key.rpartition(".")[0]
     raise BadInput(f"--set {given.key}: {topic} has no field {name}; {choices(name, list(fields))}")
 
@@ -382,9 +381,9 @@ def _origin(change: Change, given: _Setting) -> Change:
         return _plane(change, given)
     if "position_m" not in given.empty.columns:
         raise BadInput(
-            f"--set {given.key}: only positions and geodetic fixes have an origin; leave it out"
+            f"--set {given.key}: only positions and geodetic fixes have an origin; remove this setting"
         )
-    example = "a place in m, such as -0.65,0.3"
+    example = "a position in m, such as -0.65,0.3"
     place = [_plain(given, text, example) for text in given.several((2, 3), example)]
     added = [
         partial(_by, alter.shifted("position_m", entry), value) for entry, value in enumerate(place)
@@ -394,7 +393,7 @@ def _origin(change: Change, given: _Setting) -> Change:
 
 def _plane(change: Change, given: _Setting) -> Change:
     if not is_planar(given.empty.schema.full_name, given.empty.metadata):
-        raise BadInput(f"--set {given.key}: its messages are in no plane of positions; leave it out")
+        raise BadInput(f"--set {given.key}: its messages have no positions in a plane; remove it")
     texts = given.several((2, 3), EXAMPLE)
     origin = origin_of(texts)
     if origin is None:
@@ -405,7 +404,7 @@ def _plane(change: Change, given: _Setting) -> Change:
 
 def _covers(change: Change, given: _Setting) -> Change:
     if given.empty.schema.full_name != schemas.TRUTH_STATE.full_name:
-        raise BadInput(f"--set {given.key}: only truths cover targets; leave it out")
+        raise BadInput(f"--set {given.key}: only truths cover targets; remove this setting")
     if given.value not in ("some", "all"):
         raise given.refused("some or all")
     return replace(change, metadata={**change.metadata, COVERS: f"{given.value} targets"})
@@ -429,7 +428,7 @@ def _exchange(change: Change, given: _Setting) -> Change:
     first, second = given.several((2,), example)
     fields = [each.name for each in given.empty.schema if each.kind == "identifier"]
     if len(fields) != 1 or not (first.isdigit() and second.isdigit()):
-        raise given.refused(example if fields else "another topic: this one has no numbers")
+        raise given.refused(example if fields else "another topic, because this one has no numbers")
     renumber = alter.renumbered(fields[0], int(first), int(second))
     return replace(change, columns=(*change.columns, partial(_by, renumber, 0.0)))
 
@@ -446,9 +445,9 @@ def _check_exchange(
     if source.topics[other].schema_name != given.empty.schema.full_name:
         raise BadInput(
             f"--set {given.key}={other}: one is {given.empty.schema.full_name}, the other "
-            f"{source.topics[other].schema_name}; only topics of one type are exchanged"
+            f"{source.topics[other].schema_name}; only topics of the same type can be swapped"
         )
     if other in changes:
         raise BadInput(
-            f"--set {given.key}={other}: {other} is altered too; set its exchange alone, once"
+            f"--set {given.key}={other}: {other} has other settings too; set only the swap, once"
         )

@@ -43,8 +43,8 @@ def in_one_plane(
                 for wanted in (True, False)
             )
             raise BadInput(
-                f"{name}: {topic} does not state the origin of its plane, and {first} states {into}, "
-                f"{other} {origins[other]}; say which is its, as --set {topic}.plane="
+                f"{name}: {topic} does not state the origin of its tangent plane, and {first} states "
+                f"{into}, {other} {origins[other]}; set it, such as --set {topic}.plane="
                 f"{into.latitude_deg:.9g},{into.longitude_deg:.9g},{into.altitude_m:.9g}"
             )
     made = dict(changes)

@@ -117,7 +117,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
         stated = None
     if not isinstance(stated, dict):
         raise BadInput(
-            f"{estimates.name}: its metadata does not say how its log was altered; replay it again"
+            f"{estimates.name}: its metadata has no readable alterations; replay the log again"
         )
     return stated
 

@@ -53,12 +53,12 @@ def calibrate(
     """
     for name in OPTIONS:
         if name in options:
-            raise BadInput(f"calibrate: {name} is for tune; a calibration chooses it itself")
+            raise BadInput(f"calibrate: {name} is an option of tune only; calibrate chooses it")
     alterations, given = split_settings(set or {})
     sources = sources_of(logs, alterations)
     [(label, own), *others] = settings_of(estimator).items()
     if others:
-        raise BadInput(f"{label}, {others[0][0]}: one estimator is calibrated at a time; give one")
+        raise BadInput(f"{label}, {others[0][0]}: give one estimator; calibrate takes one at a time")
     bound = bind(label, sources, {"kind": label, **merge(own, allowed(given))})
     marked = [
         name
@@ -68,12 +68,12 @@ def calibrate(
     ]
     if not marked:
         raise BadInput(
-            f"estimator {label}: its model marks no parameter that the logs read as its calibration; "
-            "name parameters yourself, fuselog tune --free NAME"
+            f"estimator {label}: its model marks no calibration parameter that the logs read; choose "
+            "parameters yourself with fuselog tune --free NAME"
         )
     for name in fixed:
         if name not in marked:
-            raise BadInput(f"--fixed {name}: is not of the calibration; it is {', '.join(marked)}")
+            raise BadInput(f"--fixed {name}: is not a calibration parameter: {', '.join(marked)}")
     free = [name for name in marked if name not in fixed]
     found = tune(logs, estimator, free, set=set, **options)
     names = [each.name for each in found.found.coordinates.free]

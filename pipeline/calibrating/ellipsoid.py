@@ -114,23 +114,23 @@ class Ellipsoid:
             turned = f"about one axis only, near {axis}" if axis else "to too few sides"
             others = f"about {' or '.join(AXES.replace(axis, ''))} as well" if axis else "to all sides"
             sentences.append(
-                f"the unit was turned {turned}; that does not determine {', '.join(self.left_open)}: "
-                f"they have no value; turn it {others}"
+                f"the unit was rotated {turned}, which does not determine {', '.join(self.left_open)}: "
+                f"they have no value; rotate it {others}"
             )
         else:
             sentences.append(
                 f"{len(self.readings)} readings: their lengths differ from {self.length:.5g} {unit} by "
-                f"{before:.3g} {unit} as they are, by {after:.3g} {unit} corrected (root mean square)"
+                f"{before:.3g} {unit} uncorrected, {after:.3g} {unit} corrected (root mean square)"
             )
         if self.is_assumed:
             sentences.append(
-                f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one; "
-                "only their ratios count"
+                f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one, "
+                "and only their ratios are meaningful"
             )
         if fitted.correlation:
             sentences.append(
-                f"errors of one reading and the next correlate by {fitted.correlation:.2g}; that widens "
-                "the intervals"
+                f"errors of successive readings have a correlation of {fitted.correlation:.2g}, which "
+                "widens the intervals"
             )
         if self.settings:
             words = " ".join(f"--set {name}={value}" for name, value in self.settings.items())
@@ -146,7 +146,7 @@ class Ellipsoid:
             x=Axis(label="reading"),
             y=Axis(label=f"length ({unit_of(self.field) or 'unit'})"),
             series=[
-                curve("as they are", rows, before, "markers"),
+                curve("uncorrected", rows, before, "markers"),
                 curve("corrected", rows, after, "markers"),
                 level("stated", rows, self.length),
             ],
@@ -197,11 +197,11 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     readings = np.concatenate([_readings(source, field) for source in sources])
     if len(readings) < FEWEST:
         raise BadInput(
-            f"{field}: has {len(readings)} readings; an ellipsoid takes {FEWEST} at least, those of an "
-            "accelerometer half a second each in which it is still"
+            f"{field}: has {len(readings)} readings; an ellipsoid needs at least {FEWEST}; those of an "
+            "accelerometer are half seconds in which it is still"
         )
     if np.ptp(readings, axis=0).max() == 0.0:
-        raise BadInput(f"{field}: has {len(readings)} readings that are all alike; turn the unit")
+        raise BadInput(f"{field}: its {len(readings)} readings are all equal; rotate the unit")
     readings = readings[:: -(-len(readings) // MOST)]
     topic, _, name = field.rpartition(".")
     _, unit = middle(readings)
@@ -223,7 +223,7 @@ def _readings(source: LogSource | MemorySource, field: str) -> Floats:
     """Return the readings (n, 3) of a field; for an accelerometer, means while it is still."""
     topic, _, name = field.rpartition(".")
     if not topic:
-        raise BadInput(f"--field {field}: expected TOPIC.FIELD, as /imu.magnetic_field_ut")
+        raise BadInput(f"--field {field}: expected TOPIC.FIELD, such as /imu.magnetic_field_ut")
     if topic not in source.topics:
         raise BadInput(f"{source.name}: has no topic {topic}; {choices(topic, source.topics)}")
     stream = source.read([topic])[topic]

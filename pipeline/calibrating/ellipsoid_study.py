@@ -62,7 +62,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics |= {
                 f"ellipsoid.covered.{block}-{unit}-{name}": each for name, each in counts.items()
             }
-        outcome.figures[f"coverage-{unit}"] = coverage(f"ellipsoid of a turned {unit}", held)
+        outcome.figures[f"coverage-{unit}"] = coverage(f"ellipsoid of a rotated {unit}", held)
     outcome.input_sha256 = hash_streams(
         [recorded(unit, first) for unit, first in product(UNITS, options.seeds)]
     )
@@ -126,4 +126,4 @@ UNITS: Mapping[str, tuple[Callable[[np.random.Generator], tuple[Floats, float]],
     "magnetometer": (turned, MAGNETOMETER),
     "accelerometer": (put_down, ACCELEROMETER),
 }
-ELLIPSOID = Study("how often the intervals of an ellipsoid hold the truth", study, EllipsoidOptions)
+ELLIPSOID = Study("how often the intervals of an ellipsoid cover the truth", study, EllipsoidOptions)

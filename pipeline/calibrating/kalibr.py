@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 FILE = "kalibr-calibration.yaml"
 HEAD = (
-    "# T_sensor_body: a point from the body's axes to the sensor's, in m, as Kalibr's T_cam_imu\n"
-    "# timeshift_sensor_body: was measured at the stamp plus this, in s, as Kalibr's timeshift_cam_imu\n"
+    "# T_sensor_body: converts a point from body axes to sensor axes, in m, as Kalibr's T_cam_imu\n"
+    "# timeshift_sensor_body: measured at the stamp plus this, in s, as Kalibr's timeshift_cam_imu\n"
 )
 DELAY = "_delay_s"
 LEVER = ("lever_x_m", "lever_y_m", "lever_z_m")
@@ -60,7 +60,7 @@ def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
             elif name not in (*LEVER, *MOUNTING, HEADING):
                 key = f"{topic}.{name}" if topic else name
                 sensors.setdefault("errors", []).append(f"{key}: {value:.6g}")
-    unknown = f"# not determined, as they were at the start: {', '.join(held)}\n" if held else ""
+    unknown = f"# not determined, left at the start values: {', '.join(held)}\n" if held else ""
     blocks = [f"{name}:\n" + "".join(f"  {line}\n" for line in lines) for name, lines in sensors.items()]
     return HEAD + unknown + "".join(blocks)
 

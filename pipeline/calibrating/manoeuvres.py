@@ -102,13 +102,13 @@ def advice(found: Tuning) -> list[str]:
     names = list(table.columns[3:])
     before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
     if best["manoeuvre"] == "none":
-        return ["next: none of the manoeuvres tells more than the logs do"]
+        return ["next: no manoeuvre would add to the information in the logs"]
     useful = {each.name: each.useful for each in found.found.coordinates.free}
     widest = max(names, key=lambda name: before[name] / useful[name])
     by_determinant = table.iloc[int(table["nats"].argmax())]
     return [
-        f"next, record {best['manoeuvre']}: of {len(MOTIONS)} manoeuvres of {DURATION_S:g} s it leaves "
-        f"the narrowest widest interval; the standard error of {widest}, now the widest, becomes "
+        f"next, record {best['manoeuvre']}: among {len(MOTIONS)} manoeuvres of {DURATION_S:g} s it "
+        f"reduces the widest interval most; the standard error of {widest}, now the widest, becomes "
         f"{best[widest]:.3g} ({before[widest]:.3g} without)",
         f"by the determinant, which counts all parameters together, it is {by_determinant['manoeuvre']} "
         f"({by_determinant['nats']:.1f} nats; {best['manoeuvre']} {best['nats']:.1f})",
@@ -160,7 +160,7 @@ def _of_kinds(log: Source) -> dict[str, Stream]:
     found = {topic: stream for topic, stream in streams.items() if stream is not None}
     if "/car/odometry" not in found or "/car/fix" not in found:
         raise BadInput(
-            f"--next: {log.name} has no odometry with fixes; manoeuvres are those of a robot with wheels"
+            f"--next: {log.name} has no odometry with fixes; manoeuvres are for a robot with wheels"
         )
     return found
 

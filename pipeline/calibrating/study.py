@@ -42,7 +42,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: CalibrationOptions = setting.options
     if unknown := [each for each in options.motions if each not in MOTIONS]:
         raise BadInput(
-            f"options.motions: {unknown[0]!r} is no motion of study calibration; it has "
+            f"options.motions: the calibration study has no motion {unknown[0]!r}; it has "
             + ", ".join(MOTIONS)
         )
     [(label, settings)] = experiment.estimators.items()
@@ -102,7 +102,7 @@ def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[An
 
 
 CALIBRATION = Study(
-    "how often the intervals of a calibration hold the truth, and what each motion leaves open",
+    "how often the intervals of a calibration cover the truth, and what each motion leaves open",
     study,
     CalibrationOptions,
 )

@@ -15,16 +15,16 @@ def why_no_replay(made: CFilter) -> str:
     """Explain why fuselog cannot replay the C; "" if it can."""
     stage, found = made.filtering.stage, made.filtering.found
     if made.is_interpolated:
-        return "its control is interpolated, so that messages wait for the next one of it"
+        return "its control is interpolated, so that messages have to wait for the next control"
     if found.fallbacks or (stage.model.control is not None and stage.model.control.read is not None):
-        return "what drives it is computed of messages in Python"
+        return "its control is computed from messages in Python"
     if found.geodetic:
         return f"{found.geodetic[0].name} has latitudes and longitudes"
     for sensor in stage.sensors:
         if sensor.read is not None:
-            return f"what {sensor.topic} measures is computed of its messages in Python"
+            return f"the measurement of {sensor.topic} is computed from its messages in Python"
         if sensor.is_numbered:
-            return f"what {sensor.topic} measures depends on the number of a point"
+            return f"the measurement of {sensor.topic} depends on the number of a point"
     return ""
 
 
@@ -157,7 +157,7 @@ def replay_text(made: CFilter, reading: Reading) -> str:
     )
     if made.controls:
         cases.append(
-            f"    if (topic == {topic}) {{ /* what drives it */\n"
+            f"    if (topic == {topic}) {{ /* the control */\n"
             "        for (int k = 0; k < NAME_CONTROLS; k++)\n"
             "            if (!isnan(fields[k]))\n"
             "                own->filter.control[k] = (REAL)fields[k];\n"
@@ -194,7 +194,7 @@ static double wrapped(double angle)
         if angles
         else ""
     )
-    text = f"""/* fuselog replays the filter by this: see docs/your-filter.md and fuselog_filter.h. */
+    text = f"""/* fuselog replays the filter with this: see docs/your-filter.md, fuselog_filter.h. */
 #include "fuselog_filter.h"
 
 #include <math.h>
@@ -213,14 +213,14 @@ typedef struct {{
     int32_t outcome; /* of the last message */
 {points}}} Own;
 
-/* Numbers of the interface become the filter's. */
+/* Converts numbers of the interface to those of the filter. */
 static void take(REAL *to, const double *from, int count)
 {{
     for (int i = 0; i < count; i++)
         to[i] = (REAL)from[i];
 }}
 
-/* And back. */
+/* Converts them back. */
 static void give(double *to, const REAL *from, int count)
 {{
     for (int i = 0; i < count; i++)
@@ -332,7 +332,7 @@ def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
         lines.append(f"while (at < own->points{number} && !({is_it}))")
         lines.append("    at++;")
         lines.append(f"if (at == own->points{number})")
-        lines.append("    return FUSELOG_FILTER_WELL; /* an unknown one says nothing */")
+        lines.append("    return FUSELOG_FILTER_WELL; /* an unknown point is ignored */")
         lines.append(f"take(data + {at}, own->point{number}[at] + 1, {each.size});")
         at += each.size
     lines.append(f"take(data, fields + {first}, {m});")
@@ -348,7 +348,7 @@ def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
                 at += 1
         missing = " || ".join(f"isnan(fields[{start + index}])" for index in range(m * m))
         lines.append(f"if ({missing})")
-        lines.append("    return FUSELOG_FILTER_WELL; /* without its covariance it says nothing */")
+        lines.append("    return FUSELOG_FILTER_WELL; /* ignored without its covariance */")
     lines.append(
         f"return told(own, NAME_update_{name}(&own->filter, data, &own->parameters, &own->innovation));"
     )

@@ -6,7 +6,7 @@ TARGET_OPTIONS = (
     "--specs=rdimon.specs -DINSTRUCTIONS=instructions -T cortex_m4f.ld"
 )
 
-LINKED = """/* Where the test stands in the memory of Arm's MPS2 board, image AN386. */
+LINKED = """/* The memory of Arm's MPS2 board, image AN386, for the test. */
 MEMORY
 {
     CODE (rx) : ORIGIN = 0x00000000, LENGTH = 4M

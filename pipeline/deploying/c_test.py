@@ -67,8 +67,8 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     rows = np.searchsorted(given.time_ns, time_ns).clip(max=max(len(given.time_ns) - 1, 0))
     if not len(given.time_ns) or (sensors and not (accepted > 0).any()):
         raise BadInput(
-            f"{source.name}: the filter accepts no measurement after its start, so that its C would not "
-            "be tested; give a log with messages of its sensors that it accepts"
+            f"{source.name}: the filter accepts no measurement after its start, so its C code would not "
+            "be tested; give a log in which it accepts messages of its sensors"
         )
     covariance = first.belief.covariance[0].copy()
     filtering.form.to_covariance(covariance)
@@ -108,9 +108,7 @@ def _handed(source: LogSource, bound: Recursive, filtering: Filter) -> tuple[Fil
     for _ in replay([source], [heard]):
         pass
     if not begun:
-        raise BadInput(
-            f"{source.name}: has nothing that the filter starts from; give a log with a prior"
-        )
+        raise BadInput(f"{source.name}: the filter finds no start in this log; give a log with a prior")
     columns = [np.concatenate(each) for each in zip(*(each[1:] for each in handed), strict=True)]
     return begun[0], FilterEvents(np.array([0, len(columns[0])]), *columns)
 
@@ -154,8 +152,8 @@ def vectors_text(made: CFilter, vectors: Vectors) -> str:
     place = {row: index for index, row in enumerate(rows)}
     judged = [place.get(row, -1) for row in vectors.judged]
     lines = [
-        "/* A recorded log as the filter takes it, with outliers for its gates, and what fuselog's",
-        " * own filter made of it: whether it accepted a measurement (-1: none was), and more. */",
+        "/* A recorded log as input of the filter, with outliers for its gates, and the results of",
+        " * fuselog's own filter: whether it accepted a measurement (-1: there was none), and more. */",
         f"#define VECTORS_EVENTS {count}",
         f"#define VECTORS_WIDTH {width}\n",
         f"static const int64_t start_ns = {vectors.start_ns};",
@@ -212,8 +210,8 @@ _SHOWN = """\
     int shown = 0;
     for (int sensor = 0; sensor < NAME_SENSORS; sensor++) {
         printf("%s: %d accepted, %d rejected%s\\n", sensors[sensor], accepted[sensor], rejected[sensor],
-               accepted[sensor] == 0                     ? ": the log does not show it"
-               : gated[sensor] && rejected[sensor] == 0 ? ": the log does not show its gate"
+               accepted[sensor] == 0                     ? ": the log does not test it"
+               : gated[sensor] && rejected[sensor] == 0 ? ": the log does not test its gate"
                                                          : "");
         shown += accepted[sensor];
     }
@@ -238,7 +236,7 @@ def test_text(made: CFilter) -> str:
     else:
         predict = "NAME_predict(&filter, event_time_ns[event], &NAME_as_tuned)"
         cases.append(
-            f"        case {CONTROL}: /* what drives it */\n"
+            f"        case {CONTROL}: /* the control */\n"
             "            for (int k = 0; k < NAME_CONTROLS; k++)\n"
             f"                if (!isnan(data[CONTROL_AT + k]))\n"
             "                    filter.control[k] = data[CONTROL_AT + k];\n"
@@ -271,9 +269,9 @@ def test_text(made: CFilter) -> str:
     names = ", ".join(f'"{name}"' for name, _ in made.sensors)
     text = filled(
         made,
-        """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
- * units of the number itself, or of one where that is larger, and what was accepted and rejected.
- * Returns 0 if that is within the first argument, which is 0 unless given, and there are estimates and
+        """/* Runs the filter over a recorded log; prints the largest difference from fuselog's own,
+ * relative to the number itself or, if larger, to one, and what was accepted and rejected.
+ * Returns 0 if the difference is within the first argument (default 0), and there are estimates and
  * accepted measurements. */
 #include "NAME.h"
 
@@ -322,7 +320,7 @@ static int is_definite(double A[NAME_TANGENT][NAME_TANGENT])
     return 1;
 }
 
-/* Says from when on the covariance, which fuselog's own filter has, is none any more. */
+/* Prints when the covariance stops being positive definite, unlike that of fuselog's filter. */
 static int lost(int event)
 {
     printf("event %d, after %.3f s: the covariance is no longer positive definite\\n", event,

@@ -119,14 +119,14 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
     _, program = shorthand(name)
     if not program:
         raise BadInput(
-            f"-e {name}: a golden states its estimators; give a program to check in place of one, as "
-            "lib:PATH, or add --update"
+            f"-e {name}: a golden states its estimators; give a program to check in place of one, such "
+            "as lib:PATH, or add --update"
         )
     stored = golden["settings"]["estimators"]
     if len(stored) != 1:
         raise BadInput(
-            f"-e {name}: the golden has {len(stored)} estimators; give one of the filter alone, as "
-            "--update -e ekf writes it"
+            f"-e {name}: the golden has {len(stored)} estimators; give a golden with this filter only, "
+            "as --update -e ekf writes it"
         )
     [(label, settings)] = stored.items()
     found = description_of_library(label, program).digest if program["kind"] == "lib" else ""
@@ -134,8 +134,9 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
         _, made = _made("filter", label, settings, run, DOUBLE)
         if found not in (made.digest, made._replace(precision=SINGLE).digest):
             raise BadInput(
-                f"{program['path']}: was deployed from another filter ({found}) than the golden's "
-                f"{label} is in {run.name} ({made.digest}); deploy that one, with the same settings"
+                f"{program['path']}: was deployed from a different filter ({found}) than {label} in "
+                f"{run.name} ({made.digest}), which the golden has; deploy that filter, with the same "
+                "settings"
             )
     return {label: program}
 
@@ -161,7 +162,7 @@ def _without_clash(made: CFilter, reading: Callable[[], Reading] | None) -> CFil
 
 def _check_empty(folder: Path) -> None:
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise BadInput(f"{folder}: is not empty; give another folder with -o, or empty it yourself")
+        raise BadInput(f"{folder}: the folder is not empty; give another one with -o, or empty it")
 
 
 def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, Filter, str]:
@@ -173,21 +174,21 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
     [first, *others] = found
     filtering = getattr(getattr(first, "run", None), "__self__", None)
     if not isinstance(first, Recursive) or type(filtering) is not Filter:
-        raise BadInput(f"estimator {label}: is no filter that can be written as C; give -e {DEPLOYABLE}")
+        raise BadInput(f"estimator {label}: this estimator cannot be written as C; give -e {DEPLOYABLE}")
     kind = KINDS.get(filtering.method.steps)
     if kind is None or filtering.is_random:
-        why = "draws its samples anew for every step" if kind else "cannot be written as C"
+        why = "draws new samples in every step" if kind else "cannot be written as C"
         raise BadInput(f"estimator {label}: {name} {why}; give -e {DEPLOYABLE}")
     if others:
         several = ", ".join(each.name for each in found)
         raise BadInput(
-            f"{run.name}: {several}: the log has several that fit; cut it to the topics of one first"
+            f"{run.name}: {several}: several estimators fit the log; cut it to the topics of one first"
         )
     if filtering.parameters.every_s is not None:
-        raise BadInput(f"estimator {label}: every_s: predict when you want an estimate; leave it out")
+        raise BadInput(f"estimator {label}: every_s: C predicts whenever you call it; remove it")
     if filtering.delays_ns.any():
         raise BadInput(
-            f"estimator {label}: a message was measured before its stamp (delay); subtract that on the "
-            "robot, and set the delay to 0"
+            f"estimator {label}: messages of a sensor are delayed; subtract the delay from their stamps "
+            "on the robot, and set the delay to 0"
         )
     return first, filtering, kind

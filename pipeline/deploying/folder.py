@@ -26,7 +26,7 @@ def cmake_text(made: CFilter) -> str:
         "if(NOT CMAKE_BUILD_TYPE)",
         "  set(CMAKE_BUILD_TYPE Release)",
         "endif()",
-        "add_compile_options(-ffp-contract=off)  # a fused multiply-add rounds otherwise than fuselog",
+        "add_compile_options(-ffp-contract=off)  # a fused multiply-add rounds differently from fuselog",
         f"add_library({name} STATIC {name}.c)",
         f"target_link_libraries({name} m)",
         f"add_executable(test_{name} test_{name}.c)",
@@ -49,26 +49,26 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
     table = "\n".join(f"| {name} | {' | '.join(map(str, cost))} |" for name, cost in rows.items())
     memory = certificate.memory
     bytes_in_words = (
-        "No GCC was there to tell the bytes of code and stack."
+        "Without GCC, the sizes of code and stack are unknown."
         if memory is None
         else f"{memory.compiler}, {' '.join(OPTIONS)}: {memory.text} bytes of code and\nconstants, "
         f"and {memory.stack} bytes of stack in the deepest chain of calls, without those of libm's own."
     )
     of = "F L and H L of the\nfactor L" if made.is_root else "F P F', P H' and\nH P H'"
     saved = (
-        f" Of the products {of}, {certificate.sparse} flops are left of "
-        f"{certificate.dense}: the others have known zeros and ones."
+        f" The products {of} take {certificate.sparse} flops instead of {certificate.dense}, because "
+        "known zeros and ones are skipped."
         if certificate.dense
         else ""
     )
-    iterated = f", and all {ITERATIONS} iterates of an update" if made.steps.is_iterated else ""
+    iterated = f", and all {ITERATIONS} iterations of an update" if made.steps.is_iterated else ""
     bent = any(each is not None and each.recentre is not None for each in made.steps.sampled)
     iterated += f",\nand all {MEANS} rounds to a mean of angles or orientations" if bent else ""
     return f"""| function | flops | square roots | other calls of libm |
 |---|---|---|---|
 {table}
 
-At most: both sides of every condition count{iterated}.{saved}
+These are upper bounds: both sides of every condition count{iterated}.{saved}
 
 {bytes_in_words}"""
 
@@ -79,30 +79,30 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
         return ""
     single = certificate.single
     if single is None:
-        sentence = f"No GCC was there to run the test; `test_{made.name}` says what it costs."
+        sentence = f"The test was not run for lack of GCC; `test_{made.name}` shows the effect."
     elif single.lost_event is not None:
         lost = lost_sentence(single._asdict(), is_root=made.is_root)
         sentence = f"{lost[0].upper()}{lost[1:]}."
     else:
         sentence = (
-            f"Over the first {single.estimates} estimates of {log} means and covariances are within "
-            f"{single.furthest:.1g} of those in double precision, in units of the state or, of larger "
-            "numbers, as a share of them."
+            f"Over the first {single.estimates} estimates of {log}, means and covariances are within "
+            f"{single.furthest:.1g} of those in double precision; larger numbers than one, relative to "
+            "the number."
         )
     more = (
-        "What the libraries of both precisions differ in over whole logs, with intervals, "
-        "`fuselog compare LOG ... -e lib:A.so -e lib:B.so` tells."
+        "To compare libraries of both precisions over whole logs, with intervals, use "
+        "`fuselog compare LOG ... -e lib:A.so -e lib:B.so`."
     )
     text = fill(f"{sentence} {more}", 100, break_on_hyphens=False, break_long_words=False)
-    return f"\n## What single precision costs\n\n{text}\n"
+    return f"\n## Effect of single precision\n\n{text}\n"
 
 
 def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
     """Describe from when on single precision loses the covariance, and what to use instead."""
-    mend = "" if is_root else "; take the square-root form, sqrt:ekf or sqrt:ukf"
+    mend = "" if is_root else "; use a square-root form, sqrt:ekf or sqrt:ukf"
     return (
         f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
-        f"covariance in single precision is no longer positive definite, where that in double is{mend}"
+        f"covariance in single precision is no longer positive definite, unlike in double{mend}"
     )
 
 
@@ -123,11 +123,11 @@ def _loop(made: CFilter) -> str:
         f"    outcome = {name}_predict(&filter, message.time_ns{control}, &{name}_as_tuned);",
     ]
     if driven:
-        lines.append("    if (message.is_control) { /* it drives the filter from here on */")
+        lines.append("    if (message.is_control) { /* it holds from here on */")
         lines += [*(f"        {each}" for each in driven), "    }"]
     for each, _ in made.sensors[:1]:
         lines += [
-            f"    if (outcome == {upper}_WELL && message.is_{each}) {{ /* and so for each sensor */",
+            f"    if (outcome == {upper}_WELL && message.is_{each}) {{ /* the same for each sensor */",
             f"        outcome = {name}_update_{each}(&filter, message.data, &{name}_as_tuned,",
             "            &innovation);",
             "    }",
@@ -147,7 +147,7 @@ def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
     back = (
         f"fuselog cannot replay it: {why_not}."
         if why_not
-        else f"""fuselog replays it, beside its own filter (`fuselog_filter.h` is the interface):
+        else f"""fuselog can replay it next to its own filter (`fuselog_filter.h` is the interface):
 
 ```
 cc -std=c99 -O2 -ffp-contract=off -shared -fPIC {name}_replay.c {name}.c -lm -o {name}.so
@@ -164,19 +164,19 @@ C99 and libm: no heap, no recursion, no arrays of varying length. The filter is 
 {_loop(made)}
 ```
 
-| function | message | `data`, NAN where a component is missing |
+| function | message | `data`, NAN if a component is missing |
 |---|---|---|
 {chr(10).join(updates)}
 
-An update is at the filter's time, so predict to a message's stamp first. Every function returns a
+An update applies at the filter's time, so predict to a message's stamp first. Every function returns a
 `{name}_outcome`:
 
 | outcome | meaning |
 |---|---|
 {codes}
 
-`innovation.is_accepted` is 1 if the measurement changed the state, and 0 with every outcome but
-`{upper}_WELL`. Angles of the state are not wrapped. The numbers that it was tuned with are in
+`innovation.is_accepted` is 1 if the measurement changed the state, and 0 with every outcome except
+`{upper}_WELL`. Angles of the state are not wrapped. The parameters that it was tuned with are in
 `{name}_as_tuned`; copy it to change them.
 
 ## Test
@@ -186,13 +186,13 @@ cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
 ./test_{name}{" 0.01" if made.precision.ending else ""}
 ```
 
-It runs over the first messages of {log} from the filter's start on, with an outlier for every gate. It
-fails without estimates or accepted measurements, and prints how many measurements of each sensor were
-accepted and rejected, and which sensor or gate the log does not show. It also prints how far it
-is from fuselog's own filter: nothing at all with the same libm, in double precision and without fused
+It runs over the first messages of {log} from the filter's start, with an outlier for every gate. It
+fails without estimates or accepted measurements. It prints how many measurements of each sensor were
+accepted and rejected, which sensors and gates the log does not test, and the largest difference from
+fuselog's own filter. The difference is zero with the same libm, in double precision and without fused
 multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
-libnewlib-arm-none-eabi and qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how
-many instructions a message takes as well. QEMU knows no cycles.
+libnewlib-arm-none-eabi and qemu-system-arm, the test also runs on an emulated Cortex-M4F and prints the
+number of instructions per message. QEMU does not count cycles.
 
 ```
 {chr(10).join(target_lines(name, argument="0.01" if made.precision.ending else "1e-12"))}
@@ -200,7 +200,7 @@ many instructions a message takes as well. QEMU knows no cycles.
 
 {back}
 
-## What it costs
+## Cost
 
 {_costs(made, certificate)}
 {_single(made, certificate, log)}"""

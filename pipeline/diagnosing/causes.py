@@ -80,7 +80,7 @@ class Cause(NamedTuple):
         if not np.isnan(self.ends).any():
             return words
         without = re.sub(r" \(nan[^)]*\)", "", words)
-        return f"{without} (no interval: the fit of all causes together did not converge)"
+        return f"{without} (no interval: the joint fit of all causes did not converge)"
 
     @property
     def numbers(self) -> list[Interval]:
@@ -96,15 +96,15 @@ class Cause(NamedTuple):
     def words(self) -> str:
         """Return the fault, its size, the alternatives and the gain."""
         or_else = "".join(
-            f"; this log does not determine it: as likely, {each.statement}"
+            f"; this log does not determine it, equally likely: {each.statement}"
             if each.hypothesis is self.hypothesis
-            else f"; or else, which this log does not tell from it, {each.statement}"
+            else f"; or, which this log does not distinguish from it, {each.statement}"
             for each in self.others
         )
         first, second = self.of_halves
         half, worst = ("first", first) if first < second else ("second", second)
-        but = f"; but over the {half} half of the log it loses {number(-worst, 4)}: there it is not so"
-        gained = f"; with this undone the log-likelihood gains {number(self.gain, 4)}"
+        but = f"; but it loses {number(-worst, 4)} over the {half} half of the log, so it is not valid"
+        gained = f"; correcting this increases the log-likelihood by {number(self.gain, 4)}"
         return f"{self.statement}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 
 

@@ -36,8 +36,8 @@ def diagnose_log(
     log, *others = logs
     if others:
         raise BadInput(
-            f"{len(logs)} logs: one log is diagnosed at a time; give each by itself, and all of them to "
-            "fuselog tune"
+            f"{len(logs)} logs: give one log; diagnose takes one at a time, and fuselog tune takes all "
+            "of them together"
         )
     check_outputs(out, save, {"log": [log], "settings": list(filter(None, [settings_file]))})
     alterations, own = split_texts(settings)
@@ -47,11 +47,11 @@ def diagnose_log(
     elif label is not None:
         [(label, given)] = settings_of_estimators([label], own, settings_file, model=model).items()
     elif settings_file is not None:
-        raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
+        raise BadInput(f"--settings {settings_file}: settings are for one estimator; name it with -e")
     else:
         given = parse_settings(own) | ({} if model is None else {"model": model})
     with status() as show:
-        show("replaying with one fault undone after another")
+        show("replaying with each fault corrected in turn")
         found = diagnose(
             LogSource(opened),
             label,
@@ -81,7 +81,7 @@ def diagnose_log(
         )
         return
     print_metrics(metrics, judge.bounds)
-    columns = ("component", "mean", "mean square", "beyond 3 sigma", "next", "white by chance")
+    columns = ("component", "mean", "mean square", "beyond 3 sigma", "autocorrelation", "p if white")
     print_table(
         columns,
         [

@@ -27,9 +27,9 @@ BIASED = 0.7
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
     """Yield errors that innovations do not show; causes that were found may explain them or not."""
-    mend = "let a bias be estimated, or see fuselog observability LOG"
+    mend = "estimate a bias as a state, or see fuselog observability LOG"
     if has_causes:
-        mend = "mend what is said above, and look whether it is still so"
+        mend = "fix the causes above first, then check again"
     metrics = done.judge.metrics
     for key, (_, high) in done.judge.bounds.items():
         _, quantity, case = split_metric(key)
@@ -41,9 +41,9 @@ def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Fin
                 _truth(case),
                 "",
                 value,
-                f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
-                f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
-                "the state follows",
+                f"{case or 'the estimate'}: NEES is {value:.3g} (consistent up to {high:.3g}), but NIS "
+                f"is only {nis:.3g} per component: the state follows an error that the innovations do "
+                "not show",
                 otherwise=mend,
             )
 
@@ -68,8 +68,8 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
             apart = np.abs(stream["position_m"][here, :2] - truth["state"][there][:, columns])
             if len(here) >= SAME * len(stream) and np.mean((apart < 1e-6).all(axis=1)) >= SAME:
                 sentences[topic] = (
-                    f"{topic} is what {used} says, which the filter used: it is no judge of errors and "
-                    "NEES; give a reference of its own"
+                    f"{topic} equals {used}, which the filter used: errors and NEES against it mean "
+                    "nothing; give an independent reference"
                 )
     return sentences
 
@@ -82,7 +82,7 @@ def unnamed(
     NIS covers all innovations, including those that a gate rejects; truths in `no_judges` do not count.
     Errors are correlated over a run, so that the mean of NEES has the interval of a single step.
     """
-    faults = f"none of {tried} faults that were tried explains it" if tried else "no fault was tried"
+    faults = f"none of the {tried} faults tried explains it" if tried else "no fault was tried"
     for topic, stream in innovations.items():
         case = split_topic(topic)[1]
         normalised = whitened(stream)
@@ -95,8 +95,8 @@ def unnamed(
                 if count
             )
             evidence = (
-                f"NIS per component is {squares.sum() / counts.sum():.3g} ({of_each}), where a "
-                f"consistent filter is within {low / counts.sum():.3g} and {high / counts.sum():.3g}"
+                f"NIS per component is {squares.sum() / counts.sum():.3g} ({of_each}), outside the "
+                f"range of a consistent filter, {low / counts.sum():.3g} to {high / counts.sum():.3g}"
             )
             yield _unnamed(topic, case, float(squares.sum() / counts.sum()), evidence, faults)
     metrics = done.judge.metrics
@@ -105,7 +105,7 @@ def unnamed(
         value = metrics[key]
         if quantity == "nees" and not low <= value <= high and _truth(case) not in no_judges:
             evidence = (
-                f"NEES is {value:.3g}, where a consistent filter is within {low:.3g} and {high:.3g}"
+                f"NEES is {value:.3g}, outside the range of a consistent filter, {low:.3g} to {high:.3g}"
             )
             yield _unnamed(_truth(case), case, value, evidence, faults)
 
@@ -155,7 +155,7 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
                 listed([each.name for each in some]),
                 max(each.times for each in some),
                 f"{case}: the innovations of {listed([each.name for each in some])} are {times} times "
-                f"{less} than their variances say (NIS is {nis}, if consistent {low:.3g} to "
+                f"{less} than their variances state (NIS is {nis}, consistent from {low:.3g} to "
                 f"{high:.3g}): {mend}",
             )
 
@@ -173,11 +173,11 @@ def _inconsistent(stream: Stream) -> Iterator[_Seen]:
             continue
         mean = float(np.nanmean(column))
         if abs(mean) > BIASED * max(np.sqrt(tested.mean_square), 1.0):
-            mend = f"on average they are {mean:.3g} standard deviations: it is biased"
+            mend = f"their mean is {mean:.3g} standard deviations: the sensor is biased"
         elif tested.mean_square < low:
             mend = f"{noise} is stated too large"
         elif tested.correlation[0] > tested.bound:
-            mend = "they hang together, so that it is late, or the process noise too small"
+            mend = "they are autocorrelated: the sensor is late, or the process noise is too small"
         else:
             mend = f"{noise} is stated too small"
         yield _Seen(name, tested.mean_square, low, high, mend)
@@ -226,8 +226,8 @@ def _unnamed(topic: str, case: str, value: float, evidence: str, faults: str) ->
         topic,
         "",
         value,
-        f"{case or 'the estimate'}: something is wrong that I cannot name: {evidence} in 999 of 1,000 "
-        f"logs, and {faults}",
+        f"{case or 'the estimate'}: something is wrong, but the cause is unknown: {evidence} (in 999 of "
+        f"1,000 logs); {faults}",
     )
 
 

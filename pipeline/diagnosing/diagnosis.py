@@ -111,7 +111,8 @@ class Diagnosis:
         """Return the numbered sentences, or a sentence that nothing was found."""
         if not self.sentences:
             why = (
-                f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
+                f"none of {self.hypotheses} faults reaches the gain in log-likelihood needed, "
+                f"{self.least_gain:.3g}"
             )
             return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]
         return [f"{number}. {each.sentence}" for number, each in enumerate(self.sentences, start=1)]
@@ -246,8 +247,8 @@ def diagnose(
     sources = sources_of(log, alterations)
     if len(sources) > 1:
         raise BadInput(
-            f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
-            "The table `runs` of a replay shows which run is worst, and tune takes several logs"
+            f"{len(sources)} logs: give one log, such as {sources[0].name}; diagnose takes one at a "
+            "time. The table `runs` of a replay shows which run is worst, and tune takes several logs"
         )
     labels = [label for label in recorded_estimators(sources[0]) if estimator in (None, label)]
     if labels:
@@ -313,11 +314,11 @@ def _without_likelihood(label: str, settings: Mapping[str, Any], innovations: Ou
     if innovations.state("log_likelihood") and any(
         np.isneginf(each["log_likelihood"]).any() for each in innovations.values()
     ):
-        return f"{label} diverged: its log-likelihood is -inf, so that no fault was tried"
+        return f"{label} diverged: its log-likelihood is -inf, so no fault was tried"
     mend = for_likelihood(settings)
     return (
-        f"{label} states no likelihood of its innovations: faults are named by unusual measurements "
-        f"alone{'; ' if mend else ''}{mend}"
+        f"{label} states no likelihood of its innovations: faults are only found by unusual "
+        f"measurements{'; ' if mend else ''}{mend}"
     )
 
 
@@ -333,15 +334,15 @@ def _of_recorded(
     """
     label, *others = labels
     if others:
-        raise BadInput(f"{source.name}: has {', '.join(labels)}; name the one to diagnose with -e")
+        raise BadInput(f"{source.name}: has {', '.join(labels)}; choose one with -e")
     if settings:
         raise BadInput(
-            f"--set {next(iter(settings))}: {label} was recorded and takes no settings; leave it out"
+            f"--set {next(iter(settings))}: {label} was recorded and takes no settings; remove them"
         )
     done = recorded(source, label, gap_limit_s)
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
-        raise BadInput(f"{source.name}: has no innovations of {label}; a diagnosis needs them")
+        raise BadInput(f"{source.name}: has no innovations of {label}, which a diagnosis needs")
     sensed = [topic for topic in source.topics if is_sensed(source, topic)]
     seen = of_log(source, sensed)
     sentences = [
@@ -350,7 +351,9 @@ def _of_recorded(
         *of_innovations(innovations, None, source.epoch_ns, has_outliers=False),
         *unseen_errors(done, label, has_causes=False),
     ]
-    note = f"{label} was recorded: no fault can be undone and tried; what its innovations say is said"
+    note = (
+        f"{label} was recorded, so no fault can be corrected and tried: only its innovations are judged"
+    )
     return Diagnosis(
         label,
         done,
@@ -385,7 +388,7 @@ def _followed(
         done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
         if done.failures:
             why = next((f": {each.sentence}" for each in of_log(source, source.topics)), "")
-            raise BadInput(f"{done.failures[0]}; solve that first{why}")
+            raise BadInput(f"{done.failures[0]}; fix this first{why}")
         return _Followed(source, done)
 
     try:
@@ -397,7 +400,7 @@ def _followed(
         trying = Trying(label, alterations_of(source), is_own=False)
         mends = [trying.over(Advice.of(each.setting)) for each in mended]
         settings_given = " ".join(f"--set {each.setting}" for each in mends)
-        note = f"all else is said of the log with {settings_given}, since as it is: {error}"
+        note = f"everything else is about the log with {settings_given}, because without it: {error}"
         with suppress(BadInput):
             other = alter(source, {each.key: each.value for each in mends})
             return replayed(other)._replace(mended=mended, notes=[note])
@@ -416,7 +419,7 @@ def _asked(
             if label not in stated:
                 raise BadInput(f"{source.name}: no estimates of {label}; {choices(label, stated)}")
         if len(labels) != 1:
-            raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
+            raise BadInput(f"{source.name}: has {', '.join(stated)}; choose one with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
         chosen = of_file({labels[0]: own})
         refuse_programs(chosen, source.name)
@@ -425,5 +428,5 @@ def _asked(
         raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)
     if len(chosen) > 1:
-        raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
+        raise BadInput(f"{', '.join(chosen)}: give one estimator; only one can be diagnosed at a time")
     return source, chosen

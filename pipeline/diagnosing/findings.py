@@ -132,21 +132,21 @@ def of_innovations(
         share = float(np.mean(~is_in)) if len(stream) else 0.0
         of_all, reopened, opened = f"{number(100.0 * share, 2)} % of the measurements", "", ""
         if gate is not None:
-            of_all += f", where {100.0 * (1.0 - gate):.2g} % are expected"
+            of_all += f" ({100.0 * (1.0 - gate):.2g} % expected)"
             reopened = "--set gate_probability=1, or gate_reopens_s=1"
-            opened = "--set gate_probability=1 until the cause is mended"
+            opened = "--set gate_probability=1 until the cause is fixed"
         locked_out = [] if in_stretches else _long_runs(~is_in, LOCKED_OUT)
         if locked_out:
             begin, end = locked_out[0]
-            more = f" and {_times(len(locked_out) - 1)} again" if len(locked_out) > 1 else ""
+            more = f" and {_times(len(locked_out) - 1)} more" if len(locked_out) > 1 else ""
             yield Finding(
                 "gate",
                 topic,
                 "",
                 share,
-                f"{case}: the gate keeps out all {end - begin} measurements from "
+                f"{case}: the gate rejects all {end - begin} measurements from "
                 f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}{more}, "
-                f"{of_all}: also what would correct the filter",
+                f"{of_all}, including those that would correct the filter",
                 otherwise=reopened,
                 time_ns=int(times_ns[begin]),
             )
@@ -156,7 +156,7 @@ def of_innovations(
                 topic,
                 "",
                 share,
-                f"{case}: the gate keeps out {of_all}, and they are no outliers",
+                f"{case}: the gate rejects {of_all}, although they are not outliers",
                 otherwise=opened,
             )
         yield from _divergence(topic, case, stream, epoch_ns)
@@ -177,8 +177,8 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
         topic,
         "",
         found.nis_per_component,
-        f"{case}: diverges at {_at(found.time_ns, epoch_ns)}, after {about}: NIS per component is "
-        f"{found.nis_per_component:.3g} from there on, and was as expected before",
+        f"{case}: diverges at {_at(found.time_ns, epoch_ns)}, after {about}: from there on, NIS per "
+        f"component is {found.nis_per_component:.3g}; before, it was as expected",
         time_ns=found.time_ns,
     )
 
@@ -208,8 +208,8 @@ def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
                     str(place),
                     share,
                     f"{split_topic(topic)[1] or topic}: the variance of component {place} is "
-                    f"{distinct[0]:.3g} in {100.0 * share:.2g} % of the estimates, and never smaller: a "
-                    "floor that no measurement gets below",
+                    f"{distinct[0]:.3g} in {100.0 * share:.2g} % of the estimates and never smaller: "
+                    "measurements do not reduce it below a floor",
                 )
 
 

@@ -82,12 +82,14 @@ def _mended(logs: list[Path], label: str, own: dict[str, Any], first: Finding, m
         return ""
     told = f"With that, over {count(len(logs), 'run')}: {'; '.join(effects)}."
     if max(left, default=0.0) > STILL_WRONG:
-        told += f" That is still {number(max(left), 2)} times what is right: it is not the only cause."
+        told += (
+            f" That is still {number(max(left), 2)} times the expected value: there are other causes."
+        )
     return told
 
 
 def _change(key: str, row: Mapping[Any, Any]) -> str:
     words, second = quantity(key), float(row["second_mean"])
     own = scale(words.unit, second)
-    aim = f", {number(float(row['aim']))} is right" if key.startswith("n") else ""
+    aim = f", expected {number(float(row['aim']))}" if key.startswith("n") else ""
     return f"{words.name} {own.with_unit(second)}{aim}"

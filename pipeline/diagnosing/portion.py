@@ -54,10 +54,10 @@ def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str,
     """Return the error for an estimator that gives no innovations on a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
-    mend = for_likelihood(settings) or "give a filter of the same model, such as -e ekf"
+    mend = for_likelihood(settings) or "use a filter of the same model, such as -e ekf"
     if topic:
-        mend = f"it does not take {topic}; with {setting} it does"
-    return BadInput(f"{name}: {label} gives no innovations, and a diagnosis needs them; {mend}")
+        mend = f"it does not use {topic}, unless you give {setting}"
+    return BadInput(f"{name}: {label} gives no innovations, which a diagnosis needs; {mend}")
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
@@ -101,8 +101,9 @@ def first_part(
             streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
         count = sum(source.topics[topic].messages for topic in streamed)
         note = (
-            f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
-            f"{MOST_MESSAGES} of {count} messages, and tried on the rest; for another part: fuselog cut"
+            f"causes were searched in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s "
+            f"({MOST_MESSAGES} of {count} messages) and tested on the rest; use fuselog cut to diagnose "
+            "another part"
         )
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     part = MemorySource(streams, run, source.name)
@@ -135,7 +136,7 @@ def on_the_rest(
         return ""
     if gain > 0.0:
         return f", and {number(gain, 4)} over the rest of the log"
-    return f"; but over the rest of the log it loses {number(-gain, 4)}: there it is not so"
+    return f"; but over the rest of the log it loses {number(-gain, 4)}: it is not valid there"
 
 
 def _likelihood(

@@ -118,7 +118,7 @@ def marks_of(
 def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
     """List findings in the log that no sentence has: hints, and those that a cause names differently."""
     return [
-        f"hint: {each.sentence}" if each.severity == "hint" else f"the log alone says: {each.evidence}"
+        f"hint: {each.sentence}" if each.severity == "hint" else f"the log itself shows: {each.evidence}"
         for each in of_log
         if each not in sentences
     ]
@@ -127,8 +127,8 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
     """List what one should know about a diagnosis: what is in doubt, not judged, or left out."""
     notes = [
-        "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
-        f"than chance: {each.words}"
+        "in doubt, like everything with a smaller gain, because the parts of the log disagree about the "
+        f"number by more than chance: {each.words}"
         for each in in_doubt
     ]
     left_out = Rejections().plus(source.rejections for source in done.logs)
@@ -136,12 +136,12 @@ def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Caus
     notes += done.judge.components_without_truth
     if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
         notes.append(
-            "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"
+            "no truth: errors and NEES are missing, and faults that innovations do not show stay hidden"
         )
     elif len(done.logs) == 1:
-        notes.append("one run: the interval of NEES is that of a single step; give more to fuselog run")
+        notes.append("one run: NEES has the interval of a single step; give more runs to fuselog run")
     if len(sentences) > MOST_SENTENCES:
-        notes.append(f"{len(sentences) - MOST_SENTENCES} more were found; mend these first")
+        notes.append(f"{len(sentences) - MOST_SENTENCES} more findings; fix these first")
     return notes
 
 
@@ -159,10 +159,10 @@ def _finding(
     mend = of.mend(cause.value)
     found = CauseFinding(of.kind, of.topic, of.part, cause.numbers[0].value, words, cause=cause)
     if mend is None or trying.is_set(mend):
-        return replace(found, evidence=f"{words}; the gate that is set keeps these out")
+        return replace(found, evidence=f"{words}; the gate that is set rejects these")
     advice = trying.over(mend)
     words += rest(mend.settings) if rest is not None else ""
     if before and of.kind in CONSEQUENCES:
-        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].where}"
+        words += f"; this may be a consequence of the faulty stamps of {before[0].where}"
     tried = f"try {trying.words(advice)}"
     return replace(found, evidence=words, setting=advice.setting, otherwise=tried)

@@ -242,7 +242,7 @@ def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
     }
     if unknown := [each for each in names if each not in known]:
         raise BadInput(
-            f"options.faults: {unknown[0]!r} is no fault of study diagnosis; it has {', '.join(known)}"
+            f"options.faults: the diagnosis study has no fault {unknown[0]!r}; it has {', '.join(known)}"
         )
     return [where for name, where in known.items() if not names or name in names]
 
@@ -342,13 +342,13 @@ def _chart(faults: pd.DataFrame) -> Chart:
         panel.series.append(curve(str(scenario), places, rows["first_share"], "line+markers"))
     panel.series.append(level("80 %", list(range(len(names))), FIRST))
     return Chart(
-        title="faults that are named first, of those worth 10 in log-likelihood", panels=[panel]
+        title="faults named first, of those that gain at least 10 in log-likelihood", panels=[panel]
     )
 
 
 DIAGNOSIS = Study(
-    "how often a diagnosis names the fault that was put into a log",
+    "how often a diagnosis names the fault planted in a log",
     study,
     options=Options,
-    runs="runs of each fault, and at most as many of each cell of the battery",
+    runs="runs per fault, and at most as many per cell of the benchmark",
 )

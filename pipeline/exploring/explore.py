@@ -46,7 +46,7 @@ def explore(
     except ModuleNotFoundError as error:
         if error.name != "bokeh":
             raise
-        raise BadInput('explore draws with Bokeh: pip install "fuselog[explore]"') from None
+        raise BadInput('explore needs Bokeh: pip install "fuselog[explore]"') from None
     explorer = Explorer(session)
     if show and not viewer.in_notebook():
         webbrowser.open(explorer.url)

@@ -55,7 +55,7 @@ def head_html(
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
-        verdict = one.verdicts.get(case, Summary("failed", "It estimated nothing.", ""))
+        verdict = one.verdicts.get(case, Summary("failed", "It gave no estimates.", ""))
         parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
         if case in one.cases:
             parts.append(_numbers_html(one, played.get(PINNED), case))
@@ -63,7 +63,7 @@ def head_html(
         if one.seconds > SLOW_S:
             parts.append(f"<p>One replay takes {one.seconds:.1f} s.</p>")
     if case in played[0].cases and len(played[0].cases[case].time_s) > LINES:
-        parts.append("<p>So long a log is drawn by the least and the greatest value of each span.</p>")
+        parts.append("<p>This long log is drawn by the minimum and maximum of each span.</p>")
     return "".join(parts)
 
 
@@ -75,7 +75,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
             sigma = float(case.sigma[-1, case.components.index(name)])
             value = slider.words(float(case.beside[name][-1]))
             found.append(f"Estimated in the state: {slider.title} is {value} at the end, "
-                         f"give or take {slider.words(1.96 * sigma)} (95 %).")  # fmt: skip
+                         f"±{slider.words(1.96 * sigma)} (95 %).")  # fmt: skip
     return found
 
 

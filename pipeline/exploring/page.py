@@ -259,7 +259,7 @@ class Page:
         except BadInput as error:
             self._tell(str(error))
             return
-        self._tell(*([] if names else ["Nothing is estimated in the state any more."]))
+        self._tell(*([] if names else ["No parameter is estimated in the state now."]))
         self._label(self._widgets[name][0])
         self._replay()
 
@@ -401,7 +401,7 @@ class Page:
         self._sentences.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
 
     def _say_error(self, error: Exception) -> None:
-        message = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
+        message = str(error) if isinstance(error, BadInput) else f"this action failed: {error!r}"
         self._later(lambda: self._tell(message))
 
     def _later(self, act: Callable[[], object]) -> None:

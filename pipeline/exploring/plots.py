@@ -242,7 +242,7 @@ def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
         plot.fill(of, "band", t=t[rows], low=middle - sigma[rows], high=middle + sigma[rows])
         if of == 0:
             plot.fill(0, "outside", t=[], foot=[])
-            plot.say(f"{'Estimate' if is_known else 'Errors'} of {name}; tinted: 95 %, as it claims")
+            plot.say(f"{'Estimate' if is_known else 'Errors'} of {name}; tinted: its 95 % interval")
         return
     place = errors.components.index(component)
     error, t = errors.error[:, place], errors.elapsed_s
@@ -351,7 +351,7 @@ def show_likelihood(
     near = likelihoods[max(best - ABOUT_PEAK, 0) : best + ABOUT_PEAK + 1]
     below = 1.3 * max(likelihoods[best] - min(there, *near), LEAST_DROP)
     plot.figure.y_range.update(start=likelihoods[best] - below, end=likelihoods[best] + 0.15 * below)
-    plot.say(f"Likelihood over {slider.title}; greatest near {slider.words(points[best][0])}")
+    plot.say(f"Likelihood over {slider.title}; largest near {slider.words(points[best][0])}")
     plot.figure.xaxis.major_label_overrides = {each: slider.words(slider.value(each)) for each in TICKS}
 
 
@@ -402,4 +402,4 @@ def _show_foot(plot: Plot, of: int | str, title: str, time_s: Floats, outside: A
         plot.fill(0, "outside", t=t, foot=np.full(len(t), 0.02))
         share = 100.0 * float(np.mean(outside)) if len(outside) else 0.0
         shown = f"{share:.0f}" if share >= 10.0 or not share else f"{share:.1f}"
-        plot.say(f"{title}: outside {shown} %; 5 % is right")
+        plot.say(f"{title}: outside {shown} %; 5 % expected")

@@ -127,7 +127,7 @@ class Session:
         """
         for label in self.filters:
             if names and not self._takes(label, "estimate"):
-                raise BadInput(f"{label}: has no model that says what can be estimated in the state")
+                raise BadInput(f"{label}: no model defines what can be estimated in the state")
         sigmas = {name: 0.25 * (self.slider(name).high - self.slider(name).low) for name in names}
         return Session(self.source, self.filters, self.gap_limit_s, sigmas)
 
@@ -221,7 +221,7 @@ class Session:
         for label in self.filters:
             settings = self.settings(label, values)
             if not isinstance(settings.get("kind", label), str):
-                raise BadInput(f"{label}: is an estimator of your own; a file cannot hold it")
+                raise BadInput(f"{label}: an estimator defined in Python cannot be written to a file")
             tables[label] = {
                 name: each for name, each in settings.items() if (name, each) != ("kind", label)
             }
@@ -261,7 +261,7 @@ class Session:
 def _set_to(label: str, value: Any) -> str:
     """Write a setting as `--set` takes it: texts, numbers and lists of JSON are valid TOML."""
     if isinstance(value, Estimator):
-        raise BadInput(f"{label}: is an estimator of your own; a command cannot name it")
+        raise BadInput(f"{label}: an estimator defined in Python cannot be named in a command")
     return json.dumps(value)
 
 
@@ -286,11 +286,11 @@ def open_session(
     sources = sources_of(log, alterations)
     if len(sources) > 1:
         raise BadInput(
-            f"{len(sources)} logs: one is explored at a time; give one, such as {sources[0].name}"
+            f"{len(sources)} logs: give one log, such as {sources[0].name}; explore takes one at a time"
         )
     chosen = settings_of(estimators)
     if len(chosen) > MOST:
         raise BadInput(
-            f"{', '.join(chosen)}: at most {MOST} filters are explored at a time; leave some out"
+            f"{', '.join(chosen)}: explore takes at most {MOST} filters at a time; remove some"
         )
     return Session(sources[0], with_settings(chosen, allowed(given)) if given else chosen, gap_limit_s)

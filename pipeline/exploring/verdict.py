@@ -41,9 +41,9 @@ def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -
     if by is None or by.verdict == Consistency.CONSISTENT or has_other_cause:
         if own:
             return Summary("doubtful", "Doubtful.", own[0].sentence)
-        return Summary("good", "Nothing speaks against it.", _evidence(case))
+        return Summary("good", "No problem found.", _evidence(case))
     times = "times what" if by.verdict == Consistency.OVERCONFIDENT else "of what"
-    detail = f"Its {by.name} are {by.factor:.2g} {times} it claims."
+    detail = f"Its {by.name} are {by.factor:.2g} {times} it states."
     return Summary("doubtful", f"{by.verdict.capitalize()}.", detail)
 
 
@@ -73,7 +73,7 @@ def _evidence(case: Case) -> str:
     words = {"innovations": "NIS is {:.2f} per component", "errors": "NEES is {:.2f} for {:.0f}"}
     facts = [words[each.name].format(each.found.value, each.aim) for each in _squares_of(case)[::-1]]
     within = "within its interval" if len(facts) == 1 else "within their intervals"
-    return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge by."
+    return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge it by."
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

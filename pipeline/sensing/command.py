@@ -27,7 +27,7 @@ def show_noise(
     if sentences:
         if out is not None or topics or sheet or taus:
             raise BadInput(
-                f"{log}: holds another tool's numbers and no samples; give it without options"
+                f"{log}: this file has another tool's numbers and no samples; give it without options"
             )
         if as_json:
             print_json({"path": str(log), "notes": sentences})
@@ -37,7 +37,7 @@ def show_noise(
         return
     check_outputs(out, None, {"log": [log]})
     with status() as show:
-        show("searching for the likeliest noise of each column")
+        show("fitting the noise of each column")
         found = noise(LogSource(open_log(log, recover=recover)), topics, sheet=sheet, taus=taus)
     written = [str(found.save(out).folder)] if out is not None else []
     table = found.table

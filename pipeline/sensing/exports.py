@@ -62,7 +62,7 @@ def kalibr(found: Densities) -> str:
     force, rate = found.unit
     return found.warned(
         "#",
-        "# continuous: Kalibr makes them discrete by update_rate; no factor is included\n"
+        "# continuous: Kalibr makes them discrete with update_rate; no factor is included\n"
         f"rostopic: {found.topic}\n"
         f"update_rate: {1 / force.step_s:.6g}  # Hz\n"
         f"accelerometer_noise_density: {force.white:.6g}  # N, m/s^2/sqrt(Hz)\n"
@@ -80,7 +80,7 @@ def px4(found: Densities) -> str:
     force_bias, rate_bias = (density.walk / _PX4_STEP_S**0.5 for density in found.unit)
     return found.warned(
         "#",
-        f"# discrete, for the filter's step of {_PX4_STEP_S:g} s (EKF2_PREDICT_US): over its root\n"
+        f"# discrete, for the filter's step of {_PX4_STEP_S:g} s (EKF2_PREDICT_US), over its root\n"
         f"EKF2_GYR_NOISE {rate:.6g}\n"
         f"EKF2_ACC_NOISE {force:.6g}\n"
         f"EKF2_GYR_B_NOISE {rate_bias:.6g}\n"
@@ -115,11 +115,11 @@ def robot_localization(found: Densities) -> str:
     turned, pushed = rate.white**2 / rate.step_s, force.white**2 / force.step_s
     return found.warned(
         "#",
-        "# process_noise_covariance is a variance per second of the state, K^2 of what it drifts by:\n"
-        "# it is of your robot's motion, never N^2 of a sensor. A sensor's variance is its message's:\n"
+        "# process_noise_covariance is a variance per second of the state, or K^2 of a drifting state:\n"
+        "# it describes your robot's motion, not N^2 of a sensor. Messages state a sensor's variance:\n"
         f"# angular_velocity_covariance {turned:.6g}  # (rad/s)^2, discrete\n"
         f"# linear_acceleration_covariance {pushed:.6g}  # (m/s^2)^2, discrete\n"
-        "# where you estimate a bias as a state, its process noise per second is\n"
+        "# if you estimate a bias as a state, its process noise per second is\n"
         f"# turn rate {rate.walk**2:.6g}, specific force {force.walk**2:.6g}\n",
     )
 

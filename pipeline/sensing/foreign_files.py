@@ -24,10 +24,10 @@ def explained(path: Path) -> list[str]:
         return [f"{path}: {each}" for each in _of_imu_utils(path, text)]
     if "accelerometer_noise_density" in text and "gyroscope_random_walk" in text:
         return [
-            f"{path}: is Kalibr's imu.yaml, as allan_variance_ros writes it: N in unit/sqrt(Hz) and K "
-            "in unit/s/sqrt(Hz), continuous; Kalibr makes them discrete by update_rate",
-            f"{path}: allan_variance_ros reads N off a line over fixed times up to 10 s and differences "
-            "neighbours of overlapping bins; it states no interval: give fuselog noise the recording",
+            f"{path}: a Kalibr imu.yaml as written by allan_variance_ros: N in unit/sqrt(Hz) and K "
+            "in unit/s/sqrt(Hz), continuous; Kalibr makes them discrete with update_rate",
+            f"{path}: allan_variance_ros reads N from a line over fixed times up to 10 s and "
+            "differences neighbouring bins that overlap, without an interval: use fuselog noise instead",
         ]
     if path.suffix == ".txt" and re.search(r"_(gyr|acc)_[xyzt]$", path.stem):
         what = (
@@ -35,33 +35,33 @@ def explained(path: Path) -> list[str]:
             if path.stem.endswith("t")
             else "an Allan deviation, of a gyro in deg/h"
         )
-        return [f"{path}: is a column of imu_utils: {what}; it states no interval"]
+        return [f"{path}: this is a column of imu_utils: {what}; it gives no interval"]
     return []
 
 
 def _of_imu_utils(path: Path, text: str) -> list[str]:
     sentences = [
-        "is of imu_utils; its gyr_n and acc_n are called rad/s/sqrt(Hz) in its README, and its code "
+        "this file is from imu_utils; its README gives gyr_n and acc_n in rad/s/sqrt(Hz), but its code "
         "writes sqrt(rate) times the Allan deviation at 1 s: a standard deviation per sample",
-        "its gyr_w and acc_w are the least of its curves (a bias instability), in the samples' unit: "
-        "they are no random walk, though used as one",
+        "its gyr_w and acc_w are the minimum of its curves (bias instability), in the samples' unit: "
+        "they are often used as a random walk, but are not one",
     ]
     average = re.search(rf"Gyr:.*?avg-axis:.*?gyr_n{_NUMBER}", text, re.DOTALL)
     read = _deviation_at_1_s(path)
     if average and read and (stated := _number(average[1])) > 0:
         factor = stated / read
         verdict = (
-            "is that very deviation: N in rad/s/sqrt(Hz), continuous"
+            "equals it: N in rad/s/sqrt(Hz), continuous"
             if 0.8 < factor < 1.25
-            else f"is {factor:.4g} times that, sqrt of a rate of {factor**2:.4g} Hz: divide by "
+            else f"is {factor:.4g} times this, the root of a rate of {factor**2:.4g} Hz: divide by "
             f"{factor:.4g} for N in rad/s/sqrt(Hz)"
         )
         sentences.append(
-            f"its curves beside it have {read:.6g} rad/s at 1 s, mean of the axes; gyr_n {stated:.6g} "
-            f"{verdict}"
+            f"the curves next to it give {read:.6g} rad/s at 1 s, the mean of the axes; gyr_n "
+            f"{stated:.6g} {verdict}"
         )
     else:
-        sentences.append("without its curves beside it nothing tells which convention these follow")
+        sentences.append("without its curve files, the convention of these numbers is unknown")
     return sentences
 
 

@@ -93,7 +93,7 @@ def parse_sheet(field: str, text: str) -> tuple[str, float]:
     found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s+(\S.*?)\s*(one-sided)?\s*", text)
     value = float(found[1]) if found else 0.0
     if found is None or not 0.0 < value < math.inf:
-        example = "expected a number and a unit, as '0.007 deg/s/sqrt(Hz)'"
+        example = "expected a number and a unit, such as '0.007 deg/s/sqrt(Hz)'"
         raise BadInput(f"--sheet {field}={text}: {example}")
     written = found[2].replace("°", "deg").replace("µ", "u")
     try:
@@ -106,12 +106,12 @@ def parse_sheet(field: str, text: str) -> tuple[str, float]:
         if here.powers == there.powers:
             return term, value * here.size / there.size / (math.sqrt(2) if found[3] else 1.0)
     wanted = " or ".join(of.format(own or "UNIT") for of in _STATED.values())
-    raise BadInput(f"--sheet {field}={text}: {written} is no {wanted}; give a unit of that kind")
+    raise BadInput(f"--sheet {field}={text}: {written} is not {wanted}; give a unit of that kind")
 
 
 def _one(sources: Sequence[Any]) -> Sequence[Any]:
     if len(sources) != 1:
-        raise BadInput(f"{len(sources)} logs: the noise of one log is looked at at a time")
+        raise BadInput(f"{len(sources)} logs: give one log; noise analyses one at a time")
     return sources
 
 
@@ -124,7 +124,7 @@ def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
             raise BadInput(f"{source.name}: has no topic {text}; {choices(text, list(source.topics))}")
         if name and name not in _numbers(source.empty(topic)):
             known = _numbers(source.empty(topic))
-            raise BadInput(f"{topic}: has no numbers {name}; {choices(name, known)}")
+            raise BadInput(f"{topic}: has no numeric field {name}; {choices(name, known)}")
         chosen.setdefault(topic, []).extend([name] if name else [])
     if wanted:
         return chosen
@@ -133,7 +133,7 @@ def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
     candidates = units or [topic for topic, names in usable.items() if names]
     if not candidates or (len(candidates) > 1 and not units):
         raise BadInput(
-            f"{source.name}: has no inertial unit; say with --topic which of: {', '.join(candidates)}"
+            f"{source.name}: has no inertial unit; choose with --topic from: {', '.join(candidates)}"
         )
     return {topic: [] for topic in candidates}
 
@@ -172,9 +172,9 @@ def _analysed(
     values, step_s, notes = preparing.on_grid(column, grid), grid.step_s, []
     preparing.check_at_rest(title, name, values, step_s)
     if grid.lost:
-        notes.append(f"{100 * grid.lost:.2g} % of the messages are lost; gaps are gone by their stamps")
+        notes.append(f"{100 * grid.lost:.2g} % of the messages are lost; gaps are found by the stamps")
     if line := preparing.find_vibration(values, step_s):
-        notes.append(f"vibrates at {line[0]:.4g} Hz with {line[1]:.2g} {unit}; the numbers include it")
+        notes.append(f"vibrates at {line[0]:.4g} Hz with {line[1]:.2g} {unit}; the numbers include this")
     values = values - values[np.isfinite(values)][0]
     drift = preparing.find_drift(values, step_s)
     if drift is not None:
@@ -184,7 +184,7 @@ def _analysed(
     samples = samples_of(block_means(values, block), step_s * block)
     if block > preparing.fewest_block(len(values)):
         notes.append(
-            f"samples are correlated; averaged over {block} ({block * step_s:.3g} s), they are white"
+            f"samples are correlated; means of {block} samples ({block * step_s:.3g} s) are white"
         )
     fitted = choose(samples)
     numbers = {
@@ -215,11 +215,12 @@ def _analysed(
 def _drifts(drift: Drift, unit: str) -> str:
     if drift.offset:
         return (
-            f"warms up: {drift.offset:.2g} {unit} that decays in {drift.time_s:.3g} s, and "
-            f"{drift.rate:.2g} {unit}/s; taken out of all numbers (log-likelihood +{drift.gain:.3g})"
+            f"warms up: {drift.offset:.2g} {unit} decays with a time constant of {drift.time_s:.3g} "
+            f"s, plus {drift.rate:.2g} {unit}/s; removed from all numbers (log-likelihood "
+            f"+{drift.gain:.3g})"
         )
     return (
-        f"drifts by {drift.rate:.3g} {unit}/s; taken out of all numbers "
+        f"drifts by {drift.rate:.3g} {unit}/s; removed from all numbers "
         f"(log-likelihood +{drift.gain:.3g})"
     )
 
@@ -235,9 +236,9 @@ def _misfits(found: ColumnNoise) -> list[str]:
     ratio = model / found.curve.deviations
     worst = int(np.argmax(np.where(beyond, np.abs(np.log(ratio)), 0.0)))
     return [
-        f"{MISFIT}{found.fitted.words} do not explain it: at {taus_s[worst]:.3g} s the model's Allan "
+        f"{MISFIT}{found.fitted.words} does not explain it: at {taus_s[worst]:.3g} s the model's Allan "
         f"deviation is {ratio[worst]:.2g} times the measured one, outside its 99.9 % interval at "
-        f"{int(beyond.sum())} of {int(is_seen.sum())} times; do not trust these numbers there"
+        f"{int(beyond.sum())} of {int(is_seen.sum())} times; do not trust the numbers at these times"
     ]
 
 
@@ -248,8 +249,8 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
         m = round(tau_s / found.step_s)
         if not 1 <= m <= len(values) // 3:
             raise BadInput(
-                f"--tau {tau_s:g}: the log has averages over {found.step_s:.3g} to {longest_s:.4g} s, a "
-                "third of its length; give a time between"
+                f"--tau {tau_s:g}: the log allows {found.step_s:.3g} to {longest_s:.4g} s, a "
+                "third of its length; give a time in this range"
             )
         at = allan_deviation(values, found.step_s, np.array([m]))
         degrees = degrees_of_freedom(found.fitted.terms, found.step_s, m, int(at.pairs[0]))
@@ -266,16 +267,16 @@ def _least(found: ColumnNoise, unit: str) -> str:
     least = int(np.nanargmin(np.where(found.degrees > _FEWEST_DEGREES, found.curve.deviations, np.inf)))
     value = float(found.curve.deviations[least])
     return (
-        f"least Allan deviation {value:.3g} {unit} at {found.curve.taus_s[least]:.3g} s (as flicker "
-        f"noise, divided by .664, {value / 0.664283:.3g}); white noise and a walk have a least as well"
+        f"minimum Allan deviation {value:.3g} {unit} at {found.curve.taus_s[least]:.3g} s (as flicker "
+        f"noise, divided by 0.664: {value / 0.664283:.3g}); white noise and a walk have a minimum too"
     )
 
 
 def _against(stated: tuple[str, str, float], numbers: Mapping[str, Interval], unit: str) -> str:
     text, term, value = stated
     if term not in numbers:
-        return f"the sheet states {text}; no {term} was found to compare"
+        return f"the data sheet states {text}, but no {term} was found to compare with"
     yours = numbers[term].rising(lambda each: each / value)
     ends = f"{yours.low:.3g} to {yours.high:.3g}"
     kind = "sqrt(Hz)" if term == "white" else "sqrt(s)"
-    return f"stated {text} ({value:.4g} {unit}/{kind}), yours {yours.value:.3g} ({ends}) times that"
+    return f"data sheet: {text} ({value:.4g} {unit}/{kind}), yours: {yours.value:.3g} ({ends}) of it"

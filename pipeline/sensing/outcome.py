@@ -121,7 +121,7 @@ class SensorNoise:
         for name, below in bounds.items():
             if not found[name].walk:
                 found[name] = found[name]._replace(walk=below)
-                doubts.append(f"{name}: no walk was found; K is the most that it may be, with 95 %")
+                doubts.append(f"{name}: no walk was found; K is its 95 % upper limit")
         return Densities(self.columns[0].topic, found, doubts)
 
     @property
@@ -160,7 +160,7 @@ class SensorNoise:
                     ],
                 )
             )
-        title = "slopes: -1 quantised angle, -1/2 white noise, 0 least, +1/2 random walk, +1 ramp"
+        title = "slopes: -1 quantised angle, -1/2 white noise, 0 minimum, +1/2 random walk, +1 ramp"
         return Chart(title=title, panels=panels, columns=min(3, len(panels)))
 
     def draw(self, rrd: Path) -> None:

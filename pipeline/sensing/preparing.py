@@ -67,14 +67,14 @@ def grid_of(stream: Stream) -> Grid:
     span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
     if len(stamps) < FEWEST or span_s < SHORTEST_S:
         raise BadInput(
-            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; noise takes {FEWEST} in "
-            f"{SHORTEST_S:.0f} s at least, and a walk an hour at rest"
+            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; noise needs at least "
+            f"{FEWEST} in {SHORTEST_S:.0f} s, and a random walk an hour at rest"
         )
     written = np.diff(stamps[np.argsort(stream.position, kind="stable")])
     if (written < 0).any():
         raise BadInput(
-            f"{stream.topic}: its stamps go back {int((written < 0).sum())} times; record it by one "
-            "clock, or write it in order with fuselog cut"
+            f"{stream.topic}: its stamps go backwards {int((written < 0).sum())} times; record it with "
+            "one clock, or write it in order with fuselog cut"
         )
     rows = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
     steps = np.diff(stamps[rows]) * 1e-9
@@ -85,8 +85,8 @@ def grid_of(stream: Stream) -> Grid:
     grid = Grid(step_s, np.concatenate([[0], np.cumsum(counts)]), rows)
     if grid.lost > _MOST_LOST:
         raise BadInput(
-            f"{stream.topic}: {100 * grid.lost:.0f} % of it is lost, in {int(is_gap.sum())} gaps; "
-            "record again, or take a whole part with fuselog cut"
+            f"{stream.topic}: {100 * grid.lost:.0f} % of the messages are lost, in "
+            f"{int(is_gap.sum())} gaps; record again, or select a complete part with fuselog cut"
         )
     return grid
 
@@ -117,9 +117,9 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
     """
     there = values[np.isfinite(values)]
     if len(there) < FEWEST:
-        raise BadInput(f"{name}: has {len(there)} numbers; noise takes {FEWEST} at least")
+        raise BadInput(f"{name}: has {len(there)} numbers; noise needs at least {FEWEST}")
     if np.ptp(there) == 0:
-        raise BadInput(f"{name}: is constant, {there[0]:.6g}; a sensor that is on has noise")
+        raise BadInput(f"{name}: is constant, {there[0]:.6g}; an active sensor has noise")
     means = block_means(values, max(1, round(1 / step_s)))
     spread, most = float(np.nanstd(means)), _STILL.get(unit_of(field), math.inf)
     size = max(20, len(values) // 200)
@@ -130,8 +130,8 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
     if spread > most or activity[busiest] > 4 * np.median(activity[is_there]) > 0:
         at_s = busiest * size * step_s
         raise BadInput(
-            f"{name}: the unit moves, most of all {at_s:.0f} s into the log; record it at rest, or take "
-            "the part where it is with fuselog cut"
+            f"{name}: the unit moves, most at {at_s:.0f} s into the log; record it at rest, or select "
+            "the part at rest with fuselog cut"
         )
 
 

@@ -119,4 +119,4 @@ def at_rest(values: Floats, step_s: float) -> MemorySource:
     return memory_source(Recording([stream]), RunMetadata("at rest", epoch_ns=0))
 
 
-NOISE = Study("how often the intervals of a sensor's noise hold the truth", study, NoiseOptions)
+NOISE = Study("how often the intervals of a sensor's noise cover the truth", study, NoiseOptions)

@@ -19,8 +19,8 @@ COLUMNS = {
     "metres": "m",
     "degrees": "deg",
     "growth": "growth",
-    "halved": "for half",
-    "parted_s": "part at (s)",
+    "halved": "ratio to half",
+    "parted_s": "diverge at (s)",
     "topic": "by",
     "note": "note",
 }

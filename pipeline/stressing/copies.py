@@ -142,7 +142,7 @@ def compared(
     moved = {key: other[key] - value for key, value in one.items() if key in other}
     main = _main([key[1] for key in one])
     if largest is None and not main and not failed:
-        return Tried(name, why="no estimate is one Gaussian, and no error is known")
+        return Tried(name, why="no estimate is a single Gaussian, and no error is known")
     reach = _reach(found, main)
     shares = [
         min(abs(by), reach) / abs(one[key])

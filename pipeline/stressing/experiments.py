@@ -76,7 +76,7 @@ def stress_result(
     values["estimators"] = allowed(values.get("estimators") or {})
     experiment = build(Experiment, values, f"experiment {result.experiment}").with_absolute_files()
     if not experiment.estimators:
-        raise BadInput(f"--stress: experiment {result.experiment} names no estimators; leave it out")
+        raise BadInput(f"--stress: experiment {result.experiment} names no estimators; remove it")
     data = Path(result.settings["data"]).absolute() if result.settings.get("data") else None
     runs = len(experiment.files) or experiment.runs
     parts = [
@@ -135,6 +135,6 @@ def _merged(parts: Sequence[_Part], pool: WorkerPool, progress: Progress) -> Map
                 whole.setdefault(label, StressSums(label)).merge(sums)
     except pool.lost as error:
         raise BadInput(
-            f"--stress: a process that replayed copies died ({error}); try fewer workers"
+            f"--stress: a worker process died while replaying copies ({error}); try fewer workers"
         ) from error
     return whole

@@ -239,8 +239,8 @@ def _lacking(name: str, inputs: Inputs) -> str:
     if name == "start" and not inputs.priors:
         return "the log states no start"
     if name == "zero duration" and not inputs.controls:
-        return "no topic drives the motion"
-    return "" if inputs.sensed or name == "start" else "nothing is measured"
+        return "the estimator has no control"
+    return "" if inputs.sensed or name == "start" else "the log has no measurements"
 
 
 def _doubtful(tried: Iterable[Tried]) -> list[str]:

@@ -65,7 +65,7 @@ class Tried(NamedTuple):
     def far(self) -> str:
         """Describe how far the estimate moves."""
         if self.parting is None:
-            return f"the metric moves: {self.beyond}" if self.beyond else "the metric stays"
+            return f"the metric changes: {self.beyond}" if self.beyond else "the metric does not change"
         sizes = [(self.parting.metres, "m"), (self.parting.degrees, "deg")]
         words = [f"{self.largest:.3g} sigma"] if self.parting.has_sigmas else []
         words += [f"{_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0)]
@@ -234,7 +234,7 @@ class Stressed:
             return f"{begin}the copy fails {each.failed}"
         begin += each.far
         if self.worst == "harmless":
-            return f"{begin}; so does every other change that was tried less"
+            return f"{begin}; every other change that was tried does less"
         if not np.isfinite(self.ratio(name)):
             return begin
         return f"{begin}; {self._shrinking(name)}"
@@ -242,12 +242,12 @@ class Stressed:
     def _shrinking(self, name: str) -> str:
         """Describe the effect of half of a change, and of a quarter if that was tried."""
         share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
-        half = f"half the change does {share:.2g} of it"
+        half = f"half the change has {share:.2g} of this effect"
         if name in self.quarters:
-            half += f", and a quarter {1.0 / ratio:.2g} of that"
+            half += f", and a quarter has {1.0 / ratio:.2g} of that of half"
         if self.worst == "sensitive":
-            return f"{half}: it shrinks faster than the change" if ratio > HALVES[1] else half
-        return f"{half}: it {'jumps' if ratio > SQUARED else 'does not shrink with it'}"
+            return f"{half}: the effect shrinks faster than the change" if ratio > HALVES[1] else half
+        return f"{half}: the effect {'jumps' if ratio > SQUARED else 'does not shrink with the change'}"
 
     @property
     def sentences(self) -> list[str]:
@@ -255,25 +255,25 @@ class Stressed:
         sentences = [self.sentence]
         if self.is_per_prediction:
             sentences.append(
-                "noise per prediction, not per second: a microsecond makes one prediction two, and "
-                "that changes the covariance; scale the noise with the duration"
+                "noise is added per prediction, not per second: a microsecond splits one prediction "
+                "into two, which changes the covariance; scale the noise with the duration"
             )
         elif self._jumps:
             sentences.append(
-                "a microsecond decides what is taken together: what has one stamp is one step, and what "
-                "comes later waits for the next"
+                "a microsecond decides what is processed together: messages with one stamp are one "
+                "step, and a later message waits for the next"
             )
         if self.is_redrawn:
             sentences.append(
-                "an ulp of the inputs changes the covariance: other samples are drawn, or something is "
-                "decided otherwise; if it takes samples, more of them bring the copies nearer"
+                "an ulp of the inputs changes the covariance: other samples are drawn, or a decision "
+                "changes; an estimator with samples needs more of them"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined
             since_s = (least.since_ns - self.source.epoch_ns) * 1e-9
             sentences.append(
-                f"from {since_s:.1f} s on {least.words} is not determined: its sigma is "
-                f"{least.sigma:.3g}, across it {least.next_sigma:.3g}"
+                f"from {since_s:.1f} s on, {least.words} is not determined: its sigma is "
+                f"{least.sigma:.3g}, and {least.next_sigma:.3g} across it"
             )
         return sentences
 

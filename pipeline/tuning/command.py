@@ -53,7 +53,7 @@ def tune_logs(
     alterations, own = split_texts(settings)
     chosen = settings_of_estimators([label], own, settings_file, model=model)
     if not as_json:
-        say(f"tuned on {_in_words(logs)}; held out: {_in_words(held_out)}")
+        say(f"tuning on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
         find = search or partial(tune, free=free, by=by, grid=grid)
         found = find(
@@ -93,7 +93,7 @@ def tune_logs(
         say(sentence)
     for each in found.replays:
         print_metrics(plain(each.judge.metrics), each.judge.bounds, each.judge.runs_table)
-    say(f"{out / SETTINGS}: for --settings; {out}: tables, figures, timeline, result.json")
+    say(f"{out / SETTINGS}: settings for --settings; {out}: tables, figures, timeline, result.json")
 
 
 def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
@@ -103,17 +103,18 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
     """
     folders = {path.resolve().parent for path in held_out}
     beside = [path for path in logs if path.resolve().parent in folders]
-    mend = "to hold out several, give --validate the folder, or once before each log"
+    mend = "to hold out several logs, give --validate their folder, or repeat --validate before each log"
     for path in logs:
         if path.resolve() in {each.resolve() for each in held_out}:
-            raise BadInput(f"{path}: would be tuned on and held out; leave it out of one of them")
+            raise BadInput(f"{path}: is among both the tuned and the held-out logs; remove it from one")
     if beside and len(beside) < len(logs):
-        more = f", as would {len(beside) - 1} more of its folder" if len(beside) > 1 else ""
+        more = f", together with {len(beside) - 1} more from its folder" if len(beside) > 1 else ""
         raise BadInput(
-            f"{beside[0]}: would be tuned on{more}, while {held_out[0]} beside it is held out; {mend}"
+            f"{beside[0]}: would be tuned on{more}, although {held_out[0]} in the same folder is held "
+            f"out; {mend}"
         )
     if len(beside) > 1:
-        warn(f"the {len(beside)} logs tuned on are in one folder with those held out; {mend}")
+        warn(f"the {len(beside)} logs to tune on are in the same folder as those held out; {mend}")
 
 
 def progress_of(best: Best) -> str:
@@ -121,7 +122,7 @@ def progress_of(best: Best) -> str:
     named = zip(best.names, best.point, strict=True)
     values = ", ".join(f"{name} {value:.4g}" for name, value in named)
     found = (
-        f"best so far: {values}" if values else "no values so far with which all logs can be replayed"
+        f"best so far: {values}" if values else "no values found yet with which all logs can be replayed"
     )
     return f"{best.evaluations} evaluations; {found}"
 
@@ -142,5 +143,5 @@ def _bound(text: str) -> tuple[str, tuple[float, float]]:
     except ValueError:
         found = (0.0, 0.0)
     if not (name and found[0] < found[1]):
-        raise BadInput(f"--bound {text}: expected NAME=LOW:HIGH, as sigma_range_m=0.01:1")
+        raise BadInput(f"--bound {text}: expected NAME=LOW:HIGH, for example sigma_range_m=0.01:1")
     return name, found

@@ -180,21 +180,21 @@ def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str
     names = [each.name for each in free]
     first, *others = _involved(direction)
     if not others and free[first].useful:
-        return f"{names[first]}: the logs determine it less well than is useful"
+        return f"{names[first]}: the logs determine it less accurately than is useful"
     if not others and _factor(value) < MEANINGLESS:
         return f"{names[first]}: the logs determine it within a factor of {_factor(value):.2g} (95 %)"
     if not others:
         return (
-            f"{names[first]}: the logs determine it not at all, but that the start, "
-            f"{free[first].default:g}, explains them worse"
+            f"{names[first]}: the logs do not determine it; they only fit worse with the start value, "
+            f"{free[first].default:g}"
         )
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
         for place in others
     ]
     return (
-        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly distinguish them; "
-        f"a larger {names[first]} with {' and '.join(turned)} explains them almost as well"
+        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly distinguish "
+        f"these parameters; a larger {names[first]} with {' and '.join(turned)} fits almost as well"
     )
 
 

@@ -78,7 +78,7 @@ def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
 
 
 TUNING_HELD_OUT = Study(
-    "noise tuned by maximum likelihood on some vehicles of a log, and judged on others",
+    "noise tuned by maximum likelihood on some vehicles of a log and judged on others",
     study,
     HeldOutOptions,
 )

@@ -106,8 +106,8 @@ def in_words(
         (together if len(parts) > 1 else alone).append(" with ".join(parts))
     stay = ", ".join(f"{each.name} = {each.default:g}" for each in free if each.name in held)
     return (
-        f"the motion in the logs does not determine {', '.join([*alone, *together])}: held where they "
-        f"started ({stay}), without an interval; record turns in both senses at changing speed"
+        f"the motion in the logs does not determine {', '.join([*alone, *together])}: fixed at the "
+        f"start values ({stay}), without an interval; record turns in both directions at varying speed"
     )
 
 
@@ -141,7 +141,7 @@ def conditions(
         ]
         if moves:
             yield (
-                f"{name}: the value and its interval are right only if what is held is right: the value "
+                f"{name}: the value and its interval hold only if the fixed parameters are right: it "
                 f"changes by {', by '.join(moves)}"
             )
 

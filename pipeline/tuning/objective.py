@@ -52,7 +52,7 @@ class Run(NamedTuple):
     Attributes:
         ensemble: the log, as an ensemble of one.
         name: the log's name.
-        begun: the begin of each estimated object by name, if the log does not state it; see `begin`.
+        begun: the initial state of each estimated object by name, if the log has none; see `begin`.
         starts: the starts between which likelihoods are compared, in place of `begun`.
         parts: the log, repeated for each part of `starts`.
         disturbed: copies with noise added to the controls, if the cost is corrected for that noise.
@@ -85,13 +85,13 @@ def for_likelihood(settings: Mapping[str, Any]) -> str:
     kind = settings.get("kind")
     if isinstance(kind, Estimator):
         return (
-            "in the `follow` of a recursion, fill results.innovation, results.innovation_covariance and "
-            "results.squared, with their components named in `measured`"
+            "in the `follow` function of the recursion, fill results.innovation, "
+            "results.innovation_covariance and results.squared, and name the components in `measured`"
         )
     if kind in ("lib", "exec"):
         return (
-            "a filter of your own describes its `innovation` and gives it, and a program that reads a "
-            "log writes fuselog.Innovation"
+            "a filter of your own has to describe and return its `innovation`; a program that reads a "
+            "log has to write fuselog.Innovation"
         )
     return ""
 
@@ -179,8 +179,8 @@ class Criterion(NamedTuple):
 CRITERIA: dict[By, Criterion] = {
     "likelihood": Criterion(_likelihood, _cost_of_likelihood, True, "innovations with a likelihood"),
     "nis": Criterion(_nis, _cost_of_ratios, True, "innovations"),
-    "nees": Criterion(_nees, _cost_of_ratios, False, "truth to judge its estimates by"),
-    "rmse": Criterion(_rmse, _cost_of_squares, False, "truth to judge its estimates by"),
+    "nees": Criterion(_nees, _cost_of_ratios, False, "truth to compare its estimates with"),
+    "rmse": Criterion(_rmse, _cost_of_squares, False, "truth to compare its estimates with"),
 }
 
 
@@ -258,11 +258,11 @@ class Objective:
                 return [[sums for part in of_run for sums in part.result()] for of_run in working]
             except CancelledError:
                 raise BadInput(
-                    f"the scheduler ended while it tuned {self.label}; start it again"
+                    f"the scheduler ended while it was tuning {self.label}; start it again"
                 ) from None
             except pool.lost as error:
                 raise BadInput(
-                    f"a process that tunes {self.label} died ({error}); try fewer workers"
+                    f"a worker process died while tuning {self.label} ({error}); try fewer workers"
                 ) from error
 
     def _without_runs(self) -> "Objective":
@@ -281,7 +281,8 @@ class Objective:
                 pickle.dumps(self._without_runs())
             except (pickle.PicklingError, AttributeError, TypeError) as error:
                 raise BadInput(
-                    f"{self.label}: cannot be sent to another process ({error}); tune it with one worker"
+                    f"{self.label}: the estimator cannot be sent to another process ({error}); tune it "
+                    "with one worker"
                 ) from error
         counts, runs = [], [self.begun(start, run) for run in self.runs]
         for run in runs:
@@ -289,22 +290,22 @@ class Objective:
             failures = _failures(outputs)
             if failures:
                 raise BadInput(
-                    f"{run.name}: {self.label} fails at the values that the search starts from "
-                    f"({failures[0]}); give others with --set"
+                    f"{run.name}: {self.label} fails with the start values of the search "
+                    f"({failures[0]}); give other values with --set"
                 )
             parts = self._parts(start, run)
             count = max(map(self._count, parts))
             total = self._total(parts, run, count)
             if self.by == "likelihood" and total and -np.inf in total.values():
                 raise BadInput(
-                    f"{run.name}: {self.label} diverges at the values that the search starts from: its "
-                    "log-likelihood is -inf; give others with --set"
+                    f"{run.name}: {self.label} diverges with the start values of the search: its "
+                    "log-likelihood is -inf; give other values with --set"
                 )
             if not np.isfinite(self._cost([total])):
                 mend = for_likelihood(self.settings) if self.by == "likelihood" else ""
                 raise BadInput(
-                    f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
-                    f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
+                    f"{run.name}: {self.label} has no {CRITERIA[self.by].lacks} on this log; tune by "
+                    f"one of {', '.join(each for each in CRITERIA if each != self.by)} instead"
                     f"{', or ' if mend else ''}{mend}"
                 )
             counts.append(count)
@@ -407,7 +408,7 @@ class Objective:
         )
 
     def begun(self, values: Floats, run: Run) -> Run:
-        """Return the log with the estimator's begin at values (k,); raises BadInput as `replay`."""
+        """Find the initial states for a log with values (k,); raises BadInput as `replay`."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):

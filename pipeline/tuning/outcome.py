@@ -204,64 +204,64 @@ class Tuning:
         found, free = self.found, self.found.coordinates.free
         if found.was_stopped:
             yield (
-                f"stopped after {found.evaluations} evaluations: these are the best values so far, "
-                "and how well the logs determine them is not known"
+                f"the search was stopped after {found.evaluations} evaluations: these are the best "
+                "values so far, and their uncertainty is unknown"
             )
         elif not found.has_converged:
-            yield "the search was ended before it converged; start from these values once more"
+            yield "the search ended before it converged; start it again from these values"
         if self.gate < 1.0:
             yield (
-                f"the gate (gate_probability = {self.gate:g}) was open in the search: what it keeps out "
-                "costs nothing, so that the best values would keep out as much as they can"
+                f"the gate (gate_probability = {self.gate:g}) was open during the search: rejected "
+                "measurements cost nothing, so a closed gate would favour values that reject many"
             )
         if self.objective.by != "likelihood":
-            yield f"by {self.objective.by} there are no intervals, and other values may do as well"
+            yield f"tuning by {self.objective.by} gives no intervals; other values may be equally good"
         for topic, count in self.objective.left_out.items():
             yield (
-                f"{topic}: its first messages, {count} in all, were left out of the search, since a "
-                "delay could put them before the start of the filter"
+                f"{topic}: the search left out the first {count} messages, because a delay could move "
+                "them to before the start of the filter"
             )
         beyond = found.coordinates.at_bounds(found.coordinates.of(found.optimum))
         for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
             if each.is_assumed:
                 yield (
-                    f"{each.name}: no channel states it; the search starts from {each.default:g}, which "
-                    f"replay assumes too; --set {each.name}=... sets another start"
+                    f"{each.name}: no channel states its value; the search starts from the default that "
+                    f"replay uses, {each.default:g}; --set {each.name}=... sets another start"
                 )
             if each.is_fixed and each.name not in found.held:
                 yield (
-                    f"{each.name}: the logs determine it not at all; it stays at {each.default:g}, "
-                    "where the search began"
+                    f"{each.name}: the logs do not determine it; it stays at its start value, "
+                    f"{each.default:g}"
                 )
             elif is_beyond and not each.is_fixed:
                 side = "lower" if value < each.default else "upper"
                 yield (
-                    f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
-                    "a wider one, or leave it out of what is searched for"
+                    f"{each.name}: the best value is its {side} bound {value:g}, so it has no interval; "
+                    "give a wider --bound, or remove it from the free parameters"
                 )
         yield from found.lacks
         if not found.begins_alike:
             yield (
-                "with these values the filter begins elsewhere than in the search that found them, and "
-                "with those found from there elsewhere again; give every log a prior"
+                "with these values the filter starts elsewhere than in the search that found them; a "
+                "new search would move the start again; give every log a prior"
             )
         if found.at_edge:
             yield (
-                f"{', '.join(found.at_edge)}: no interval, since beside the value a run fails or uses "
-                "fewer measurements, so that likelihoods cannot be compared; give every log a prior, a "
-                "narrower --bound, or other values to start from"
+                f"{', '.join(found.at_edge)}: no interval, because close to the value a run fails or "
+                "uses fewer measurements, so that likelihoods cannot be compared; give every log a "
+                "prior, a narrower --bound, or other start values"
             )
         if found.is_spike:
             yield (
                 "there are no intervals: innovations are too large with these values, and a search from "
-                "a second start ends at others that explain the logs less: the filter diverges nearby; "
-                "start from other values with --set, or from a --grid"
+                "a second start ends at values that explain the logs less well, so the filter diverges "
+                "nearby; choose other start values with --set, or use --grid"
             )
         if self.objective.is_corrected:
             yield (
-                "the noise of the control, such as the odometry, would move these values: shifted "
-                "stamps average it, and a factor below 1 attenuates it; the search leaves out what "
-                "that gains, and the intervals include it"
+                "the noise of the controls, such as odometry, would bias these values: shifted stamps "
+                "average the noise, and a factor below 1 attenuates it; the search corrects for this, "
+                "and the intervals include it"
             )
         if found.confidence is not None:
             yield from doubts(found.confidence, found.coordinates)
@@ -270,18 +270,18 @@ class Tuning:
         rows = self.whiteness.to_dict("records")
         if not rows:
             yield (
-                f"{self.label} gives no innovations, so that these values are those with which its "
-                "estimates are nearest to the truth; what the measurements say of them is not known"
+                f"{self.label} gives no innovations, so these values minimise the errors of its "
+                "estimates against the truth; how well they fit the measurements is unknown"
             )
         for row in (each for each in rows if each["estimator"] == TUNED):
             if row["probability"] < IMPROBABLE:
                 what = " ".join(filter(None, (row["case"], row["component"])))
                 negative = row["next_correlation"] < 0
                 yield (
-                    f"{what}: the tuned innovations are not white (Ljung-Box {row['ljung_box']:.4g}, by "
-                    f"chance {row['probability']:.1g}); each correlates with the next by "
-                    f"{row['next_correlation']:.2g}, as where the "
-                    f"{'measurement' if negative else 'process'} noise is too small, or of another kind"
+                    f"{what}: the tuned innovations are not white (Ljung-Box {row['ljung_box']:.4g}, "
+                    f"p = {row['probability']:.1g}); the correlation of successive innovations is "
+                    f"{row['next_correlation']:.2g}, which suggests that the "
+                    f"{'measurement' if negative else 'process'} noise is too small, or not white"
                 )
 
     def _notes_of_truth(self) -> Iterator[str]:
@@ -299,9 +299,9 @@ class Tuning:
                     continue
                 what = " ".join(filter(None, (label, case)))
                 yield (
-                    f"{what}: NEES is {metrics[key]:.3g}, if consistent up to {high:.3g}, and NIS only "
-                    f"{nis:.3g} per component: innovations do not see errors that change slowly, as a "
-                    "sensor's bias; let these be estimated"
+                    f"{what}: NEES is {metrics[key]:.3g} (consistent up to {high:.3g}), but NIS is only "
+                    f"{nis:.3g} per component: innovations do not show slowly changing errors, such as "
+                    "a sensor's bias; estimate such errors as states"
                 )
 
     def _notes_of_others(self) -> Iterator[str]:
@@ -312,12 +312,15 @@ class Tuning:
             if self.objective.by == "likelihood":
                 what, sign = f"log-likelihood ({self._scale})", -1.0
             yield (
-                f"logs held out: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
+                f"held-out logs: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
                 f"{'better' if after < before else 'no better'}"
             )
         if len(self.folds):
             better = int((self.folds[f"cost_{TUNED}"] < self.folds[f"cost_{START}"]).sum())
-            yield f"{better} of {len(self.folds)} folds are explained better by what the others give"
+            yield (
+                f"{better} of {len(self.folds)} folds are explained better with the values from the "
+                "other folds"
+            )
 
     @property
     def _scale(self) -> str:
@@ -325,7 +328,7 @@ class Tuning:
         count = len(self.held_out_logs)
         total = "of 1 log" if count == 1 else f"the sum over {count} logs"
         is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")
-        return f"{total}{is_open}; in the tables: the mean per log{is_closed}"
+        return f"{total}{is_open}; the tables have the mean per log{is_closed}"
 
     @property
     def toml(self) -> str:
@@ -395,7 +398,7 @@ class Tuning:
                 x=Axis(
                     label=label_of(each.name, self._meanings.get(each.name, "")), log=positive[each.name]
                 ),
-                y=Axis(label="log-likelihood less its greatest"),
+                y=Axis(label="log-likelihood relative to its maximum"),
                 series=[
                     level("95 %", each.along, -DROP_95),
                     curve("by curvature", each.along, -each.parabola, "dashed", reference=True),
@@ -404,7 +407,7 @@ class Tuning:
             )
             for each in self._profiles
         ]
-        title = "along each parameter, all others following"
+        title = "profiles along each parameter, with all others optimised"
         return Chart(title=title, panels=panels, columns=min(2, len(panels)))
 
 

@@ -105,9 +105,8 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
             units[place], (below, middle, above) = _unit(near, value)
         if below == middle == above:
             raise BadInput(
-                f"{each.name}: nothing in the logs depends on it, so that they cannot determine its "
-                "value; "
-                "leave it out of --free"
+                f"{each.name}: the logs do not depend on it, so they cannot determine its value; remove "
+                "it from --free"
             )
     return Coordinates(free, units)
 
@@ -131,14 +130,12 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     low, high = coordinates.bounds
     for each, begin, end in zip(coordinates.free, low, high, strict=True):
         if not np.isfinite(end - begin):
-            raise BadInput(
-                f"{each.name}: a grid goes from bound to bound; give them, --bound {each.name}=LOW:HIGH"
-            )
+            raise BadInput(f"{each.name}: a grid needs bounds; give --bound {each.name}=LOW:HIGH")
     count = points ** len(low)
     if count > MOST_GRID_POINTS:
         raise BadInput(
-            f"--grid {points}: that is {count} points of {len(low)} parameters; give a coarser one, of "
-            f"{MOST_GRID_POINTS} at most"
+            f"--grid {points}: these are {count} points for {len(low)} parameters; give a coarser grid, "
+            f"of at most {MOST_GRID_POINTS} points"
         )
     axes = [np.linspace(begin, end, points) for begin, end in zip(low, high, strict=True)]
     start = coordinates.of(np.array([each.default for each in coordinates.free]))

@@ -99,17 +99,17 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 def _chart(summary: pd.DataFrame) -> Chart:
     """Draw coverage and the spread of values with their standard errors against the logs' duration."""
-    x = Axis(label="length of the log (s)", log=True)
-    covered = Panel(x=x, y=Axis(label="95 % intervals that hold the truth", limits=(0.0, 1.05)))
+    x = Axis(label="duration of the log (s)", log=True)
+    covered = Panel(x=x, y=Axis(label="95 % intervals that cover the truth", limits=(0.0, 1.05)))
     spread = Panel(x=x, y=Axis(label="spread of log(value / true)", log=True))
     for name, rows in summary.groupby("parameter", sort=False):
         length_s = rows["duration_s"]
         covered.series.append(curve(str(name), length_s, rows["covered_share"], "line+markers"))
         spread.series.append(curve(str(name), length_s, rows["ratio_spread"], "line+markers"))
         standard_error = rows["standard_error"]
-        spread.series.append(curve(f"{name}, as intervals say", length_s, standard_error, "dashed"))
+        spread.series.append(curve(f"{name}, standard error", length_s, standard_error, "dashed"))
     covered.series.append(level("95 %", summary["duration_s"], COVERAGE))
-    return Chart(title="tuned values over the length of the log", panels=[covered, spread])
+    return Chart(title="tuned values against the duration of the log", panels=[covered, spread])
 
 
 TUNING = Study(

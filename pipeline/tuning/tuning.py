@@ -130,11 +130,11 @@ def tune(
     held_out = sources_of(validate, alterations) if validate else []
     if folds and not 2 <= folds <= len(sources):
         raise BadInput(
-            f"--folds {folds}: give two or more, and a log for each at least; there are {len(sources)}"
+            f"--folds {folds}: expected a number between 2 and the number of logs, {len(sources)}"
         )
     chosen = settings_of(estimator)
     if len(chosen) > 1:
-        raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
+        raise BadInput(f"{', '.join(chosen)}: give one estimator; only one can be tuned at a time")
     [(label, own)] = chosen.items()
     settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
@@ -206,9 +206,9 @@ def _refuse_random(label: str, bound: Sequence[Bound], by: By) -> None:
     """Raise BadInput if a search would follow the estimator's own random numbers."""
     if CRITERIA[by].is_smooth and any(isinstance(each, Recursive) and each.is_random for each in bound):
         raise BadInput(
-            f"estimator {label}: draws random numbers, so that its likelihood changes by chance from "
-            "one value to the next; tune another method, such as -e ukf, and replay this one with what "
-            "it finds, or tune --by rmse"
+            f"estimator {label}: draws random numbers, so its likelihood changes randomly between "
+            "evaluations; tune a deterministic method such as -e ukf and replay this estimator with the "
+            "result, or use tune --by rmse"
         )
 
 
@@ -227,13 +227,13 @@ def _searched(
         raise BadInput("--free: name at least one parameter to search for")
     for name in bounds:
         if name not in names:
-            raise BadInput(f"--bound {name}: this parameter is not searched for; {choices(name, names)}")
+            raise BadInput(f"--bound {name}: --free does not name it; {choices(name, names)}")
     for number, name in enumerate(names):
         if name in names[:number]:
-            raise BadInput(f"--free {name}: is named twice; name it once")
+            raise BadInput(f"--free {name}: the parameter is named twice; name it once")
         if name in OPEN and CRITERIA[by].is_smooth:
             raise BadInput(
-                f"--free {name}: the likelihood is greatest for a gate that accepts no measurement; "
+                f"--free {name}: the likelihood would be largest if the gate rejected all measurements; "
                 "leave it out, or tune --by nees"
             )
     return [_free(name, bounds.get(name), source, bound[0]) for name in names]
@@ -253,14 +253,14 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     is_log = least >= 0.0 or (given is not None and given[0] > 0.0 and not useful)
     if is_log and start <= 0.0 and given is None:
         raise BadInput(
-            f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
-            f"above zero, --set {name}=..."
+            f"--free {name}: the search uses its logarithm, but its start value is {start:g}; give a "
+            f"positive start value with --set {name}=..."
         )
     low, high = given or ((start / REACH, start * REACH) if is_log else (least, greatest))
     if not (low < start < high and (low > 0.0 if is_log else low >= least)):
         raise BadInput(
-            f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
-            f"{' two numbers above zero' if is_log else ''}; give other bounds, or --set {name}=..."
+            f"--bound {name}={low:g}:{high:g}: expected bounds{' above zero' if is_log else ''} on both "
+            f"sides of the start value, {start:g}; give other bounds, or --set {name}=..."
         )
     return declared._replace(
         default=start,
@@ -367,10 +367,10 @@ def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
 def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
     """Search until filters begin with the values found where they began in the search.
 
-    Without a prior in the log, the begin of a filter depends on the values, for example on how much it
-    trusts its path between the first fixes. The begin is fixed during a search, because likelihoods of
-    different measurements cannot be compared; the next search begins with the values found by the
-    previous one.
+    Without a prior in the log, the stamp at which a filter begins depends on the values, for example on
+    how much it trusts its path between the first fixes. This stamp is fixed during a search, because
+    likelihoods of different measurements cannot be compared; in the next search, filters begin where the
+    values found by the previous one put them.
     """
     start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)

@@ -48,7 +48,7 @@ def draw_explorer() -> None:
         slider = explorer.session.slider("sigma_range_m")
         with _page(scheme) as page:
             page.goto(explorer.url)
-            page.wait_for_selector("text=Nothing speaks against it.")
+            page.wait_for_selector("text=No problem found.")
             page.evaluate(SET, [slider.name, slider.place(PINNED_M)])
             page.wait_for_selector("text=Overconfident.")
             page.get_by_text("Pin", exact=True).click()

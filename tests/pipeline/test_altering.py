@@ -352,14 +352,14 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
         (f"{SEEN}.delay_s=3 m", "the unit 'm' does not fit"),
         (f"{SEEN}.speed_scale=2", "has no field speed; available: range_m, bearing_rad"),
         (f"{SEEN}.range_scale=inf", "expected a factor, such as -1 or 3.6"),
-        (f"{SEEN}.range_matrix=1", "range_m is no vector of three entries"),
-        (f"{SEEN}.range_sign=2", "of a topic can be set"),
+        (f"{SEEN}.range_matrix=1", "range_m is not a vector of three entries"),
+        (f"{SEEN}.range_sign=2", "settings of a topic are"),
         ("/robot1/truth.covers=most", "expected some or all"),
         (f"{SEEN}.covers=some", "only truths cover targets"),
         (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
-        (f"{SEEN}.exchanged={ODOMETRY}", "only topics of one type are exchanged"),
+        (f"{SEEN}.exchanged={ODOMETRY}", "only topics of the same type can be swapped"),
         ("/landmarks.exchanged=3", "expected two numbers, such as 3,9, or another topic"),
-        ("/landmarks.origin=here", "expected a place in m, such as -0.65,0.3"),
+        ("/landmarks.origin=here", "expected a position in m, such as -0.65,0.3"),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_a_sentence(

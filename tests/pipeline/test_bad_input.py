@@ -285,7 +285,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     ),
     "report result-older": ("result-older/result.json", "an older version of fuselog", "write it again"),
     "report result-damaged": ("result-damaged", "run the experiment again"),
-    "diagnose log.mcap other.mcap -e ekf": ("2 logs", "one log is diagnosed", "to fuselog tune"),
+    "diagnose log.mcap other.mcap -e ekf": ("2 logs", "give one log", "fuselog tune takes"),
     # where to write
     "record landmarks --out folder": ("'folder' is a directory",),
     "record landmarks --out /dev/null": ("/dev/null", "not a regular file"),

@@ -143,17 +143,15 @@ def test_bounds_above_zero_leave_a_parameter_its_intervals() -> None:
 
 def test_what_cannot_be_calibrated_is_refused() -> None:
     log = recorded(drive(None, duration_s=3.0))
-    with pytest.raises(
-        fl.BadInput, match="--fixed lever_z_m: is not of the calibration; it is forward_"
-    ):
+    with pytest.raises(fl.BadInput, match="--fixed lever_z_m: is not a calibration parameter: forward_"):
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
     with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
         fl.calibrate(log, "ekf", by="rmse")
     bounds = {"lever_x_m": (0.1, 2.0)}
     with pytest.raises(
         fl.BadInput,
-        match=r"--bound lever_x_m=0.1:2: the search starts from 0, which must lie between; give other "
-        r"bounds, or --set lever_x_m=...",
+        match=r"--bound lever_x_m=0.1:2: expected bounds above zero on both sides of the start "
+        r"value, 0; give other bounds, or --set lever_x_m=...",
     ):
         fl.calibrate(log, "ekf", bounds=bounds)
     without = replace(
@@ -373,7 +371,7 @@ def test_what_depends_on_a_value_that_is_held_is_said() -> None:
 
 def test_a_search_without_a_usable_value_says_so() -> None:
     none = Best(3, np.empty(0), np.inf)
-    assert progress_of(none) == "3 evaluations; no values so far with which all logs can be replayed"
+    assert progress_of(none) == "3 evaluations; no values found yet with which all logs can be replayed"
     found = Best(4, np.array([0.25]), 1.0, ["lever_x_m"])
     assert progress_of(found) == "4 evaluations; best so far: lever_x_m 0.25"
 
@@ -394,7 +392,9 @@ def test_a_delay_may_put_fixes_before_the_prior() -> None:
     row = found.parameters.iloc[0]
     assert row["low"] < 0.06 < row["high"]
     assert row["high"] - row["low"] < 0.08
-    assert any(each.startswith("/robot1/fix: its first messages, 3 in") for each in found.notes)
+    assert any(
+        each.startswith("/robot1/fix: the search left out the first 3 messages") for each in found.notes
+    )
 
 
 def test_ctrl_c_in_the_second_search_ends_with_the_best_of_the_first(

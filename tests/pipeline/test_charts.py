@@ -266,7 +266,7 @@ def test_a_profile_falls_from_the_maximum_along_its_parameter() -> None:
     chart = Tuning.profile_chart.fget(tuned)
     labels = {"sigma": "standard deviation", "bias": "bias"}
     wanted = {
-        f"log-likelihood less its greatest over {labels[each.name]}": {
+        f"log-likelihood relative to its maximum over {labels[each.name]}": {
             "log-likelihood": [each.along, -each.rise],
             "by curvature": [each.along, -each.parabola],
             "95 %": [each.along[[0, -1]], [-1.92073, -1.92073]],

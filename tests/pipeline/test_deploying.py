@@ -146,7 +146,7 @@ def test_check_says_whether_the_c_is_as_the_golden(
     assert said.out.startswith("all ")
     said = run_here("check", log, "--against", "other.golden.xz", "-e", f"lib:{library}")
     assert said.code == 2
-    assert "was deployed from another filter" in said.err
+    assert "was deployed from a different filter" in said.err
     source = folder / "robot_ekf.c"
     text = source.read_text()
     source.write_text(text.replace("+= C[row][i] * v[i];", "+= 1.0001 * C[row][i] * v[i];"))
@@ -305,7 +305,7 @@ def test_single_precision_says_where_it_breaks_and_the_square_root_holds(tmp_pat
         folder = fl.deploy(log, fl.modelled(CART, kind), tmp_path / kind.replace(":", "_"), single=True)
         costs[kind] = json.loads((folder / "certificate.json").read_text())["single"]
     assert costs["ekf"]["lost_event"] > 0
-    assert "take the square-root form" in (tmp_path / "ekf/README.md").read_text()
+    assert "use a square-root form" in (tmp_path / "ekf/README.md").read_text()
     assert costs["sqrt:ekf"]["lost_event"] is None
     assert costs["sqrt:ekf"]["furthest"] < 1e-4
     assert costs["sqrt:ekf"]["estimates"] == 150
@@ -345,8 +345,8 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     log = recorded(tmp_path, "landmarks", duration_s=2.0)
     out = tmp_path / "robot_ekf"
     for label, options, sentence in (
-        ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
-        ("lrkf:rukf-10", {"model": "robot"}, "lrkf:rukf-10 draws its samples anew for every step"),
+        ("smoother:ekf", {"model": "robot"}, "smoother:ekf: this estimator cannot be written as C"),
+        ("lrkf:rukf-10", {"model": "robot"}, "lrkf:rukf-10 draws new samples in every step"),
         ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
     ):
         with pytest.raises(BadInput, match=sentence):
@@ -367,7 +367,7 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     assert not out.exists()
     out.mkdir()
     (out / "mine.c").write_text("mine")
-    with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
+    with pytest.raises(BadInput, match="robot_ekf: the folder is not empty; give another one with -o"):
         fl.deploy(log, "ekf", out, model="robot")
     assert [each.name for each in out.iterdir()] == ["mine.c"]
 
@@ -408,7 +408,7 @@ def test_a_filter_is_written_where_it_was_asked_for_and_nowhere_else(
         assert f"| `{name}_update_range_bearing` | range_bearing | {data} |" in readme
         assert f"Made by `fuselog deploy` from {log.name};" in readme
         for place, sentence in (
-            (out, f"{Path(out)}: is not empty; give another folder with -o, or empty it yourself\n"),
+            (out, f"{Path(out)}: the folder is not empty; give another one with -o, or empty it\n"),
             ("a file", "Invalid value for '-o' / '--out': Directory 'a file' is a file"),
         ):
             refused = run_here(*words, place)

@@ -170,7 +170,7 @@ def first(source: fl.MemorySource, **settings: float) -> Any:
 def test_nothing_is_found_where_nothing_is_wrong(run: fl.MemorySource) -> None:
     found = fl.diagnose(run, "ekf")
     assert found.sentences == []
-    assert found.told[0].startswith(f"nothing found: of {found.hypotheses} faults none surely gains")
+    assert found.told[0].startswith(f"nothing found: none of {found.hypotheses} faults reaches")
     assert found.least_gain == least_gain(found.hypotheses)
     assert found.components["mean_square"].between(0.8, 1.2).all()
 
@@ -222,7 +222,13 @@ def test_messages_are_lost_of_a_regular_topic_alone(
     ("alteration", "by", "kind", "topic", "said"),
     [
         (alter.shifted("range_m"), 0.2, "bias or turned frame", SEEN, "range_m is too large by"),
-        (alter.shifted("bearing_rad"), 0.05, "bias or turned frame", SEEN, "or the sensor's frame is"),
+        (
+            alter.shifted("bearing_rad"),
+            0.05,
+            "bias or turned frame",
+            SEEN,
+            "or equivalently the sensor's frame is",
+        ),
         (alter.thinned(5), 0.3, "lost messages", SEEN, "loses 27 % of its messages"),
         (alter.shifted("mean", 2), 0.6, "start", "/robot1/prior", "heading_rad at the start is"),
         (
@@ -230,7 +236,7 @@ def test_messages_are_lost_of_a_regular_topic_alone(
             0,
             "exchanged numbers",
             "/landmarks",
-            "3 and 9 are exchanged",
+            "3 and 9 are swapped",
         ),
     ],
 )
@@ -283,7 +289,7 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
         ("place", "/robot1/fix"),
     ]
     assert not found[0].setting
-    assert "the gate that is set keeps these out" in found[0].sentence
+    assert "the gate that is set rejects these" in found[0].sentence
 
 
 @pytest.mark.paper
@@ -368,7 +374,8 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     [cause], listed, _ = find_causes(likelihood, base, [*alike, replace(alike[0])], 5)
     assert len(cause.others) == 1
     assert (
-        "; or else, which this log does not tell from it, /robot1/prior: x_m at the start" in cause.words
+        "; or, which this log does not distinguish from it, /robot1/prior: x_m at the start"
+        in cause.words
     )
     assert [each.at.gain for each in listed] == pytest.approx([cause.gain] * 2)
 
@@ -485,8 +492,9 @@ def test_components_of_which_the_same_is_true_are_one_sentence() -> None:
         "stated too large"
     )
     assert biased.evidence == (
-        "vehicle/fix: the innovations of z_m are 2.98 times larger than their variances say (NIS is "
-        "8.9, if consistent 0.784 to 1.25): on average they are 2.94 standard deviations: it is biased"
+        "vehicle/fix: the innovations of z_m are 2.98 times larger than their variances state (NIS "
+        "is 8.9, consistent from 0.784 to 1.25): their mean is 2.94 standard deviations: "
+        "the sensor is biased"
     )
 
 
@@ -541,14 +549,14 @@ def test_the_command_the_report_and_the_timeline_say_the_same(
 
 def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySource) -> None:
     with pytest.raises(
-        fl.BadInput, match="dead-reckoning gives no innovations, and a diagnosis needs them"
+        fl.BadInput, match="dead-reckoning gives no innovations, which a diagnosis needs"
     ):
         fl.diagnose(run, "dead-reckoning")
     with pytest.raises(fl.BadInput, match="name the estimator to diagnose with -e"):
         fl.diagnose(run)
-    with pytest.raises(fl.BadInput, match="one estimator is diagnosed at a time"):
+    with pytest.raises(fl.BadInput, match="give one estimator; only one can be diagnosed at a time"):
         fl.diagnose(run, {"ekf": {}, "ukf": {}})
-    with pytest.raises(fl.BadInput, match="2 logs: one log is diagnosed at a time; give one, such as"):
+    with pytest.raises(fl.BadInput, match="2 logs: give one log, such as"):
         fl.diagnose([run, run], "ekf")  # type: ignore[arg-type]
     log = tmp_path / "run.mcap"
     fl.write(log, run)
@@ -557,7 +565,7 @@ def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySour
 def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource) -> None:
     streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/truth")}
     found = fl.diagnose(replace(run, streams=streams), "ekf")
-    assert any(note.startswith("no truth: errors and NEES are left out") for note in found.notes)
+    assert any(note.startswith("no truth: errors and NEES are missing") for note in found.notes)
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
 
 

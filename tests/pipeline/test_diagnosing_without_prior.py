@@ -121,9 +121,9 @@ def test_what_is_inconsistent_and_has_no_name_is_said_to_be(monkeypatch: pytest.
     [found] = fl.diagnose(source(0.5 * values), {"level": fl.modelled(model, "ekf")}).sentences
     assert found.kind == "unnamed"
     assert found.sentence.startswith(
-        "the estimate: something is wrong that I cannot name: NIS per component"
+        "the estimate: something is wrong, but the cause is unknown: NIS per component"
     )
-    assert "in 999 of 1,000 logs, and none of" in found.sentence
+    assert "(in 999 of 1,000 logs); none of" in found.sentence
     well = fl.diagnose(source(values), {"level": fl.modelled(model, "ekf")})
     assert well.sentences == []
 
@@ -190,7 +190,7 @@ def test_what_another_number_explains_as_well_is_not_determined(
     tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), 10.0, lambda _, at: at, late, lambda _: None)  # type: ignore[arg-type,return-value]
     [[cause], *_] = find_causes(likelihood, 0.0, [tried], 1)  # type: ignore[arg-type]
     assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
-    other = f"; this log does not determine it: as likely, {values[-1]:.2f} late;"
+    other = f"; this log does not determine it, equally likely: {values[-1]:.2f} late;"
     assert (other in cause.words) == (len(values) > 1)
 
 
@@ -262,7 +262,7 @@ def test_a_fit_that_does_not_converge_has_no_interval() -> None:
     found = fit(likelihood, np.zeros(2), supposed, has_ends=True)  # type: ignore[arg-type]
     assert np.isnan(found.ends).all()
     cause = Cause(flat.faults[0], found.faults[0].value, found.ends[0], 10.0)
-    assert re.match(r"0 is \d\.\d{3} \(no interval: the fit of all causes", cause.statement)
+    assert re.match(r"0 is \d\.\d{3} \(no interval: the joint fit of all causes", cause.statement)
 
 
 def test_a_part_of_a_log_has_the_same_measurements_in_any_order() -> None:
@@ -313,8 +313,8 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     fl.write(log, car(2000))
     found = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert found["found"] == [
-        f"nothing found: of {found['hypotheses']} faults none surely gains {found['least_gain']:.3g} in "
-        "log-likelihood"
+        f"nothing found: none of {found['hypotheses']} faults reaches the gain in log-likelihood "
+        f"needed, {found['least_gain']:.3g}"
     ]
     fl.write(log, car(2000, 1 / 256))
     wrong = fuselog("diagnose", log, "-e", "ekf", "--json").json

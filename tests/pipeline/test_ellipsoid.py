@@ -53,7 +53,7 @@ def test_readings_of_one_side_determine_nothing() -> None:
     stream = log.streams["/imu"]
     is_near = stream["magnetic_field_ut"] @ [1.0, 0.0, 0.0] > 44.0
     found = fl.ellipsoid(fl.Recording([stream.take(np.flatnonzero(is_near))]), study.FIELD)
-    assert "to too few sides; that does not determine offset_x" in found.notes[0]
+    assert "to too few sides, which does not determine offset_x" in found.notes[0]
     assert found.left_open == list(NAMES)
 
 
@@ -71,7 +71,7 @@ def test_the_one_axis_of_turns_is_named(axis: int) -> None:
         **{**stream.columns, "magnetic_field_ut": column},
     )
     found = fl.ellipsoid(fl.Recording([turned]), study.FIELD, length=study.FIELD_UT)
-    assert f"about one axis only, near {'xyz'[axis]}; that does not determine" in found.notes[0]
+    assert f"about one axis only, near {'xyz'[axis]}, which does not determine" in found.notes[0]
     assert {f"offset_{'xyz'[axis]}", f"scale_{'xyz'[axis]}"} <= {*found.left_open}
     assert found.table.set_index("parameter").loc[found.left_open].isna().all(axis=None)
     assert found.settings == {}

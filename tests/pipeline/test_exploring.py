@@ -32,7 +32,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.replay.estimators.landmarks import ROBOT
 
 SURE = {"sigma_range_m": 0.03}  # of .1
-GOOD = "Nothing speaks against it."
+GOOD = "No problem found."
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +271,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     is_out["NIS per component"] = (case.nis.mean < case.nis.low) | (case.nis.mean > case.nis.high)
     for (words, outside), name in zip(is_out.items(), ("error", "nis", "nees"), strict=True):
         share = np.mean(outside)
-        said = f"{words}: outside {100 * share:.{int(share < 0.1)}f} %; 5 % is right"
+        said = f"{words}: outside {100 * share:.{int(share < 0.1)}f} %; 5 % expected"
         assert titles[name] == said
     assert titles["scene"] == "Scene from above (m)"
     assert titles["lens"] == f"Lens at {page._at_s:.1f} s (m)"
@@ -326,7 +326,7 @@ def test_the_newest_work_wins() -> None:
 @pytest.mark.parametrize(
     ("estimators", "sentence"),
     [
-        (["ekf", "ukf", "iekf"], "ekf, ukf, iekf: at most 2 filters are explored at a time"),
+        (["ekf", "ukf", "iekf"], "ekf, ukf, iekf: explore takes at most 2 filters at a time"),
         (["network"], "network"),
     ],
 )
@@ -435,7 +435,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         )
         page.on("pageerror", lambda error: said.append(str(error)))
         page.goto(explorer.url)
-        page.wait_for_selector("text=Nothing speaks against it.")
+        page.wait_for_selector("text=No problem found.")
         axe = pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is missing")
         page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
         assert page.evaluate("axe.run().then((each) => each.violations.map((one) => one.id))") == []
@@ -452,7 +452,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         page.wait_for_selector(f"text=--set sigma_range_m={slider.value(0.25)!r}")
         page.get_by_text("Pin", exact=True).click()
         page.get_by_text("Reset", exact=True).click()
-        page.wait_for_selector("text=Nothing speaks against it.")
+        page.wait_for_selector("text=No problem found.")
         page.wait_for_selector("text=pinned")
         assert page.get_by_text("--set sigma_range_m").count() == 0
         page.set_viewport_size({"width": 400, "height": 900})

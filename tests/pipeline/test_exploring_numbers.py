@@ -170,11 +170,11 @@ def test_a_verdict_goes_by_errors_and_then_by_innovations() -> None:
         assert verdict_of(case, alarms, ["it stopped"])[0::2] == ("failed", "it stopped")
         return f"{verdict.level}: {verdict.headline} {verdict.detail}"
 
-    over = "doubtful: Overconfident. Its {} are 2 times what it claims."
+    over = "doubtful: Overconfident. Its {} are 2 times what it states."
     assert said(2.0, 4.0) == said(2.0, 4.0, "innovations") == over.format("innovations")
     assert said(8.0, 4.0) == said(8.0, 1.0) == over.format("errors")
-    assert said(0.02, 4.0) == "doubtful: Conservative. Its errors are 0.1 of what it claims."
+    assert said(0.02, 4.0) == "doubtful: Conservative. Its errors are 0.1 of what it states."
     assert said(8.0, 4.0, "unused") == "doubtful: Doubtful. unused!"
     assert said(2.0, 1.0, "innovations") == "doubtful: Doubtful. innovations!"  # off by little
-    good = "good: Nothing speaks against it. NIS is 1.00 per component and NEES is 2.00 for 2"
+    good = "good: No problem found. NIS is 1.00 per component and NEES is 2.00 for 2"
     assert said(2.0, 1.0, "errors", of="robot2") == said(2.0, 1.0) == f"{good}, within their intervals."

@@ -13,8 +13,8 @@ DEVIATION_RADPS = 1e-4  # at 1 s
 @pytest.mark.parametrize(
     ("factor", "verdict"),
     [
-        (1.0, "is that very deviation: N in rad/s/sqrt(Hz), continuous"),
-        (1.2, "is that very deviation"),
+        (1.0, "equals it: N in rad/s/sqrt(Hz), continuous"),
+        (1.2, "equals it"),
         (20.0, "is 20 times that, sqrt of a rate of 400 Hz: divide by 20 for N"),
         (0.05, "is 0.05 times that, sqrt of a rate of 0.0025 Hz"),
     ],
@@ -28,14 +28,16 @@ def test_the_convention_of_imu_utils_is_told_by_its_curves(
     file.write_text(
         f"Gyr:\n  avg-axis:\n    gyr_n: {stated:.8e}\n    gyr_w: 1e-6\nAcc:\n  acc_w: 1e-4\n"
     )
-    assert "nothing tells which convention" in explained(file)[-1]
+    assert "the convention of these numbers is unknown" in explained(file)[-1]
     taus_s = np.array([0.1, 1.0, 10.0])
     np.savetxt(tmp_path / "data_unit_gyr_t.txt", taus_s)
     for axis in "xyz":
         curve = np.degrees(DEVIATION_RADPS) * 3600.0 / np.sqrt(taus_s)
         np.savetxt(tmp_path / f"data_unit_gyr_{axis}.txt", curve)
     *_, last = explained(file)
-    assert last.startswith(f"{file}: its curves beside it have 0.0001 rad/s at 1 s, mean of the axes")
+    assert last.startswith(
+        f"{file}: the curves next to it give 0.0001 rad/s at 1 s, the mean of the axes"
+    )
     assert verdict in last
 
 

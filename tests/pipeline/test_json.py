@@ -119,7 +119,7 @@ TABLES = {
         "components",
         "component",
         {"mean": "mean", "mean square": "mean_square", "beyond 3 sigma": "beyond_3_sigma"}
-        | {"next": "next_correlation", "white by chance": "probability_white"},
+        | {"autocorrelation": "next_correlation", "p if white": "probability_white"},
     ),
     "tune": ("parameters", "parameter", {"start": "start", **INTERVAL}),
     "calibrate": ("parameters", "parameter", {"start": "start", **INTERVAL}),
@@ -129,7 +129,7 @@ TABLES = {
         "changes",
         "change",
         {"verdict": "verdict", "sigmas": "amplification", "m": "metres", "deg": "degrees"}
-        | {"growth": "growth", "for half": "halved", "part at (s)": "parted_s", "by": "topic"},
+        | {"growth": "growth", "ratio to half": "halved", "diverge at (s)": "parted_s", "by": "topic"},
     ),
 }
 

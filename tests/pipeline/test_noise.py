@@ -252,7 +252,7 @@ def test_the_command_writes_what_others_read(
     assert f"gyroscope_noise_density: {white:.6g}" in kalibr
     walks = (row for row in said.json["numbers"] if row["term"] == "random walk K (rad/s/sqrt(s))")
     assert f"gyroscope_random_walk: {max(row['high'] for row in walks):.6g}" in kalibr  # no zero
-    assert "# turn_rate_radps: no walk was found; K is the most that it may be, with 95 %" in kalibr
+    assert "# turn_rate_radps: no walk was found; K is its 95 % upper limit" in kalibr
     assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
     shown = fuselog("info", "noise/timeline.rrd", "--json").json["entities"]
     drawn = {name.rpartition("/")[2].replace("\\", "") for name in shown if "/curves/5/" in name}
@@ -307,7 +307,7 @@ def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: P
         assert file is not None
         turn_radps = np.radians(np.load(io.BytesIO(file.read()))[:, 1].astype(float))
     found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
-    assert any("yours 1.28 (" in note for note in found.notes)
+    assert any("yours: 1.28 (" in note for note in found.notes)
     assert len(found.densities.doubts) == 1
 
 
@@ -330,13 +330,13 @@ def test_bad_input_is_a_sentence() -> None:
     moved = rest(size)["turn_rate_radps"].copy()
     moved[800:900] += 0.5 * np.sin(np.arange(100)[:, None])
     assert "the unit moves" in refused(rest(size, turn_rate_radps=moved))
-    assert "noise takes 500 in 20 s" in refused(rest(250))
+    assert "noise needs at least 500 in 20 s" in refused(rest(250))
     assert "is constant" in refused(rest(size, turn_rate_radps=np.zeros((size, 3))))
     rows = np.r_[0:500, 1500:2000]
-    assert "% of it is lost" in refused(rest(size).take(rows))
+    assert "% of the messages are lost" in refused(rest(size).take(rows))
     stamps = rest(size).publish_time_ns.copy()
     stamps[1000:] -= 1_000_000_007
-    assert "stamps go back" in refused(replace(rest(size), publish_time_ns=stamps))
+    assert "stamps go backwards" in refused(replace(rest(size), publish_time_ns=stamps))
     assert "a third of its length" in refused(rest(size), taus=[30.0])
     assert "ug/sqrt(Hz) is no rad/s/sqrt(Hz) or rad/s/sqrt(s)" in refused(
         rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"}
@@ -380,8 +380,8 @@ def test_of_a_hundred_intervals_ninety_to_ninety_nine_hold_the_truth(name: str) 
 
 def test_a_drift_is_said_with_what_decays_if_something_does() -> None:
     drift = Drift(2e-6, 1e-7, 0.0, 1.0, 40.0)
-    taken = "taken out of all numbers (log-likelihood +40)"
+    taken = "removed from all numbers (log-likelihood +40)"
     assert _drifts(drift, "rad/s") == f"drifts by 2e-06 rad/s/s; {taken}"
     warm = drift._replace(offset=0.01, time_s=30.0)
-    decays = "warms up: 0.01 rad/s that decays in 30 s, and 2e-06 rad/s/s"
+    decays = "warms up: 0.01 rad/s decays with a time constant of 30 s, plus 2e-06 rad/s/s"
     assert _drifts(warm, "rad/s") == f"{decays}; {taken}"

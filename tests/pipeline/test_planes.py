@@ -109,7 +109,7 @@ def test_a_truth_in_an_unknown_plane_is_not_judged_until_it_is_stated(
     assert said.code == 0
     assert not any("position_rmse_m" in key for key in said.json["metrics"])
     assert said.err.count("\n") == 1
-    assert "ekf car: not judged: /car/truth does not state the origin of its plane" in said.err
+    assert "ekf car: not judged: /car/truth does not state the origin of its tangent plane" in said.err
     assert "--set /car/truth.plane=" in said.err
     estimates = log.with_suffix(".estimates.mcap")
     aligned = fuselog("evaluate", estimates, "--align", "se2", "--json")
@@ -140,7 +140,7 @@ def test_planes_that_cannot_be_told_apart_are_refused(
     said = fuselog("replay", log, "-e", "ekf")
     assert said.code == 2
     assert said.err.count("\n") == 1
-    assert "/car/prior does not state the origin of its plane" in said.err
+    assert "/car/prior does not state the origin of its tangent plane" in said.err
     assert "--set /car/prior.plane=60,10,0" in said.err
     mended = fuselog("replay", log, "-e", "ekf", "--set", "/car/prior.plane=60,10,0", "--json")
     assert rmse_of(mended) < SIGMA_M

@@ -309,7 +309,7 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     assert float(value) == pytest.approx(0.1, rel=0.15)
     assert cause.mended.startswith("With that, over 2 runs: position error, RMS ")
     left = re.search(
-        r"NEES ([\d.]+), 3 is right; .* still ([\d.]+) times what is right: it is not the o",
+        r"NEES ([\d.]+), expected 3; .* still ([\d.]+) times the expected value: there",
         cause.mended,
     )
     assert left is not None

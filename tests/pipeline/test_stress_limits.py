@@ -71,7 +71,7 @@ def test_other_samples_are_no_noise_per_prediction() -> None:
     ).stressed
     said = " ".join(stressed.sentences)
     assert "an ulp of the inputs changes the covariance: other samples are drawn" in said
-    assert "noise per prediction" not in said
+    assert "per prediction" not in said
 
 
 def test_parameters_of_smoothers_are_changed() -> None:

@@ -362,7 +362,7 @@ def test_noise_per_prediction_is_a_discontinuity() -> None:
     assert stressed.ratio("stamps") == pytest.approx(1.0, abs=0.01)
     assert stamps.metres[-1] == pytest.approx(4.07, rel=0.05)  # the sheet moves the gyro alone
     said = " ".join(stressed.sentences)
-    assert "noise per prediction, not per second" in said
+    assert "noise is added per prediction, not per second" in said
     assert (
         "from 20.0 s on 0.59 rate_radps - 0.58 gyro_radps - 0.56 wheels_radps is not determined" in said
     )
@@ -375,7 +375,7 @@ def test_what_waits_for_a_microsecond_is_no_noise() -> None:
     """Nodes that hear each other at once hear each other a step later."""
     [stressed] = fl.stress(fl.record("ispace", steps=5), "network:naive").stressed
     assert stressed.verdict("stamps") == "discontinuous or chaotic"
-    assert "a microsecond decides what is taken together" in " ".join(stressed.sentences)
+    assert "a microsecond decides what is processed together" in " ".join(stressed.sentences)
     assert not stressed.is_per_prediction
 
 

@@ -7,7 +7,7 @@ NAME, T and M stand for the filter's name, the size of its tangent space, and th
 sensor; REAL, and _S at the end of numbers and functions of libm, stand for the precision.
 """
 
-CHOLESKY = """/* A = L L' in place, of the first `size` rows and columns; 0 where A is indefinite. */
+CHOLESKY = """/* A = L L' in place, for the first `size` rows and columns; 0 if A is indefinite. */
 static int cholesky(REAL *A, int stride, int size)
 {
     for (int column = 0; column < size; column++)
@@ -27,7 +27,7 @@ static int cholesky(REAL *A, int stride, int size)
 """
 
 COMMON = """\
-/* How many times larger the covariance of an innovation counts, by the options of robust updates. */
+/* The factor on the covariance of an innovation that the options of robust updates give. */
 static REAL inflation(REAL nis, int size, const NAME_gate *gate)
 {
     REAL factor = 1.0_S;
@@ -54,7 +54,7 @@ static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate
     return 1;
 }
 
-/* Makes an innovation that of nothing: all NaN, and not accepted. */
+/* Clears an innovation: all numbers are NaN, and it is not accepted. */
 static void forget(NAME_innovation *innovation)
 {
     for (int i = 0; i < NAME_INNOVATION; i++) {
@@ -86,7 +86,7 @@ static int is_noise_usable(const REAL *data, int measured, const REAL *entry)
     return 1;
 }
 
-/* What an update returns: NAME_WELL only of a finite state, and nothing is accepted otherwise. */
+/* What an update returns: NAME_WELL only for a finite state; otherwise nothing is accepted. */
 static NAME_outcome finished(const NAME *filter, int outcome, NAME_innovation *innovation)
 {
     const NAME_outcome found = outcome == NAME_WELL ? checked(filter) : (NAME_outcome)outcome;
@@ -95,7 +95,7 @@ static NAME_outcome finished(const NAME *filter, int outcome, NAME_innovation *i
     return found;
 }
 
-/* Keeps an innovation for whoever looks at it: each component that is not missing at its place. */
+/* Stores an innovation for the caller: each component that is not missing, in its place. */
 static void keep(NAME_innovation *innovation, int components, const int *places, const REAL v[M],
                  const REAL S[M][M])
 {
@@ -111,7 +111,7 @@ static void keep(NAME_innovation *innovation, int components, const int *places,
 }
 """
 
-ALGEBRA = """/* Moves the components that were measured to the front; returns how many there are. */
+ALGEBRA = """/* Moves the measured components to the front; returns their number. */
 static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
 {
     int size = 0;
@@ -132,7 +132,7 @@ static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
     return size;
 }
 
-/* v becomes L^-1 v and S its factor L; the NIS is the square of that. 0 where S is indefinite. */
+/* v becomes L^-1 v and S its factor L; the NIS is the square of v. 0 if S is indefinite. */
 static int whiten(int size, REAL v[M], REAL S[M][M], REAL *nis)
 {
     *nis = 0.0_S;

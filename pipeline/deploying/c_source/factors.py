@@ -4,7 +4,7 @@ Names are those of `algebra`; ROWS and COLUMNS are the largest size of an array 
 """
 
 FACTORISING = """\
-/* What is factorised: rows, the weights of their columns, and the factor that is found. */
+/* Rows to factorise, the weights of their columns, and the resulting factor. */
 typedef struct {
     REAL rows[ROWS][COLUMNS], weights[COLUMNS], factor[ROWS][ROWS];
 } factorisation;

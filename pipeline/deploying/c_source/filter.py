@@ -123,7 +123,7 @@ static int is_finite(const double *numbers, int count)
 }
 """
 _FINITE_IN_SINGLE = """\
-/* Whether numbers are finite: so is their sum, for inf - inf is NaN. */
+/* Whether numbers are finite: then sum - sum is 0, and otherwise NaN. */
 static int is_finite(const float *numbers, int count)
 {
     float sum = 0.0f;
@@ -141,7 +141,7 @@ static NAME_outcome checked(const NAME *filter)
                : NAME_NOT_FINITE;
 }
 
-/* The time from a stamp to one that is not before it. */
+/* The time from a stamp to a later or equal one. */
 static double seconds(int64_t from_ns, int64_t to_ns)
 {
     return (double)((uint64_t)to_ns - (uint64_t)from_ns) * 1e-9;

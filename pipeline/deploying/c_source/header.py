@@ -10,7 +10,7 @@ from fuselog.replay.inference.formulas import reference_names
 from fuselog.replay.inference.model.model import Sensor
 
 _COVARIANCE = """\
-/* The covariance, of the lower factor L that the filter carries: L L'. */
+/* The covariance L L' from the lower factor L that the filter carries. */
 void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANGENT]);
 """
 
@@ -25,7 +25,7 @@ def header(made: CFilter) -> str:
         f" * Made by fuselog deploy; graphs and numbers {made.digest}. Licence: Apache-2.0, or yours.",
         " *",
         " * No heap, no recursion, no arrays of varying length. Times are in nanoseconds. The",
-        " * covariance is in the tangent space: of a quaternion's four components it has three. */",
+        " * covariance is in the tangent space, which has three components for a quaternion. */",
         f"#ifndef {upper}_H\n#define {upper}_H\n",
         "#include <stdint.h>\n",
         f'#define {upper}_DIGEST "{made.digest}"\n',
@@ -39,7 +39,7 @@ def header(made: CFilter) -> str:
         filled(
             made,
             """/* A measurement with a larger NIS than nis[its components] is not used, unless the last
- * one that was used is more than reopens_s ago; the others make what is used count less. NAN: off. */
+ * used one is more than reopens_s ago; the other options reduce the weight of used ones. NAN: off. */
 typedef struct {
     REAL nis[NAME_MOST + 1];
     double reopens_s;
@@ -61,7 +61,7 @@ typedef struct {
     int64_t accepted_ns[NAME_SENSORS + 1]; /* when a measurement was last used */
 GAP} NAME;
 
-/* Measured minus predicted, and its covariance before the update; NAN where a component is missing. */
+/* Measured minus predicted, and its covariance before the update; NAN if a component is missing. */
 typedef struct {
     REAL difference[NAME_INNOVATION];
     REAL covariance[NAME_INNOVATION][NAME_INNOVATION];
@@ -69,7 +69,7 @@ typedef struct {
     int is_accepted; /* 1 if the measurement changed the state; only together with NAME_WELL */
 } NAME_innovation;
 
-/* Starts at a prior, undriven. A prior that cannot be used leaves a state that is not finite. */
+/* Starts at a prior, without a control. An invalid prior leaves a state that is not finite. */
 NAME_outcome NAME_init(NAME *filter, int64_t time_ns, const REAL *mean,
     const REAL *covariance);
 
@@ -77,7 +77,7 @@ FACTOR""".replace("CARRIED", "factor" if made.is_root else "covariance")
             .replace("FACTOR", _COVARIANCE if made.is_root else "")
             .replace(
                 "GAP",
-                "    int is_in_gap; /* whether what drives it is silent */\n" if made.has_gaps else "",
+                "    int is_in_gap; /* whether the control is silent */\n" if made.has_gaps else "",
             ),
         ),
         _predict_comment(made),
@@ -151,26 +151,26 @@ def predict_signature(made: CFilter) -> str:
 def _predict_comment(made: CFilter) -> str:
     if made.is_interpolated:
         return _between_comment(made)
-    driven = "; filter->control holds until it is changed" if made.controls else ""
+    driven = "; filter->control holds until you change it" if made.controls else ""
     return f"/* Predicts to a time{driven}. */"
 
 
 def _between_comment(made: CFilter) -> str:
     control = made.filtering.stage.model.control
     assert control is not None
-    note = "Predicts to a time, driven by the mean of the last control and that at this time."
+    note = "Predicts to a time with the mean of the last control and that at this time."
     if not made.has_gaps:
         return f"/* {note} */"
     after = (
-        "the next prediction with a control passes over all of it"
+        "the next prediction with a control covers the whole gap"
         if made.steps.gap is not None
         else "the filter has to be started again"
     )
     silent = made.filtering.gap_ns * 1e-9
     return (
-        f"/* {note}\n * Hand over NAN where {control.topic} is silent for longer than {control.gap},\n"
+        f"/* {note}\n * Pass NAN while {control.topic} is silent for longer than {control.gap},\n"
         f" * {silent:g} s, up to its first message then: {made.name.upper()}_NOT_DRIVEN says that the\n"
-        f" * estimate is unknown, messages are not to be used, and {after}. */"
+        f" * estimate is unknown, messages must not be used, and {after}. */"
     )
 
 

@@ -62,7 +62,7 @@ _DRIVEN = """\
         return NAME_BAD_INPUT;
 """
 _STEP = "static NAME_outcome predict(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"
-_PASS_GAP = """/* Over a gap of what drives it: the mean stays, the covariance widens. */
+_PASS_GAP = """/* Over a gap of the control, the mean stays and the covariance grows. */
 static NAME_outcome pass_gap(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"""
 
 

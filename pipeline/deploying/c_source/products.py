@@ -83,7 +83,7 @@ FACTORS
 }
 """
 
-SLOPE = """/* P a / (a' P a): how the state changes with what bends along a. */
+SLOPE = """/* P a / (a' P a): how the state changes along a, in which it is curved. */
 static void find_slope(const REAL P[T][T], const REAL a[T], REAL slope[T])
 {
     REAL variance = 0.0_S;

@@ -22,8 +22,8 @@ from fuselog.replay.tracing.graph import Node, steady
 SETTLED_IN_SINGLE = 1e-7  # see `manifold.SETTLED`
 
 TYPE = """\
-/* What a function makes of samples: tangent vectors of these from the mean, behind which noise stands,
- * and of its values from their centre, less a shift. */
+/* The results of a function at samples: tangent vectors of the samples from the mean, followed by noise,
+ * and of its values from their centre, minus a shift. */
 typedef struct {
     REAL factor[DRAWN][DRAWN]; /* of the covariance of state and noise */
     REAL offsets[SAMPLES][DRAWN], values[SAMPLES][VALUES];
@@ -54,7 +54,7 @@ static void find_shift(drawn_samples *samples, int count, const REAL *weights, i
 """
 
 NARROWING = """\
-/* The variances of so many tangent components, summed. */
+/* The sum of the variances of `width` tangent components. */
 static REAL squared_length(const drawn_samples *samples, int first, int width)
 {
     REAL squared = 0.0_S;
@@ -64,7 +64,7 @@ static REAL squared_length(const drawn_samples *samples, int first, int width)
     return squared;
 }
 
-/* The share of the factor at which samples are taken, so that no angle comes round: 1 unless one is
+/* The share of the factor at which samples are taken, so that no angle wraps: 1 unless an angle is
  * hardly known. A motion (`bounded`) samples no angle wider than uniform. */
 static REAL narrow(drawn_samples *samples, int count, int size, const REAL *points, REAL unsuspected,
                    int bounded)
@@ -112,7 +112,7 @@ static REAL narrow(drawn_samples *samples, int count, int size, const REAL *poin
     return share;
 }
 
-/* Offsets and values of narrowed samples, as wide as they are meant. */
+/* Rescales offsets and values of narrowed samples to their full width. */
 static void widen(drawn_samples *samples, int count, int drawn, int size, REAL share)
 {
     for (int index = 0; index < count; index++) {
@@ -127,7 +127,7 @@ static void widen(drawn_samples *samples, int count, int drawn, int size, REAL s
 """
 
 MOMENTS = """\
-/* The state's factor, with room for noise behind it; 0 where its covariance is indefinite. */
+/* The state's factor, with room for noise behind it; 0 if its covariance is indefinite. */
 static int start_samples(const NAME *filter, drawn_samples *samples)
 {
     for (int row = 0; row < DRAWN; row++)
@@ -137,7 +137,7 @@ static int start_samples(const NAME *filter, drawn_samples *samples)
     return cholesky(&samples->factor[0][0], DRAWN, T);
 }
 
-/* The covariance of the values, and where `cross` is not NULL that of the state with them. */
+/* The covariance of the values and, if `cross` is not NULL, that of the state with them. */
 static void find_moments(const drawn_samples *samples, int count, const REAL *weights, int size,
                          REAL *spread, int stride, REAL (*cross)[M])
 {
@@ -297,10 +297,8 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
     needed = [each for sign, each in given.items() if sign in text]
     typed = ", ".join([*(each for each, _ in needed), "drawn_samples *samples"])
     call = ", ".join([*(each for _, each in needed), "&samples"])
-    what = "the motion makes" if number == 0 else f"{name} measures"
-    head = (
-        f"/* What {what} of samples, and the mean of that. */\nstatic void sample_{name}({typed})\n{{\n"
-    )
+    what = "the motion gives" if number == 0 else f"{name} measures"
+    head = f"/* What {what} at samples, and the mean of it. */\nstatic void sample_{name}({typed})\n{{\n"
     return filled(made, head + text + "}\n"), f"sample_{name}({call});"
 
 
@@ -353,7 +351,7 @@ def _settling(made: CFilter, number: int) -> list[str]:
         "}",
     ]
     head = (
-        "/* The centre becomes the mean of the values: what they are away from it sums to zero. */\n"
+        "/* The centre becomes the mean of the values: their deviations from it sum to zero. */\n"
         f"static void settle_{name}(drawn_samples *samples)\n{{\n"
     )
     return [filled(made, head + body(lines) + "}\n")]

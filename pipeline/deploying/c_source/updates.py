@@ -31,7 +31,7 @@ def correcting_text(made: CFilter) -> list[str]:
     texts = []
     if direction is not None:
         names, declared = Inputs(made, "").names(direction)
-        text = "/* Along what the state bends when it is moved. */\n"
+        text = "/* Finds how the state changes in the direction in which it is curved. */\n"
         text += "static void bend(NAME *filter, REAL slope[T])\n{\n"
         text += body([*declared, "REAL a[T];"])
         text += body(c_lines(entries(direction, "a"), names, made.precision))

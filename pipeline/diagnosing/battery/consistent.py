@@ -89,8 +89,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 FALSE_CAUSES = Study(
-    "how often a diagnosis names a cause in a log with nothing wrong, whatever noise is the largest",
+    "how often a diagnosis names a cause in a log without a fault, for many ratios of noise",
     study,
     FalseCausesOptions,
-    runs="logs of each setting of the noise, of which there are 20 unless options name others",
+    runs="logs per noise setting; there are 20 settings unless options give others",
 )

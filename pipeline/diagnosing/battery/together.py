@@ -161,8 +161,8 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 
 
 FAULTS_TOGETHER = Study(
-    "how often a diagnosis names two or three faults that are planted into a log, with their values",
+    "how often a diagnosis names two or three faults planted in a log, with their values",
     study,
     TogetherOptions,
-    runs="logs of each pair and each triple",
+    runs="logs per pair and per triple",
 )

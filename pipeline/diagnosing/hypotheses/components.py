@@ -94,7 +94,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
     specials |= {-at: f"{meaning} that are converted twice" for at, meaning in specials.items()}
 
     def words(at: float, low: float, high: float) -> str:
-        more = f", as {specials[at]}" if at in specials else ""
+        more = f", as if {specials[at]}" if at in specials else ""
         ends = [0.0, max(abs(low), abs(high))] if low * high <= 0.0 else sorted((abs(low), abs(high)))
         size = "large" if at > 0.0 else "small"
         factor, least, most = (number(np.exp(each), 4) for each in (abs(at), *ends))
@@ -138,7 +138,7 @@ def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
         bias = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
         if not entry.is_angle:
             return bias
-        return f"{bias}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
+        return f"{bias}, or equivalently the sensor's frame is rotated by {np.degrees(-at):.2g} deg"
 
     def mend(at: float) -> Advice:
         if own and own.bias:
@@ -187,7 +187,7 @@ def _turn(topic: str, field: str) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
         at, low, high = (float(np.degrees(each)) for each in (at, low, high))
         size = f"{at:.3g} ({low:.3g} to {high:.3g}) deg"
-        return f"{topic}: {field} is turned about the vertical by {size}"
+        return f"{topic}: {field} is rotated about the vertical by {size}"
 
     def mend(at: float) -> Advice:
         return Advice(f"{topic}.{bare(field)}_turn", precise(at))
@@ -208,7 +208,7 @@ def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:
         topic,
         field,
         in_topic(topic, alter.permuted(field, order)),
-        f"{topic}: {names} of {field} are exchanged",
+        f"{topic}: {names} of {field} are swapped",
         Advice(f"{topic}.{bare(field)}_axes", axes),
     )
 
@@ -221,7 +221,7 @@ def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis
         is_so, at, low, high = in_sense(at, low, high)
         return (
             f"{topic}: the heading is {is_so} by {at:.3g} ({low:.3g} to {high:.3g}) deg: an offset, "
-            "the magnetic declination or how the sensor is mounted, which are the same"
+            "the magnetic declination or the sensor's mounting, which have the same effect"
         )
 
     kind: Kind = "bias or turned frame"

@@ -40,7 +40,7 @@ def of_numbers(
         known = set(source.streams[topic][field].tolist())
         for first, second in combinations(sorted(each for each in targets if each in known), 2):
             without = in_topic(topic, alter.renumbered(field, first, second))
-            words = f"{topic}: {field} {first} and {second} are exchanged"
+            words = f"{topic}: {field} {first} and {second} are swapped"
             advice = Advice(f"{topic}.exchanged", f"{first},{second}")
             yield supposed("exchanged numbers", topic, f"{first} {second}", without, words, advice)
     of_case = {split_topic(each.name + "/_")[1]: each.streams for each in bound}
@@ -48,7 +48,7 @@ def of_numbers(
     for one, other in combinations(sorted(each for each in cases if each in of_case), 2):
         for here, there in zip(of_case[one], of_case[other], strict=False):
             if source.topics[here].schema_name == source.topics[there].schema_name:
-                words = f"{here} and {there} are exchanged"
+                words = f"{here} and {there} are swapped"
                 advice = Advice(f"{here}.exchanged", there)
                 without = _back(here, there)
                 yield supposed("exchanged numbers", here, there, without, words, advice)

@@ -35,9 +35,7 @@ def _of_positions(stream: Stream) -> Hypothesis:
 
     def words(at: Metres, low: Metres, high: Metres) -> str:
         x, y = _too_far(at, low, high)
-        return (
-            f"{stream.topic}: its positions are {x} along x and {y} along y: its origin is another one"
-        )
+        return f"{stream.topic}: its positions are {x} along x and {y} along y: its origin is different"
 
     def mend(at: Metres) -> Advice:
         place = ",".join(f"{precise(-each)}" for each in at)
@@ -68,8 +66,8 @@ def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
     def words(at: Metres, low: Metres, high: Metres) -> str:
         east, north = _too_far(at, low, high)
         return (
-            f"{stream.topic}: its fixes are {east} east and {north} north: the origin of the plane is "
-            "another one"
+            f"{stream.topic}: its fixes are {east} east and {north} north: the origin of the tangent "
+            "plane is different"
         )
 
     def mend(at: Metres) -> Advice:

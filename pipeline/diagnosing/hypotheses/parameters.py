@@ -124,7 +124,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
     for field, spread in fields:
 
         def words(at: float, low: float, high: float, field: str = field) -> str:
-            changes = f"of {field} the standard deviation is {times(at, low, high)}"
+            changes = f"the standard deviation of {field} is {times(at, low, high)}"
             return f"{stream.topic}: {changes}, so that R is too {size_of(at)}"
 
         def mend(at: float) -> Advice:
@@ -239,8 +239,8 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
         return trial._replace(settings=settings | ({"gate_reopens_s": reopens_s} if reopens else {}))
 
     def words(reopens_s: float, *_: float) -> str:
-        which = "some measurements" if reopens_s == REOPENS_S else "the measurements of whole stretches"
-        return f"{which} are outliers: of something else, or false"
+        which = "some measurements" if reopens_s == REOPENS_S else "whole stretches of measurements"
+        return f"{which} are outliers: false, or of something else"
 
     found = supposed("outliers", "gate_probability", "", without, "", Advice("gate_probability", GATE))
     yield replace(found, words=words, specials=(REOPENS_S, NEVER_S) if reopens else (REOPENS_S,))

@@ -228,7 +228,7 @@ def test_a_filter_that_diverged_is_not_told_to_give_innovations(log: str) -> Non
         results.squared[-1] = np.inf
 
     given = {"mine": recursion(follow=diverging, compiled=False)}
-    with pytest.raises(fl.BadInput, match="mine diverges at the values that the search starts from"):
+    with pytest.raises(fl.BadInput, match="mine diverges with the start values of the search"):
         fl.tune(log, given, "drift_density")
     assert any(
         "mine diverged: its log-likelihood is -inf" in each for each in fl.diagnose(log, given).notes
@@ -242,16 +242,16 @@ def test_without_a_likelihood_it_is_said_what_to_fill(log: str, field: str) -> N
         getattr(results, field)[:] = np.nan
 
     fill = (
-        "fill results.innovation, results.innovation_covariance and results.squared, with their "
-        "components named in `measured`"
+        "fill results.innovation, results.innovation_covariance and results.squared, and name the "
+        "components in `measured`"
     )
     mine = {"mine": recursion(follow=lacking, compiled=False)}
     if field == "squared":
-        with pytest.raises(fl.BadInput, match="mine gives no innovations, and a diagnosis") as told:
+        with pytest.raises(fl.BadInput, match="mine gives no innovations, which a diagnosis") as told:
             fl.diagnose(log, mine)
         assert fill in str(told.value)
     else:
         assert any(fill in note for note in fl.diagnose(log, mine).notes)
-    with pytest.raises(fl.BadInput, match="no innovations with a likelihood there") as told:
+    with pytest.raises(fl.BadInput, match="no innovations with a likelihood on this log") as told:
         fl.tune(log, mine, "drift_density", by="likelihood")
     assert fill in str(told.value)

@@ -60,7 +60,7 @@ def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_fil
     notes = [[each for each in of.notes if "mine gives no innovations" in each] for of in tuned]
     assert [len(each) for each in notes] == [0, 1]
     with pytest.raises(
-        BadInput, match="mine gives no innovations with a likelihood there; tune by another"
+        BadInput, match="mine has no innovations with a likelihood on this log; tune by one of"
     ):
         fl.tune(log, mute, "drift_density", by="likelihood")
     assert 1.0 < values[0][0] < 100.0
