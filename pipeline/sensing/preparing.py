@@ -179,7 +179,7 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
         step_s: the grid's step.
 
     Returns:
-        The drift; None where it explains too little.
+        The drift; None if it explains too little.
     """
     block = -(-len(values) // _DRIFT_SAMPLES)
     means, step_s = block_means(values, block), step_s * block
@@ -239,7 +239,7 @@ def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
         step_s: the grid's step.
 
     Returns:
-        Its frequency in Hz and its amplitude in the unit of the samples; None where there is no line.
+        Its frequency in Hz and its amplitude in the unit of the samples; None if there is no line.
     """
     part = values[:MOST]
     part = np.where(np.isfinite(part), part - np.nanmean(part), 0.0)

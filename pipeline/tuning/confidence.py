@@ -29,7 +29,7 @@ class Confidence(NamedTuple):
     Attributes:
         places: (m,) the indices of these parameters.
         curvature: (m, m) the second derivatives of the cost in coordinates.
-        covariance: (m, m) its inverse; variances are infinite where the cost does not rise.
+        covariance: (m, m) its inverse; variances are infinite in directions without a rise.
     """
 
     places: Sequence[int]

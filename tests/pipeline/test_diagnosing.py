@@ -488,8 +488,8 @@ def test_components_of_which_the_same_is_true_are_one_sentence() -> None:
     small, biased = of_each_component({stream.topic: stream})
     assert small.evidence == (
         "vehicle/fix: the innovations of x_m and y_m are 1.92 to 1.96 times smaller than their "
-        "variances say (NIS is 0.26 to 0.27, if consistent 0.784 to 1.25): its noise (EKF2_GPS_P) is "
-        "stated too large"
+        "variances state (NIS is 0.26 to 0.27, consistent from 0.784 to 1.25): its noise "
+        "(EKF2_GPS_P) is stated too large"
     )
     assert biased.evidence == (
         "vehicle/fix: the innovations of z_m are 2.98 times larger than their variances state (NIS "
