@@ -1,1 +1,1 @@
-"""Studies ultra-wideband ranges; begin with `study`."""
+"""Studies of ultra-wideband ranges; begin with `study`."""

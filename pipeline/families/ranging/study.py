@@ -1,4 +1,4 @@
-"""Shares what studies of ranges need: recordings in a folder, their replay, errors by the truth."""
+"""Functions shared by studies of ranges: finding recordings, replaying them, reporting errors."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,10 +22,10 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """States delays that the data do not.
+    """Delays that are not in the data.
 
     Attributes:
-        range_delay_s: ranges are taken to be older than stamped by so much, beside an estimator's own
+        range_delay_s: delay of the ranges before their stamps, added to an estimator's own
             `range_delay_s`.
     """
 
@@ -33,7 +33,7 @@ class RangingOptions(Parameters):
 
 
 class Recording(NamedTuple):
-    """Names one recording, its place, and the files beside it that belong to it."""
+    """One recording: its name, its path, and further files that belong to it."""
 
     name: str
     path: Path
@@ -41,7 +41,7 @@ class Recording(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """Holds a recording with the outputs of every estimator, by the last parts of their topics."""
+    """A recording with the outputs of every estimator, by label and the last part of their topics."""
 
     recording: Recording
     source: MemorySource
@@ -49,7 +49,10 @@ class Replayed(NamedTuple):
 
 
 def recordings(setting: Setting, pattern: str) -> list[Path]:
-    """Find the files of this name in the data's folder or below; raises BadInput where none is."""
+    """Find the files that match a pattern in the data's folder or below.
+
+    Raises BadInput if no file matches.
+    """
     assert setting.data is not None
     found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
     if not found:
@@ -61,7 +64,7 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
 
 
 def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -> Iterator[Replayed]:
-    """Yield the recordings one by one; logs are kept of all, the timeline of the first."""
+    """Replay the recordings one by one; keep the logs of all and the timeline of the first."""
     assert experiment.import_ is not None
     delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
     estimators = dict(experiment.estimators)
@@ -83,27 +86,27 @@ def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -
 
 
 class Reference(NamedTuple):
-    """Holds the truth: stamps in order (n,), and components (n, d); those of angles do not wrap."""
+    """The truth: increasing stamps (n,) in ns, and components (n, d), in which angles do not wrap."""
 
     time_ns: Integers
     state: Floats
 
     def at(self, time_ns: Integers) -> Floats:
-        """Interpolate linearly between stamps."""
+        """Interpolate the components linearly at other stamps."""
         since = (self.time_ns - self.time_ns[0]) * 1e-9
         wanted = (time_ns - self.time_ns[0]) * 1e-9
         return np.stack([np.interp(wanted, since, column) for column in self.state.T], axis=1)
 
 
 def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
-    """Return the mean NIS of single ranges within a span."""
+    """Compute the mean NIS of single ranges within a span."""
     stamps = innovations.publish_time_ns
     inside = (stamps >= begin_ns) & (stamps <= end_ns)
     return float(np.mean(innovations["normalised_innovation_squared"][inside]))
 
 
 def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
-    """Tabulate figures by estimator and recording, and compute metrics of them."""
+    """Make an outcome of figures by estimator and recording: tables and metrics."""
     table = pd.DataFrame(rows)
     outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
     for row in rows:
@@ -119,11 +122,11 @@ def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
 
 
 def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:
-    """Draw every estimator's errors over time, of one recording.
+    """Draw the errors of every estimator in one recording over time.
 
     Args:
-        errors: by estimator stamps in ns and errors, (n,) each.
-        label: of the axis of the errors, with their unit.
+        errors: stamps in ns and errors, (n,) each, by estimator.
+        label: label of the axis of errors, with their unit.
     """
     begin_ns = min(int(time_ns[0]) for time_ns, _ in errors.values() if len(time_ns))
     panel = Panel(x=Axis(label="time (s)"), y=Axis(label=label, log=True))

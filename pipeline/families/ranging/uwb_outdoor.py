@@ -1,8 +1,8 @@
-"""Studies positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
+"""A study of positions from ranges outdoors (dataset uwb_outdoor), compared with published tracks.
 
-Published errors are those of a part of each path, which begins and ends where it enters a place. The
-truth is linear between its rows, but for those at another height than the others by half a metre.
-Published tracks are scored at their stamps, ours at the rows of the truth.
+Published errors refer to a part of each path, which begins and ends where the path enters a given area.
+The truth is interpolated linearly, without rows whose height differs from the median by more than half a
+metre. Published tracks are scored at their stamps, our estimates at the rows of the truth.
 """
 
 import re
@@ -34,13 +34,13 @@ PUBLISHED = ("LS", "ESKF")
 
 
 class Place(Parameters):
-    """Bounds a part of the plane, where a window begins or ends.
+    """A rectangular area in which a window begins or ends.
 
     Attributes:
-        x_above_m: least x; None for any.
-        x_below_m: greatest x; None for any.
-        y_above_m: least y; None for any.
-        y_below_m: greatest y; None for any.
+        x_above_m: smallest x, or None for no limit.
+        x_below_m: largest x, or None for no limit.
+        y_above_m: smallest y, or None for no limit.
+        y_below_m: largest y, or None for no limit.
     """
 
     x_above_m: float | None = None
@@ -49,19 +49,21 @@ class Place(Parameters):
     y_below_m: float | None = None
 
     def holds(self, position: Floats) -> Booleans:
-        """Return which positions (n, 2) lie there."""
+        """Test which positions (n, 2) are in the area."""
         above = np.array([self.x_above_m, self.y_above_m], float)
         below = np.array([self.x_below_m, self.y_below_m], float)
-        outside = (position <= above) | (position > below)  # nothing is outside a limit that is none
+        outside = (position <= above) | (
+            position > below
+        )  # False for a limit of None, which is NaN here
         return np.asarray((np.isfinite(position) & ~outside).all(axis=1))
 
 
 class Window(Parameters):
-    """Describes the part of a path that is scored.
+    """The part of a path that is scored.
 
     Attributes:
-        begin: where it begins: the first time that the path is there.
-        end: where it ends: the first time after that.
+        begin: area in which the window begins, when the path first enters it.
+        end: area in which the window ends, when the path first enters it afterwards.
     """
 
     begin: Place = Place()
@@ -69,12 +71,12 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """States the windows, and what errors are held to.
+    """The windows, and the rows of the truth that are used.
 
     Attributes:
-        windows: the part of a path that is scored, by the name of a folder that a recording lies in;
-            without one all of it is.
-        level_m: how far from the path's median height a row of the truth may lie.
+        windows: the part of a path that is scored, by the name of a folder that contains the recording;
+            a path without a window is scored as a whole.
+        level_m: largest difference in height between a row of the truth and the path's median.
     """
 
     windows: dict[str, Window] = {}
@@ -117,7 +119,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         name = each.recording.name
         paper = (
             printed(each.recording.path) if window else {}
-        )  # errors of other paths are of unknown parts
+        )  # without a window, it is unknown to which part of the path the printed errors refer
         rows += [{"estimator": label, "recording": name, **figures} for label, figures in own.items()]
         for track, (plane, space) in published.items():
             figures = {"position_rmse_m": plane, "space_rmse_m": space}
@@ -132,7 +134,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[Reference, int, int]:
-    """Return the truth x, y, z, and between which stamps to score; raises BadInput for no overlap."""
+    """Return the truth x, y, z, and the stamps at which scoring begins and ends.
+
+    Raises BadInput if the path does not cross the window.
+    """
     stream = of.source.streams["/truth"]
     time_ns, state = stream.publish_time_ns, stream["state"][:, :3]
     begin, end = 0, len(time_ns) - 1
@@ -153,7 +158,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
 def published_rmse(
     of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
 ) -> tuple[float, float]:
-    """Return the error in the plane, and in space, of a published track within the window."""
+    """Compute the RMSE of a published track within the window, in the plane and in space."""
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
@@ -161,7 +166,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """Return the errors that a recording comes with, by their names; none without such a file."""
+    """Read the errors that are published with a recording, by name; return {} without such a file."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

@@ -1,8 +1,8 @@
-"""Studies poses from ranges between anchors and tags: lias, ultra-wideband with motion capture.
+"""A study of poses from ranges between anchors and tags (dataset lias), with motion capture as truth.
 
-Estimates are scored from `skip_s` on at their stamps; the truth is linear between its own. The body of
-the motion capture is not quite that of the tags, so that errors have a mean that no filter can know:
-figures are also given without it.
+Estimates are scored at their stamps from `skip_s` on; the truth is interpolated linearly. The frame of
+the motion capture differs slightly from that of the tags, so errors have a mean that no filter can
+estimate; figures are therefore also given without this mean.
 """
 
 from typing import Any
@@ -31,11 +31,11 @@ from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class UwbPoseOptions(RangingOptions):
-    """States when scoring begins, and how truth is mounted.
+    """When scoring begins, and how the tags are mounted relative to the truth.
 
     Attributes:
-        skip_s: scoring begins so long after the first estimate.
-        mounting_yaw_deg: yaw of the tags' frame against the truth's body.
+        skip_s: time after the first estimate at which scoring begins.
+        mounting_yaw_deg: yaw of the tags' frame relative to the body of the truth.
     """
 
     skip_s: NonNegativeFloat = 2.0
@@ -71,7 +71,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def figures_of(
     of: Replayed, label: str, options: UwbPoseOptions
 ) -> tuple[dict[str, float], Integers, Floats]:
-    """Compute one estimator's figures, and its errors x, y, heading (n, 3) with their stamps (n,)."""
+    """Compute an estimator's figures, the stamps (n,) and the errors of x, y and heading (n, 3)."""
     captured = of.source.streams["/truth"]
     order = np.argsort(captured.publish_time_ns, kind="stable")
     yaw = np.unwrap(heading(captured["state"][order, 3:7])) + np.radians(options.mounting_yaw_deg)

@@ -1,4 +1,4 @@
-"""Studies samples and the systems of the S2KF paper; begin with `reactor`.
+"""Studies of sampling filters and of the systems of the S2KF paper; begin with `reactor`.
 
 The samplings themselves are in `fuselog.replay.inference.sampling`.
 """

@@ -1,8 +1,9 @@
-"""Studies the S2KF paper's extended target: an update with multiplicative noise.
+"""A study of the S2KF paper's extended target: an update with multiplicative noise.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section VI.B, Figs. 9 and 10. Beside the paper's filters run the S2KF's with their sample sets turned at
-random: a set in eight dimensions is unique only up to a rotation, and the results depend on it.
+section VI.B, Figs. 9 and 10. In addition to the paper's filters, the study runs S2KFs whose sample sets
+are rotated at random: a set in eight dimensions is unique only up to a rotation, and the results depend
+on it.
 """
 
 from typing import Any
@@ -52,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict[str, Any]]:
-    """Return the S2KF of 25 and 50 samples with their sets turned, under labels of their own."""
+    """Return copies of the S2KFs with 25 and 50 samples with rotated sample sets, by new labels."""
     return {
         f"{label}{TURNED}{turn}": values | {"kind": f"{values['kind']}:rotation={turn}"}
         for label, values in experiment.estimators.items()
@@ -62,11 +63,12 @@ def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict
 
 
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
-    """Return one row per estimator and step.
+    """Tabulate the errors of an ensemble, with a row per estimator and step.
 
-    RMSE of area and position against the exact moments' filter (the paper's) and against truth; the
-    median area. A half side of -l is the rectangle of l, but flips the area's sign: such runs are
-    counted, and `size` is the area without its sign. Failed runs are counted too.
+    Columns are the RMSE of area and position against the filter with exact moments (as in the paper) and
+    against the truth, and the median area. A half side of -l describes the same rectangle as l, but
+    changes the sign of the area: such runs are counted, and `size` is the absolute area. Failed runs are
+    also counted.
     """
     exact = ensemble.tracks[REFERENCE].mean
     parts = []
@@ -97,7 +99,7 @@ def _area(target: Floats) -> Floats:
 
 
 def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns at the paper's steps, averaged over the seeds; counts are summed."""
+    """Average the errors at the paper's steps over the seeds, and sum the counts."""
     rows = steps[steps["step"].isin(KEY_STEPS)]
     counts = dict.fromkeys(("flipped_runs", "failed_runs"), "sum")
     means = dict.fromkeys((name for name in rows.columns if name.endswith(("_m", "_m2"))), "mean")
@@ -105,7 +107,7 @@ def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
-    """Return every column at every key step; of turned sets a list, one entry per rotation."""
+    """Return every column at every key step; for rotated sets, a list with an entry per rotation."""
     found: dict[str, MetricValue] = {}
     columns = [name for name in at_keys.columns if name not in ("estimator", "step")]
     own = at_keys[~at_keys["estimator"].str.contains(TURNED)]
@@ -122,13 +124,13 @@ def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
 
 
 def turned_areas(at_keys: pd.DataFrame, label: str, step: int) -> list[float]:
-    """Return the area RMSE of every rotation of a filter's set at one step."""
+    """Return the RMSE of the area for every rotation of a filter's set at one step."""
     turned = at_keys["estimator"].str.startswith(label + TURNED) & (at_keys["step"] == step)
     return [float(value) for value in at_keys.loc[turned, "area_rmse_m2"]]
 
 
 def error_chart(steps: pd.DataFrame) -> Chart:
-    """Draw RMSE of position and area against exact moments, and the rotations' band, Fig. 9."""
+    """Draw the RMSE of position and area, and the band of the rotations (Fig. 9)."""
     is_turned = steps["estimator"].str.contains(TURNED)
     own = steps[~is_turned & (steps["estimator"] != REFERENCE)]
     panels = []

@@ -1,7 +1,7 @@
-"""Studies samplings of N(0, I): how near they are to it, what LCD sets cost, how they look.
+"""A study of samplings of N(0, I): their distance from it, and the cost of LCD sets.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section V, Figs. 1 and 5. No filter runs here: the logs hold the sample sets.
+section V, Figs. 1 and 5. No filter runs here: the log contains the sample sets.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
 
 class LcdOptions(Parameters):
-    """States the sets to optimise, and samplings to draw.
+    """The sets to optimise, and the samplings to draw.
 
     Attributes:
         sizes: dimension and count of each set to optimise.
@@ -54,7 +54,9 @@ class LcdOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: LcdOptions = setting.options
-    optimised(2, 3, 1, experiment.seed)  # compiles, so that the first set's time is its own
+    optimised(
+        2, 3, 1, experiment.seed
+    )  # compiles, so that the time of the first set does not include this
     rows = [
         optimised(dimension, count, options.starts, experiment.seed)
         for dimension, count in setting.progress(options.sizes, "optimising", len(options.sizes))
@@ -65,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome(tables={"sets": sets}, figures={"samplings": sample_figure(drawn, distances)})
     for row in sets.to_dict("records"):
         case = f"n{row['dimension']}-l{row['count']}"
-        for name in sets.columns[2:].drop("cpu_per_start_s"):  # no two runs take the same time
+        for name in sets.columns[2:].drop("cpu_per_start_s"):  # times differ from run to run
             outcome.metrics[f"lcd.{name}.{case}"] = float(row[name])
     outcome.metrics |= {f"{name}.distance.drawn": value for name, value in distances.items()}
     for dimension in options.contained:
@@ -77,7 +79,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
-    """Find the best set of some starts: D / pi^(N/2), the covariance's eigenvalues, and its cost."""
+    """Optimise a set from several starts; return D / pi^(N/2), extreme eigenvalues, and the cost."""
     begin = process_time()
     points = lcd_samples(dimension, count, np.random.default_rng(seed), starts=starts)
     seconds = process_time() - begin
@@ -94,15 +96,15 @@ def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, f
 
 
 def draw(name: str, seed: int) -> Samples:
-    """Return one set in the plane."""
+    """Draw one sample set in the plane from the sampling of this name."""
     return parse_sampling(name).at(2).draw(np.random.default_rng(seed), ())
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """Return how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
+    """Compare 2N+1 LCD samples, raw and moment-corrected, with the equally weighted points of the UKF.
 
-    The largest difference between their sorted distances from one another and from the origin, which
-    no rotation changes.
+    The measure is the largest difference between the sorted distances of the points from one another
+    and from the origin, which are invariant to rotations.
     """
     points = lcd_samples(dimension, 2 * dimension + 1, np.random.default_rng(seed), starts=starts)
     wanted = _invariants(unscented(dimension).points)
@@ -117,7 +119,7 @@ def _invariants(points: np.ndarray) -> np.ndarray:
 
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:
-    """Draw the sets with the circle that holds 95 %, areas of points their weights, Fig. 1."""
+    """Draw the sets and the circle of 95 % probability, with weights as areas of the points (Fig. 1)."""
     figure = Figure(figsize=(2.6 * len(drawn), 3.2), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 100)
     radius = np.sqrt(chi2.ppf(0.95, 2))
@@ -132,7 +134,7 @@ def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Fig
 
 
 def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) -> str:
-    """Write the sets as a log and its timeline; return a hash of all samples."""
+    """Write the sets to a log and a timeline; return a hash of all samples."""
     digest = hashlib.sha256()
     streams = []
     for name, (points, weights) in drawn.items():

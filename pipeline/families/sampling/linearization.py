@@ -1,7 +1,7 @@
-"""Shares what studies of the S2KF's paper need: filters against the one with exact moments.
+"""Functions shared by studies of the S2KF paper: comparison of filters with one of exact moments.
 
-An experiment's runs are replayed for several seeds, because errors differ more between seeds than
-between sample sets of one kind; each seed is an ensemble of its own.
+The runs of an experiment are replayed for several seeds, because errors differ more between seeds than
+between sample sets of one kind. Each seed gives an ensemble.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,11 +26,11 @@ REFERENCE = "analytic"
 
 
 class Options(Parameters):
-    """States what is averaged over.
+    """Numbers of seeds and rotations.
 
     Attributes:
         data_seeds: number of seeds of the data to average over.
-        rotations: number of rotations of the S2KF's sets to try beside.
+        rotations: number of additional rotations of the S2KF's sets.
     """
 
     data_seeds: PositiveInt = 4
@@ -38,7 +38,7 @@ class Options(Parameters):
 
 
 class Track(NamedTuple):
-    """Holds one filter's estimates of an ensemble; NaN from where a run failed."""
+    """The estimates of a filter for an ensemble; NaN after the failure of a run."""
 
     mean: Floats
     """(runs, steps, n)"""
@@ -47,12 +47,12 @@ class Track(NamedTuple):
 
     @property
     def failed(self) -> int:
-        """Count how many runs did not reach the last step."""
+        """Count the runs that did not reach the last step."""
         return int(np.isnan(self.mean[:, -1, 0]).sum())
 
 
 class Ensemble(NamedTuple):
-    """Holds the runs of one seed: truth (runs, steps, n) after the start, and each filter's track."""
+    """The runs of one seed: the truth (runs, steps, n) after the start, and the track of each filter."""
 
     sources: list[MemorySource]
     truth: Floats
@@ -67,10 +67,10 @@ def ensembles(
     *,
     written: bool = True,
 ) -> Iterator[Ensemble]:
-    """Record and replay the experiment for every seed; the first runs' logs are those of the first.
+    """Record and replay the experiment for every seed, and write the logs of the first seed.
 
-    `extra` estimators are replayed too, but not written, nor is anything unless `written`. Raises
-    BadInput where the reference is not among the estimators.
+    `extra` estimators are replayed as well, but not written. Without `written`, no logs are written.
+    Raises BadInput if the reference is not among the estimators.
     """
     if REFERENCE not in experiment.estimators:
         raise BadInput(f"this study compares with the estimator '{REFERENCE}'; add it to the experiment")
@@ -92,7 +92,7 @@ def ensembles(
 
 
 def track(estimates: Ragged, steps: int) -> Track:
-    """Put the estimates of all runs into arrays; a run's go from the first step to its failure."""
+    """Put the estimates of all runs into arrays; those of a run end at its failure."""
     counts = np.diff(estimates.offsets)
     there = np.arange(steps) < counts[:, None]
     size = estimates["mean"].shape[1]
@@ -104,13 +104,13 @@ def track(estimates: Ragged, steps: int) -> Track:
 
 
 def rmse(difference: Floats) -> Floats:
-    """Compute the RMS by step of differences (runs, steps, ...), over the runs that have one."""
+    """Compute the RMS of differences (runs, steps, ...) by step, ignoring runs with NaN."""
     squared = np.sum(difference**2, axis=tuple(range(2, difference.ndim)))
     return np.sqrt(np.nanmean(squared, axis=0))
 
 
 def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
-    """Draw one line per estimator over the steps, averaged over the seeds."""
+    """Draw a quantity over the steps, averaged over the seeds, with a line per estimator."""
     mean = steps.groupby(["estimator", "step"], sort=False)[quantity].mean()
     lines = {str(name): mean[name] for name in mean.index.get_level_values("estimator").unique()}
     return Panel(

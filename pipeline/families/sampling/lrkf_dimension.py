@@ -1,9 +1,10 @@
-"""Studies how many samples pay in a linear regression Kalman filter: 2 to 20 dimensions, drives.
+"""A study of how many samples are worthwhile in a linear regression Kalman filter, by dimension.
 
-Moments come first, apart from any filter: waves y = sin(k'x + phase) of x ~ N(0, I) have exact ones, by
+The first part compares moments, without a filter, in 2 to 20 dimensions: waves y = sin(k'x + phase) of
+x ~ N(0, I) have exact moments, by
     E exp(i k'x) = exp(-|k|^2 / 2).
-The vectors k point in all directions, or along the axes, as a sine of the heading does. The samplings
-are those of the experiment's estimators, which then follow robots and vehicles.
+The vectors k point in all directions, or along the axes, as for the sine of a heading. In the second
+part, the experiment's estimators, which define the samplings, track robots and vehicles.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,19 +33,19 @@ from fuselog.replay.inference.sampling import Sampler, Samples, parse_sampling
 from fuselog.replay.judging.intervals import mean_interval
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
-RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others
+RATED = "s2kf-100"  # the sampling whose errors are compared with those of the others
 X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
 class Options(Parameters):
-    """States functions of several dimensions, and drives.
+    """The functions in several dimensions, and the drives.
 
     Attributes:
         dimensions: dimensions of the state.
         functions: number of functions of each dimension.
         phase_sigma_rad: standard deviation of k'x, the phase of a function.
-        pays: share by which more samples must lessen an error to pay.
-        drives: what is recorded, by name.
+        pays: relative reduction of the error for which more samples are worthwhile.
+        drives: recorded scenarios, by name.
     """
 
     dimensions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (2, 5, 10, 20)
@@ -55,14 +56,14 @@ class Options(Parameters):
 
 
 class Waves(NamedTuple):
-    """Describes the function sin(K x + phases): vectors K (m, n), phases (m,)."""
+    """The function sin(K x + phases), with vectors K (m, n) and phases (m,)."""
 
     vectors: Floats
     phases: Floats
 
 
 class Moments(NamedTuple):
-    """Holds of what a function gives the mean (m,), covariance (m, m), and that of x with it (n, m)."""
+    """Moments of a function of x: mean (m,), covariance (m, m), cross-covariance with x (n, m)."""
 
     mean: Floats
     covariance: Floats
@@ -91,7 +92,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
-    """Return the samplings of the estimators by their labels; BadInput where there is none."""
+    """Return the samplings of the estimators by label; raise BadInput if no estimator has a sampling."""
     kinds = {label: str(values.get("kind", label)) for label, values in experiment.estimators.items()}
     found: dict[str, Callable[[int], Sampler]] = {
         label: parse_sampling(kind.removeprefix("lrkf:")).at
@@ -104,7 +105,7 @@ def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
 
 
 def exact(waves: Waves) -> Moments:
-    """Return the moments of waves of x ~ N(0, I)."""
+    """Compute the exact moments of waves of x ~ N(0, I)."""
     vectors, phases = waves
     squared = np.sum(vectors**2, axis=1)
     fading = np.exp(-0.5 * squared)
@@ -120,7 +121,7 @@ def exact(waves: Waves) -> Moments:
 
 
 def sampled(waves: Waves, samples: Samples) -> Moments:
-    """Return what a sample set (L, n) makes of them."""
+    """Approximate the moments of waves by a sample set (L, n)."""
     points, weights = samples
     values = np.sin(points @ waves.vectors.T + waves.phases)
     mean = weights @ values
@@ -131,10 +132,10 @@ def sampled(waves: Waves, samples: Samples) -> Moments:
 def moment_errors(
     samplings: Mapping[str, Callable[[int], Sampler]], options: Options, seed: int
 ) -> pd.DataFrame:
-    """Return one row per sampling, dimension, direction and function: relative errors of its moments.
+    """Tabulate relative errors of moments, with a row per sampling, dimension, direction and function.
 
-    That of the mean is the root mean square in standard deviations of what the function gives, those of
-    the covariances are by the Frobenius norm.
+    The error of the mean is a root mean square, in standard deviations of the function's components. The
+    errors of the covariances are relative Frobenius norms.
     """
     rows = []
     for dimension in options.dimensions:
@@ -170,10 +171,11 @@ def _relative(found: Floats, wanted: Floats) -> float:
 def driven(
     experiment: Experiment, setting: Setting, name: str, drive: Record
 ) -> tuple[list[MemorySource], pd.DataFrame]:
-    """Return the runs of a scenario, kept in a folder of its name; one row per estimator and run.
+    """Record a scenario, replay it, keep its logs in a folder of its name, and tabulate the errors.
 
-    A row has the state's dimension, the RMSE of the position, the mean NEES for each component, and how
-    long a second of a run took all cores together, in ms: the mean of all runs at once.
+    The table has a row per estimator and run: the dimension of the state, the RMSE of the position, the
+    mean NEES per component, and the CPU time on all cores for a second of a run, in ms, averaged over
+    all runs.
     """
     runner = Runner(experiment.model_copy(update={"record": drive}), setting)
     sources = runner.obtain()
@@ -199,7 +201,7 @@ def driven(
 
 
 def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure errors with intervals over the functions; and logarithms of `RATED`'s by others'."""
+    """Measure errors with intervals over the functions, and log ratios of `RATED` to the others."""
     for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
         case = f"n{dimension}-{direction}"
         for quantity in ("mean_error", "covariance_error", "cross_error"):
@@ -213,7 +215,7 @@ def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
-    """Measure errors by drive, and by how much (%) those of the position change with other samples."""
+    """Measure errors by drive, and the change (%) of the position error between samplings."""
     found = outcome.metrics
     for drive, of_drive in runs.groupby("drive", sort=False):
         quantities = ["position_rmse_m", "nees_per_component", "samples"]
@@ -231,7 +233,7 @@ def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> No
 
 
 def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
-    """Draw errors of means over the number of samples by dimension; of drives, errors and time."""
+    """Draw errors of the mean, and errors and times of drives, over the number of samples."""
     panels = []
     for direction, words in DIRECTIONS.items():
         of_direction = moments[moments["direction"] == direction]
@@ -250,7 +252,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """Draw a line for each family of samplings; the extended filter, without samples, as a level."""
+    """Draw a line for each family of samplings, and a level for the EKF, which has no samples."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

@@ -1,8 +1,8 @@
-"""Studies the S2KF paper's batch reactor: nonlinear prediction against the exact moments.
+"""A study of the S2KF paper's batch reactor: nonlinear prediction against the exact moments.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section VI.A, Fig. 7. Its statements are judged for the prior mean as printed, (0.5, 3.5), and for the
-two numbers swapped: only with these do the figure's curves come out.
+section VI.A, Fig. 7. The paper's statements are tested for the prior mean as printed, (0.5, 3.5), and
+with the two numbers swapped: only the swapped prior reproduces the curves of the figure.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ from fuselog.pipeline.runs.inputs import Record
 from fuselog.recorders.errors import BadInput
 
 CASES = {"printed": "prior as printed", "swapped": "prior swapped"}
-EARLY = 5  # steps that count as the beginning
+EARLY = 5  # number of steps that count as early, or late at the end
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -48,7 +48,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _in_case(experiment: Experiment, case: str) -> Experiment:
-    """Give the experiment the prior of a case."""
+    """Set the prior of a case in the experiment."""
     if experiment.record is None:
         raise BadInput("study reactor records its own runs; give the experiment a [record] table")
     mean = experiment.record.parameters.get("prior_mean", (0.5, 3.5))
@@ -60,10 +60,10 @@ def _in_case(experiment: Experiment, case: str) -> Experiment:
 
 
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
-    """Return one row per estimator and step.
+    """Tabulate the errors of an ensemble, with a row per estimator and step.
 
-    RMSE of mean and covariance against the exact moments' filter (the paper's), of the mean against
-    truth, and how large the filter's own variance is beside the exact one.
+    Columns are the RMSE of mean and covariance against the filter with exact moments (as in the paper),
+    that of the mean against the truth, and the ratio of the filter's own variance to the exact one.
     """
     exact = ensemble.tracks[REFERENCE]
     own = np.nanmean(np.trace(exact.covariance, axis1=2, axis2=3), axis=0)
@@ -90,10 +90,10 @@ def step_errors(ensemble: Ensemble) -> pd.DataFrame:
 
 
 def metrics(steps: pd.DataFrame, case: str) -> dict[str, MetricValue]:
-    """Average over steps and seeds; of the errors that are compared also return those of every seed.
+    """Average the errors over steps and seeds; list the errors of mean and covariance by seed.
 
-    Those of the mean also of the first and of the last steps, and by step beside the UKF's: in which
-    share of them they are above.
+    Errors of the mean are also averaged over the first and the last steps, and compared with those of
+    the UKF: the metric is the share of steps with an error above the UKF's.
     """
     found: dict[str, MetricValue] = {}
     by_step = steps.groupby(["estimator", "step"], sort=False)["mean_rmse"].mean()
@@ -116,7 +116,7 @@ def metrics(steps: pd.DataFrame, case: str) -> dict[str, MetricValue]:
 
 
 def error_chart(steps: pd.DataFrame, case: str) -> Chart:
-    """Draw RMSE of mean and covariance against the exact moments, over the steps, Fig. 7."""
+    """Draw the RMSE of mean and covariance against the exact moments over the steps (Fig. 7)."""
     approximate = steps[steps["estimator"] != REFERENCE]
     return Chart(
         title=f"Batch reactor against the analytic moments, {case}",

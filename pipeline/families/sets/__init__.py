@@ -1,1 +1,1 @@
-"""Studies guaranteed sets; begin with `set_membership`."""
+"""Studies of guaranteed sets; begin with `set_membership`."""

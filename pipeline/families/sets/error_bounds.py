@@ -1,6 +1,7 @@
-"""Takes bounds of a robot's errors from the other robots of its log: their truth says theirs.
+"""Bounds of a robot's errors, taken from the errors of the other robots in its log.
 
-So nothing is chosen by the truth of the robot that is judged. Channels state what is found.
+The truth of the robot that is judged is thus not used to choose its bounds. The bounds are written to
+the metadata of the robot's topics.
 """
 
 from collections.abc import Sequence
@@ -23,19 +24,19 @@ from fuselog.replay.families.sets.regions.moving_sets import Growth, odometry_of
 
 Floats = NDArray[np.float64]
 
-# Spans over which odometry is compared with the truth; those up to SHORT_S make the bound's offset.
+# Spans over which odometry is compared with the truth; those up to SHORT_S determine the bound's offset.
 SPANS_S = (0.25, 1.0, 2.0, 5.0, 10.0, 20.0)
 SHORT_S = 2.0
 SPAN_STEP_S = 0.5
 
 
 class BoundOptions(Parameters):
-    """States how bounds follow from errors.
+    """How bounds follow from errors.
 
     Attributes:
-        margin: odometry's bound is its largest error times this.
-        bearing_quantile: a bearing's bound is what this share of errors stays below, since a
-            misidentified landmark is off by any angle.
+        margin: factor by which the bound of odometry exceeds its largest error.
+        bearing_quantile: quantile of the errors of bearings that is their bound; the largest error would
+            be useless, since the error of a misidentified landmark can be any angle.
     """
 
     margin: PositiveFloat = 1.2
@@ -44,7 +45,11 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """Holds one robot's errors: bearings and differences (n,); odometry, largest by span (spans, 2)."""
+    """Absolute errors of a robot.
+
+    `bearing_rad` (n,) are those of bearings, `relative_rad` (m,) those of differences between bearings
+    of a frame, `odometry` (spans, 2) the largest of position (m) and heading (rad) for each span.
+    """
 
     bearing_rad: Floats
     relative_rad: Floats
@@ -54,9 +59,9 @@ class RobotErrors:
 def state_bounds(
     sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
 ) -> list[MemorySource]:
-    """State in each robot's channels the bounds that the others keep in all runs.
+    """Write bounds of each robot, from the errors of the others in all runs, to its topics' metadata.
 
-    Raises BadInput where fewer than two robots have odometry, bearings and truth.
+    Raises BadInput if fewer than two robots have odometry, bearings and truth.
     """
     leaves = ("odometry", "range_bearing", "truth")
     first = sources[0].streams
@@ -90,7 +95,7 @@ def state_bounds(
 def _bounds(
     others: Sequence[RobotErrors], options: BoundOptions
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return what the channels of odometry and of bearings state."""
+    """Compute the metadata of the topics of odometry and of bearings."""
     largest = options.margin * np.max([errors.odometry for errors in others], axis=0)
     spans_s = np.array(SPANS_S)
     offset = largest[spans_s <= SHORT_S].max(axis=0)
@@ -107,7 +112,7 @@ def _bounds(
 
 
 def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> RobotErrors:
-    """Return how far one robot's bearings and odometry were off, where its truth is known."""
+    """Compute the errors of one robot's bearings and odometry where its truth is known."""
     seen, truth = source.streams[f"{prefix}/range_bearing"], source.streams[f"{prefix}/truth"]
     landmarks, driven = source.streams["/landmarks"], source.streams[f"{prefix}/odometry"]
     error, look = _bearing_errors(seen, landmarks, truth, gap_limit_s)
@@ -130,7 +135,7 @@ def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> Robot
 def _bearing_errors(
     seen: Stream, landmarks: Stream, truth: Stream, gap_limit_s: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Compute errors (n,) of bearings to mapped landmarks where truth is known, and their stamps."""
+    """Compute errors (n,) of bearings to mapped landmarks where the truth is known, and their stamps."""
     numbers = landmarks["landmark_id"]
     order = np.argsort(numbers)
     row = np.searchsorted(numbers, seen["target_id"], sorter=order).clip(max=len(numbers) - 1)

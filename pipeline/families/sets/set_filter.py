@@ -1,7 +1,6 @@
-"""Studies guaranteed sets over time: area, containment, what the past helps, what was isolated.
+"""A study of guaranteed sets over time: area, containment, the benefit of the past, isolated faults.
 
-What is compared are the frames for which all estimators have a set or an ellipse; intervals are over the
-robots.
+It compares the frames for which all estimators have a set or an ellipse. Intervals are over the robots.
 """
 
 from collections import Counter
@@ -32,7 +31,7 @@ from fuselog.replay.judging.intervals import mean_interval
 ELLIPSE = 0.99
 FRAMES, FILTER, L8, EKF, BEARINGS = "frames", "filter", "filter-l8", "ekf", "ekf-bearings"
 KEYS = ["case", "run", "time_ns"]
-FEWEST_ROBOTS = 3  # whose mean share has an interval: as many as `set-filter` has, over all of its runs
+FEWEST_ROBOTS = 3  # for an interval of the mean share: the number of robots in `set-filter`
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -65,7 +64,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _set_rows(found: JudgedSets) -> pd.DataFrame:
-    """Tabulate the sets of one estimator and robot, where the truth is known."""
+    """Tabulate the sets of one estimator and robot where the truth is known."""
     columns = {
         "estimator": found.estimator,
         "case": found.case,
@@ -78,7 +77,7 @@ def _set_rows(found: JudgedSets) -> pd.DataFrame:
 
 
 def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
-    """Tabulate one estimator's and robot's ellipses at its sets' stamps: the estimate last said."""
+    """Tabulate the ellipses of an estimator's latest estimates at the stamps of the sets."""
     squared_radius = float(chi2.ppf(ELLIPSE, 2))
     place = errors.position
     error, covariance = errors.error[:, place], errors.covariance[:, place][:, :, place]
@@ -102,20 +101,20 @@ def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
 
 
 def compared(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of frames for which every estimator has one."""
+    """Select the frames for which every estimator has a row."""
     count = table.groupby(KEYS)["estimator"].transform("nunique")
     return table[count == table["estimator"].nunique()].reset_index(drop=True)
 
 
 def summarise(table: pd.DataFrame) -> pd.DataFrame:
-    """Compute the median area not empty, and the share that holds the truth, by robot and run."""
+    """Compute the median area of nonempty sets and the share with the truth, by robot and run."""
     there = table.assign(area_m2=table["area_m2"].where(table["area_m2"] > 0.0))
     groups = there.groupby(["estimator", "case", "run"], sort=False)
     return groups.agg(area_m2=("area_m2", "median"), inside=("inside", "mean")).reset_index()
 
 
 def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Measure what the sets rest on, how often that held, what was found wrong; by filter, robot."""
+    """Count frames, violations, guaranteed sets and findings, by filter and robot."""
     metrics: dict[str, MetricValue] = {}
     for each in found:
         known = each.sets.known
@@ -141,7 +140,7 @@ def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
 
 
 def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure the filter's areas by those of the others, and how much more often it holds the robot."""
+    """Measure the ratio of the filter's areas to the others', and the gain in containment."""
     wide = summary.pivot_table(index=["case", "run"], columns="estimator")
     area, inside = wide["area_m2"], wide["inside"]
     for other in (FRAMES, L8, EKF, BEARINGS):
@@ -153,7 +152,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Return how often the wrong one of a frame and the past is isolated, by the truth; by filter."""
+    """Count correct and wrong decisions between a faulty frame and a faulty past, by filter."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())
@@ -172,7 +171,7 @@ def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]
 
 
 def _chart(summary: pd.DataFrame) -> Chart:
-    """Draw area and containment, robot by robot."""
+    """Draw the area and containment of each robot."""
     panels = []
     for quantity, label in (("area_m2", "median area (m²)"), ("inside", "share that holds the robot")):
         series = curves(summary[summary["run"] == 0], ["estimator"], "case", quantity, "markers")

@@ -1,7 +1,7 @@
-"""Studies set-valued fixes: areas, containment of the truth, faults.
+"""A study of set-valued position fixes: areas, containment of the truth, faults.
 
-Its paper, Briechle, Hanebeck (2004), has figures without numbers; section V is recorded besides the
-experiment's own runs wherever these are simulated.
+The paper, Briechle and Hanebeck (2004), has figures without numbers. If the experiment is simulated, the
+scene of the paper's section V is recorded in addition to its own runs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
-    """Return one row per estimator, case, run and frame."""
+    """Tabulate the sets, with a row per estimator, case, run and frame."""
     parts = [
         pd.DataFrame(
             {
@@ -68,10 +68,11 @@ def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
 
 
 def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
-    """Measure the share of sets that hold the truth, the median area, and how many wrongly miss it.
+    """Compute the share of sets that contain the truth, the median area, and the number of violations.
 
-    A set must hold the truth where its bounds hold and the robot is in its arena; how often it is not is
-    counted apart. Per case and all cases together, of the frames that have a truth.
+    A set must contain the truth if its bounds hold and the robot is in its arena; frames with the robot
+    outside the arena are counted separately. Metrics are per case and for all cases together, over
+    frames with truth.
     """
     metrics: dict[str, MetricValue] = {}
     together: dict[str, list[JudgedSets]] = {}
@@ -93,14 +94,14 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
 
 
 def _without_errors(runner: Runner) -> dict[str, MetricValue]:
-    """Compute the ratios of the same scenes where nothing errs: their exact sets are the largest."""
+    """Compute the ratios for the same scenes without errors, whose exact sets are the largest."""
     replayed = runner.replay(runner.obtain({"error_share": 0.0}))
     gap_limit_s = runner.experiment.gap_limit_s
     return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)
 
 
 def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValue]:
-    """Compute the median of area / exact area over the frames, and how often the box is larger."""
+    """Compute the median ratio of area to exact area over the frames, and the share below the box."""
     areas = {(each.estimator, each.case): each.area_m2 for each in found}
     metrics: dict[str, MetricValue] = {}
     for (name, of), area in areas.items():
@@ -112,7 +113,7 @@ def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValu
 
 
 def _section_v(runner: Runner, outcome: Outcome) -> Replayed:
-    """Record and replay the paper's scene's first pair, then all of it; metrics and pictures."""
+    """Record and replay the first pair of the paper's scene, then all pairs; add metrics and figures."""
     experiment = runner.experiment
     assert experiment.record is not None
     bare = Record(scenario=experiment.record.scenario)
@@ -130,7 +131,7 @@ def _section_v(runner: Runner, outcome: Outcome) -> Replayed:
 
 
 def _set_chart(replayed: Replayed, title: str) -> Chart:
-    """Draw the first sets of the first run, and where the robot is."""
+    """Draw the first sets of the first run, and the true position of the robot."""
     series = []
     for topic, sets in replayed.outputs.items():
         if topic.endswith("/set"):
@@ -145,7 +146,7 @@ def _set_chart(replayed: Replayed, title: str) -> Chart:
 
 
 def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
-    """Draw containment and area, estimator by estimator."""
+    """Draw the containment and area of each estimator."""
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
     labels = {
         "containment_share": "share of sets that hold the truth",
@@ -159,7 +160,7 @@ def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
 
 
 def _value(metrics: Mapping[str, MetricValue], key: str) -> float:
-    """Return a metric that is one number; NaN where there is none."""
+    """Return a metric as a number, or NaN if it is missing or not a number."""
     found = metrics.get(key)
     return float(found) if isinstance(found, int | float) else float("nan")
 

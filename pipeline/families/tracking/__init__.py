@@ -1,4 +1,4 @@
-"""Studies trackers: vessels, ferries, targets that cross; begin with `study`.
+"""Studies of trackers: vessels, ferries and crossing targets; begin with `study`.
 
-Writes tracks for the MOT Challenge, too.
+`mot` exports tracks in the format of the MOT Challenge.
 """

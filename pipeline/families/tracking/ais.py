@@ -1,8 +1,7 @@
-"""Studies tracks of reports without identities: which vessels kept one track of their own.
+"""A study of tracks from AIS reports without identities: which vessels kept one track of their own.
 
-The identities that the log has are used to judge alone. A vessel's own track is the one that it is
-assigned when tracks and vessels are paired one to one: see
-`fuselog.replay.families.tracking.judging.tracks`.
+The identities in the log serve only to judge the tracks. A vessel's own track is the one assigned to it
+when tracks and vessels are paired one to one; see `fuselog.replay.families.tracking.judging.tracks`.
 """
 
 import numpy as np
@@ -29,10 +28,10 @@ from fuselog.replay.judging.metrics.measuring import Output
 
 
 class AisOptions(Parameters):
-    """States how tracks are counted.
+    """How tracks are counted.
 
     Attributes:
-        live_s: a track is called live for so long after a report.
+        live_s: time after a report during which a track counts as live.
     """
 
     live_s: PositiveFloat = 600.0
@@ -54,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def vessel_table(replayed: Replayed) -> pd.DataFrame:
-    """Return the tables of all estimators; see `tracks.track_table`."""
+    """Concatenate the tables of vessels of all estimators; see `tracks.track_tables`."""
     tables = [
         table.assign(estimator=each.estimator)
         for each in replayed.judged
@@ -69,7 +68,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
 
 
 def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Chart:
-    """Draw how much of each vessel's reports is in its own track, and live tracks over time."""
+    """Draw the share of each vessel's reports in its own track, and the live tracks over time."""
     many = vessels[vessels["reports"] > MANY_REPORTS]
     shares = {
         str(estimator): np.sort(rows["share"])[::-1]

@@ -1,8 +1,8 @@
-"""Studies Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
+"""A study of the Autoferry scenarios: what each sensor and each association adds to tracks of vessels.
 
-Quays, marks and other craft have no reference: GOSPA leaves out what is farther than 50 m from both
+Quays, marks and other craft have no reference, so GOSPA ignores tracks farther than 50 m from both
 vessels. Trackers are replayed in the order of the stamps, and some of them again in the order of
-arrival, with each way to take late scans.
+arrival, with each policy for out-of-sequence scans.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ from fuselog.replay.families.tracking.judging.errors import Judged, instants_of,
 
 
 class AutoferryOptions(Parameters):
-    """States what is compared, and which ways to treat late scans are tried.
+    """Compared estimators, and policies for out-of-sequence scans.
 
     Attributes:
         compared: pairs of estimators whose figures are compared, the first with the second.
-        late: ways to treat late scans that are tried in the order of arrival.
-        late_estimators: labels of the estimators that are replayed so; those that are not run are left
-            out.
+        late: policies for out-of-sequence scans, applied in the order of arrival.
+        late_estimators: labels of the estimators that are replayed in the order of arrival; labels of
+            estimators that are not run are ignored.
     """
 
     compared: list[tuple[str, str]] = []
@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """Find the scenarios in the data's folder by the numbers in their names, or the folder itself."""
+    """Import the scenarios in the data's folder, sorted by number, or the folder itself."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []
@@ -99,10 +99,10 @@ def _late_table(
     in_order: Mapping[str, Ragged],
     runs: Mapping[str, Judged],
 ) -> pd.DataFrame:
-    """Tabulate by estimator, way to take late scans, and scenario.
+    """Tabulate the figures by estimator, policy for out-of-sequence scans, and scenario.
 
-    `from_in_order_m` is how far the tracks after the last late scan are from those in order, at most;
-    infinite where they are not the same tracks.
+    `from_in_order_m` is the largest distance, after the last late scan, between these tracks and those
+    of the replay in order; it is infinite if the two replays have different tracks.
     """
     tables = []
     known = experiment.estimators
@@ -123,7 +123,7 @@ def _late_table(
 
 
 def _last_late_ns(source: MemorySource) -> int:
-    """Return when the last late scan of a run arrived; 0 where none is late."""
+    """Return when the last late scan of a run arrived, or 0 if all scans are in order."""
     arrivals = [
         stream.log_time_ns[stream.log_time_ns > stream.publish_time_ns]
         for topic, stream in source.streams.items()
@@ -135,7 +135,7 @@ def _last_late_ns(source: MemorySource) -> int:
 def _farthest(
     in_order: Mapping[str, Ragged], outputs: Mapping[str, Ragged], label: str, run: int, from_ns: int
 ) -> float:
-    """Compute how far tracks of two replays are apart at most, from a time on."""
+    """Compute the largest difference between the tracks of two replays, from a time on."""
     sizes, tracks = sets_of(in_order, label, run)
     stamps = np.unique(sizes.publish_time_ns)
     stamps = stamps[stamps >= from_ns]
@@ -149,7 +149,7 @@ def _farthest(
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Draw GOSPA of every estimator by scenario."""
+    """Draw the GOSPA of every estimator by scenario."""
     series = curves(table, ["estimator"], "run", "gospa_m", "line+markers")
     panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m)"), series=series)
     return Chart(title="GOSPA (cutoff 20 m) by scenario", panels=[panel])

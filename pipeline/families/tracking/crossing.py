@@ -1,7 +1,7 @@
-"""Studies simulated targets that cross: what associations are worth in clutter.
+"""A study of simulated crossing targets: how well methods of association work in clutter.
 
-Every case has a rate of clutter and a probability of detection; the targets of a run and their true ways
-are the same in all cases.
+Every case has a rate of clutter and a probability of detection. The targets of a run and their true
+trajectories are the same in all cases.
 """
 
 from itertools import product
@@ -21,7 +21,7 @@ from fuselog.replay.judging.intervals import mean_interval
 
 
 class CrossingOptions(Parameters):
-    """States the cases, and what is compared.
+    """The cases, and the compared estimators.
 
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.
@@ -63,7 +63,7 @@ def _case(clutter_per_scan: float, detection_probability: float) -> str:
 
 
 def _chart(every: pd.DataFrame) -> Chart:
-    """Draw GOSPA over clutter, with 95 % intervals over runs: a panel by detection probability."""
+    """Draw GOSPA over clutter with 95 % intervals over runs, a panel for each detection probability."""
     panels = []
     for probability, of_panel in every.groupby("detection_probability", sort=False):
         panel = Panel(
@@ -82,7 +82,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
-    """Measure by how much the differences in GOSPA grow from the least clutter to the most."""
+    """Measure how much the differences in GOSPA grow from the least to the most clutter."""
     for probability, rows in every.groupby("detection_probability", sort=False):
         by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
         for label, other in pairs:

@@ -1,11 +1,12 @@
-"""Writes tracks and truths as lines of the MOT Challenge, which TrackEval reads.
+"""Export of tracks and truths in the format of the MOT Challenge, which TrackEval reads.
 
-A frame is every half second from the run's epoch on, the first one has number 1. Tracks are predicted to
-it, truths interpolated. A target has no extent: its box begins where it is, in metres, and has no width
-and no height. TrackEval's similarity of points is that of its Euclidean distance, not overlap.
+Frames are half a second apart and begin at the epoch of the run; the first has number 1. Tracks are
+predicted to the time of a frame, truths are interpolated. Targets are points: the corner of their box is
+their position in metres, and its width and height are 0. Evaluate them in TrackEval with its Euclidean
+distance, not with overlap.
 
     frame,id,x,y,0,0,1,-1,-1,-1      a track
-    frame,id,x,y,0,0,1,1,1           a truth; the last three: it counts, class 1, wholly visible
+    frame,id,x,y,0,0,1,1,1           a truth; the last three values: it counts, class 1, fully visible
 
 Dendorfer et al., "MOTChallenge: a benchmark for single-camera multiple target tracking", IJCV 129, 2021.
 """
@@ -26,10 +27,10 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """Return by file name the topics and lines: a file of each tracker's tracks, one of all truths.
+    """Return the topics and lines of each file, by its name: a file per tracker, and one of all truths.
 
-    `topics` are those wanted, or none for all. Raises BadInput where one is not there or holds neither
-    tracks nor truths in the plane, or there are none at all.
+    `topics` selects topics; if it is empty, all suitable topics are exported. Raises BadInput if a
+    topic is missing or has neither tracks nor truths in the plane, or if the log has no such topic.
     """
     unknown = [topic for topic in topics if topic not in log.topics]
     if unknown:
@@ -75,7 +76,6 @@ def _is_point(topic: Topic) -> bool:
 
 
 def _frames(epoch_ns: int, last_ns: int) -> Integers:
-    """Return the stamps of all frames until the last stamp."""
     return np.arange(epoch_ns, last_ns + 1, PERIOD_NS)
 
 

@@ -1,7 +1,7 @@
-"""Shares what studies of trackers need: tracks judged by run, and differences of trackers.
+"""Functions shared by studies of trackers: figures of tracks by run, and differences between trackers.
 
-Tracks are judged as `fuselog.replay.families.tracking.judging.errors` says, at instants that
-are the same for all trackers.
+Tracks are judged at the same instants for all trackers, as described in
+`fuselog.replay.families.tracking.judging.errors`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,19 +31,19 @@ from fuselog.replay.families.tracking.judging.errors import (
 from fuselog.replay.judging.errors.evaluation import Innovations
 from fuselog.replay.judging.intervals import Interval, mean_interval
 
-# The figures whose differences are told.
+# The figures whose differences are measured.
 COMPARED = (
     *("gospa_m", "localisation_m2", "switches", "target1_rmse_m", "target1_coverage"),
     *("target2_rmse_m", "target2_coverage", "target5_rmse_m"),
 )
-# What trajectory GOSPA takes for a target that goes on with another track: half a target missed.
+# Penalty of trajectory GOSPA if a target continues with another track: that of half a missed target.
 SWITCH_PENALTY_M = 10.0
 
 
 def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream, Stream]:
-    """Return how many tracks an estimator tells of in every scan of a run, and these tracks.
+    """Return the number of an estimator's tracks at every scan of a run, and these tracks.
 
-    Raises BadInput where it is no tracker.
+    Raises BadInput if the estimator is not a tracker.
     """
     leaves = [f"/estimates/{label}/{leaf}" for leaf in ("set", "track")]
     if not all(leaf in outputs for leaf in leaves):
@@ -57,15 +57,16 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
 def figures_of(
     tracked: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
 ) -> dict[str, float]:
-    """Compute what the tracks of a run are worth.
+    """Compute the figures of merit of the tracks of a run.
 
-    If truths cover some targets, figures of whole tracks leave out those that are never within the
-    cutoff of a target. A track's length is the time from its first to its last instant, and trajectory
-    GOSPA is divided by the root of the number of instants, so that it is as large as GOSPA.
+    If the truth covers only some targets, figures of whole tracks ignore tracks that are never within
+    the cutoff of a target. The length of a track is the time from its first to its last instant.
+    Trajectory GOSPA is divided by the square root of the number of instants, which makes it comparable
+    to GOSPA.
 
     Args:
         tracked: the tracks at k instants.
-        truths: (targets, k, 2), where the targets are at these, in m; NaN where one is not there.
+        truths: positions of the targets at these instants, (targets, k, 2), in m; NaN if absent.
         unreferenced_m: see `Judged`.
 
     Returns:
@@ -90,7 +91,7 @@ def table_of(
     runs: Mapping[str, Judged],
     delay_s: float = 0.0,
 ) -> pd.DataFrame:
-    """Tabulate by estimator and run; what was told later than `delay_s` before is not known."""
+    """Tabulate the figures by estimator and run, with tracks that are output up to `delay_s` late."""
     rows = []
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
@@ -100,13 +101,13 @@ def table_of(
 
 
 def means_of(table: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Return the means over the runs, by estimator."""
+    """Compute the means over the runs, by estimator."""
     means: Any = table.drop(columns="run").groupby("estimator", sort=False).mean()
     return {str(label): row.to_dict() for label, row in means.iterrows()}
 
 
 def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
-    """Mean NIS per measured component, by estimator and sensor: of tracks' likeliest detections."""
+    """Compute the mean NIS per measured component of likeliest detections, by estimator and sensor."""
     return {
         f"{each.estimator}.nis_per_component.{each.case}": float(each.squared.sum() / each.degrees.sum())
         for each in innovations
@@ -117,7 +118,7 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
 def measure_changes(
     table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
 ) -> None:
-    """Measure by how much figures of one estimator exceed those of another, of pairs that were run."""
+    """Measure how much the figures of one estimator exceed those of another, for all tabulated pairs."""
     for label, other in pairs:
         if {label, other} <= set(table["estimator"]):
             for quantity in [name for name in COMPARED if name in table]:
@@ -127,6 +128,6 @@ def measure_changes(
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
-    """Compute by how much a quantity of one estimator is above that of another, over the runs."""
+    """Compute the mean difference in a quantity between two estimators over the runs."""
     by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
     return mean_interval(by_run[label] - by_run[other])

@@ -1,1 +1,1 @@
-"""Studies cooperative vehicles: Zhang et al. 2016; begin with `study`."""
+"""Studies of cooperative vehicles (Zhang et al. 2016); begin with `study`."""

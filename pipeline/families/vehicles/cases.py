@@ -1,4 +1,4 @@
-"""Runs cooperative vehicles in several cases: each estimator's errors, by run and by step."""
+"""Errors of each estimator of cooperative vehicles, by case, run and step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -24,20 +24,20 @@ from fuselog.replay.judging.errors.label_errors import (
 
 Floats = NDArray[np.float64]
 
-# What a message's parts take, in bytes.
+# Sizes of the parts of a message, in bytes.
 POSITION_BYTES, IDENTITY_BYTES, NUMBER_BYTES = 16, 4, 8
-# State and covariance of a vehicle, the latter without its mirror image.
+# The state of a vehicle and the upper triangle of its covariance.
 TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """States the cases, and what they are compared with.
+    """The cases, and the estimators that are compared.
 
     Attributes:
-        cases: what differs in the scenario's parameters, by the name of a case.
+        cases: changes to the parameters of the scenario, by name of the case.
         reference: label of the Kalman filter.
         few: parameters of estimators that are too slow for all runs, by label.
-        few_runs: number of runs of the first case that these get.
+        few_runs: number of runs of the first case that the estimators of `few` process.
     """
 
     cases: dict[str, dict[str, Any]] = {"deterministic": {}}
@@ -47,10 +47,12 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Holds total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+    """Errors of one estimator in every run.
 
-    By step the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps); `failed` counts runs that
-    did not reach the end. Sets have no labels: NaN.
+    `fixed` and `assigned` (runs,) are the total errors of equation (20) in m, with fixed labels and with
+    the best assignment of labels. `fixed_by_step` and `assigned_by_step` (runs, steps) are the squared
+    errors in m², `gospa_by_step` (runs, steps) is in m, with a cutoff of 10 m. `failed` is the number of
+    runs that did not reach the end. Errors with fixed labels are NaN for sets, which have no labels.
     """
 
     fixed: Floats
@@ -61,13 +63,13 @@ class Scores(NamedTuple):
     failed: int
 
     def of_first(self, runs: int) -> "Scores":
-        """Return the scores of the first runs."""
+        """Return the scores of the first `runs` runs."""
         by_step = (self.fixed_by_step, self.assigned_by_step, self.gospa_by_step)
         return _scores(*(part[:runs] for part in by_step))
 
 
 class Case(NamedTuple):
-    """Holds one case: its runs, each estimator's scores by label, and bytes that each sends per step."""
+    """One case: its runs, and by label each estimator's scores and the bytes that it sends per step."""
 
     name: str
     sources: Sequence[MemorySource]
@@ -76,14 +78,14 @@ class Case(NamedTuple):
 
     @property
     def parameters(self) -> VehiclesParameters:
-        """Return what was recorded."""
+        """Return the parameters of the recorded scenario."""
         stated = self.sources[0].run
         assert stated is not None
         return VehiclesParameters.model_validate(stated.parameters)
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
-    """Read the stamps (runs, steps) after the start, and true places (runs, steps, vehicles, 2)."""
+    """Read stamps (runs, steps) after the start, and true positions (runs, steps, vehicles, 2) in m."""
     numbers = vehicle_numbers(sources[0].topics)
     topics = [f"/vehicle{number}/truth" for number in numbers]
     read = [source.read(topics) for source in sources]
@@ -92,15 +94,15 @@ def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
 
 
 def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np.int64]) -> Floats:
-    """Take an estimator's places of all vehicles at the truth's stamps.
+    """Collect an estimator's positions of all vehicles at the stamps of the truth.
 
     Args:
-        outputs: by topic.
-        label: the estimator's.
-        times_ns: (runs, steps), the truth's stamps.
+        outputs: outputs of all estimators by topic.
+        label: label of the estimator.
+        times_ns: stamps of the truth, (runs, steps).
 
     Returns:
-        (runs, steps, vehicles, 2), in m; NaN where there is none.
+        Positions (runs, steps, vehicles, 2), in m; NaN without an estimate.
     """
     topics = [topic for topic in outputs if topic.startswith(f"/estimates/{label}/vehicle")]
     states = [topic for topic in topics if topic.endswith("/state")]
@@ -115,11 +117,11 @@ def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np
 
 
 def score(estimates: Floats, truths: Floats) -> Scores:
-    """Compute the total errors of estimated places.
+    """Compute the errors of estimated positions.
 
     Args:
-        estimates: (runs, steps, vehicles, 2), in m; NaN where there is none.
-        truths: (runs, steps, vehicles, 2), in m.
+        estimates: positions (runs, steps, vehicles, 2), in m; NaN without an estimate.
+        truths: true positions (runs, steps, vehicles, 2), in m.
     """
     return _scores(
         fixed_squared_error(estimates, truths),
@@ -129,20 +131,19 @@ def score(estimates: Floats, truths: Floats) -> Scores:
 
 
 def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
-    """Sum up squared errors and GOSPA by run and step."""
     failed = int(np.isnan(assigned).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
 
 
 def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
-    """Compute the total errors of a set estimate.
+    """Compute the errors of a set estimate.
 
-    A vehicle without an element of its own takes the nearest.
+    If a set has fewer elements than there are vehicles, several vehicles can share an element.
 
     Args:
-        outputs: by topic.
+        outputs: outputs of all estimators by topic.
         found: the judged set estimate, which has GOSPA.
-        truths: (runs, steps, vehicles, 2), in m.
+        truths: true positions (runs, steps, vehicles, 2), in m.
     """
     topic = f"/estimates/{found.estimator}/{found.case}"
     sizes, elements = outputs[f"{topic}/set"], outputs[f"{topic}/element"]
@@ -165,7 +166,7 @@ def scores_of(
     labels: Iterable[str],
     others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
-    """Return the scores of all estimators of the runs; those of sets by the network's fixes."""
+    """Compute the scores of all estimators by label; sets are scored in the case `network`."""
     times_ns, truths = truths_of(sources)
     sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
@@ -180,10 +181,10 @@ def scores_of(
 def bytes_per_step(
     sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
-    """Return what the members of the network send per scan of the network, on average, by estimator.
+    """Compute how many bytes the network sends per scan, on average, by estimator.
 
-    Fixes with identity where the association must be known, without else; of the infrastructure
-    sensor nothing, its one number, or its detections.
+    Vehicles send their position fixes, with an identity if the estimator needs a known association. The
+    infrastructure sensor sends nothing, one number, or its detections.
     """
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]

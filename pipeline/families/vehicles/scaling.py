@@ -1,8 +1,9 @@
-"""Studies how time and error of vehicles' filters grow with the number of vehicles.
+"""A study of how CPU time and error of filters grow with the number of vehicles.
 
-Vehicles start anywhere in a square: one that grows with their number, so that they stay as far apart, or
-one so small that any fix may be of any vehicle. Where a method's time grows faster than any power, it is
-told by the factor for every further vehicle; else by the power.
+Vehicles start anywhere in a square. The square either grows with their number, which keeps their density
+constant, or is so small that every fix can belong to every vehicle. Growth of the time is given as a
+power of the number of vehicles and as a factor per vehicle; the factor is the better description for
+methods whose time grows exponentially.
 """
 
 import time
@@ -28,12 +29,12 @@ TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
-    """States up to how many vehicles a method goes, and how its work should grow.
+    """The largest number of vehicles of a method, and the expected growth of its time.
 
     Attributes:
         most: largest number of vehicles.
-        place: whether vehicles start apart, or together in one square.
-        growth: how its work should grow with the number of vehicles.
+        place: whether vehicles start apart, or together in a small square.
+        growth: how the time should grow with the number of vehicles.
     """
 
     most: PositiveInt
@@ -42,13 +43,13 @@ class Swept(Parameters):
 
 
 class ScalingOptions(Parameters):
-    """States the numbers of vehicles, and where they are.
+    """The numbers of vehicles, and where they start.
 
     Attributes:
         vehicles: numbers of vehicles.
-        area_per_vehicle_m2: area per vehicle where they start apart.
-        together_m: side of the square where they start together.
-        methods: how far each method goes, by label.
+        area_per_vehicle_m2: area per vehicle if they start apart.
+        together_m: side of the square if they start together.
+        methods: limits of each method, by label.
     """
 
     vehicles: tuple[PositiveInt, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 20, 35, 50)
@@ -58,7 +59,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """States how time grows over the greater half of the numbers: power of N, and factor per vehicle."""
+    """The growth of time over the larger half of the numbers: a power of N, and a factor per vehicle."""
 
     power: float
     factor: float
@@ -110,7 +111,7 @@ def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> 
 def _timed(
     sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
 ) -> tuple[float, float, int]:
-    """Measure a step's CPU ms, the assigned RMSE of a vehicle's place in m, and how many runs fail."""
+    """Measure CPU time per step (ms), assigned RMSE of a vehicle's position (m), and failed runs."""
     chosen = {label: estimators[label]}
     replay_in_memory(sources[:1], chosen)  # compiles
     begin = time.process_time()
@@ -126,9 +127,10 @@ def _timed(
 
 
 def growth_of(table: pd.DataFrame) -> Growth:
-    """Fit to the greater half of the numbers of vehicles, where the work hides what is constant.
+    """Fit the growth of the time of a step with the number of vehicles.
 
-    Steps too short for the clock, which measure 0, are left out.
+    The fit uses the larger half of the numbers, for which the constant part of the time is negligible.
+    It ignores steps too short for the clock, with a time of 0.
     """
     own = table[(table["vehicles"] >= table["vehicles"].median()) & (table["step_ms"] > 0)]
     if len(own) < 2:
@@ -145,7 +147,7 @@ def _table(growth: Mapping[Any, Growth], options: ScalingOptions) -> pd.DataFram
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Draw time of a step and error of a vehicle over the number of vehicles."""
+    """Draw the time of a step and the error of a vehicle over the number of vehicles."""
     ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
     x = Axis(label="vehicles", log=True, ticks=ticks)
     axes = {

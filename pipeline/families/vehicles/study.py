@@ -1,4 +1,4 @@
-"""Studies cooperative vehicles: total errors by method, bounds and bandwidth.
+"""A study of cooperative vehicles: total errors by method, bounds and bandwidth.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016.
@@ -63,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """Return the slow estimators' scores in the first runs of a case, and the others' in the same."""
+    """Score the slow estimators in the first runs of a case, with the others' scores in these runs."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]
@@ -73,7 +73,7 @@ def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Sc
 
 
 def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
-    """Tabulate means and medians over the runs of the total error."""
+    """Tabulate the mean and median of the total error over the runs."""
     rows = [
         (
             case,
@@ -94,7 +94,7 @@ def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
 
 
 def _known(average: Callable[[Floats], Any], values: Floats) -> float:
-    """Average what is known; NaN where nothing is."""
+    """Average the finite values; return NaN if there are no finite values."""
     known = values[np.isfinite(values)]
     return float(average(known)) if len(known) else np.nan
 
@@ -118,7 +118,7 @@ def _metrics(case: str, scores: Mapping[str, Scores], reference: str) -> dict[st
 
 
 def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate the Kalman filter's exact total error, and bounds of settled filters, by case."""
+    """Tabulate the exact total error of the Kalman filter, and bounds in steady state, by case."""
     rows = []
     for case in cases:
         given = case.parameters
@@ -132,7 +132,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_bytes(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate what each method sends per step, and what exchanging all tracks would."""
+    """Tabulate the bytes that each method sends per step, and those of exchanging all tracks."""
     rows = [(case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()]
     for case in cases:
         tracks = TRACK_BYTES * _vehicles(case)
@@ -145,7 +145,7 @@ def _vehicles(case: Case) -> int:
 
 
 def _steps(case: Case) -> pd.DataFrame:
-    """Tabulate by estimator and step the error of all vehicles together, RMS over the runs."""
+    """Tabulate the errors of all vehicles together by estimator and step, over the runs."""
     columns = [
         "case",
         "estimator",
@@ -172,7 +172,7 @@ def _steps(case: Case) -> pd.DataFrame:
 
 
 def _chart(case: Case) -> Chart:
-    """Draw the median over the runs of all vehicles' error by step, best labels (the paper's Fig. 3)."""
+    """Draw the median error of all vehicles by step, with the best labels (the paper's Fig. 3)."""
     series = []
     for label, scores in case.scores.items():
         median = np.sqrt(np.nanmedian(scores.assigned_by_step, axis=0))
