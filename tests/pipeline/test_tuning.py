@@ -235,7 +235,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
             {"set": {"turn_noise_density": 0.0}},
             "its start value is 0; give a positive start value",
         ),
-        ("sigma_range_m", {"by": "rmse"}, "gives no truth to compare its estimates with"),
+        ("sigma_range_m", {"by": "rmse"}, "has no truth to compare its estimates with"),
         ("sigma_range_m", {"by": "luck"}, "--by luck: available: likelihood, nis"),
         (
             "sigma_range_m",
