@@ -14,8 +14,8 @@ hide: [navigation, toc]
 
 # Gallery
 
-All experiments of fuselog. Each picture is the timeline of the experiment's first run, or its figure, and
-links to the page that explains it.
+All experiments of fuselog. Each picture is the timeline of the experiment's first run, or its figure,
+and links to the page that explains it.
 
 <div class="grid cards gallery" markdown>
 
