@@ -14,8 +14,8 @@ hide: [navigation, toc]
 
 # Gallery
 
-Every experiment that ships: its first run as the timeline draws it, or else its figure. A picture leads
-to the page that says what it shows.
+All experiments of fuselog. Each picture is the timeline of the experiment's first run, or its figure,
+and links to the page that explains it.
 
 <div class="grid cards gallery" markdown>
 

@@ -33,20 +33,20 @@ ROOMS = {
 KINDS: dict[str, tuple[Mapping[str, Entry], str]] = {
     "scenarios": (
         fl.scenarios,
-        "What can be recorded or imported. `--set NAME=VALUE` changes a parameter, whose name "
+        "Scenarios that you can record or import. `--set NAME=VALUE` changes a parameter, whose name "
         "ends in its unit, such as `_m` or `_radps`.",
     ),
     "models": (
         fl.models,
-        "What a state is made of, how it moves and what sensors measure of it. The "
-        "[methods](estimators.md) that estimate it are those with a check mark.",
+        "Each model describes a state, how it moves and what sensors measure of it. A check mark "
+        "means that the [method](estimators.md) can estimate the state.",
     ),
     "estimators": (
         fl.estimators,
-        "All that `-e NAME` takes. The methods among them estimate any [model](models.md), whose "
-        "parameters they take besides their own; the others have mathematics of their own.",
+        "All names for `-e NAME`. Methods estimate the state of any [model](models.md), and have the "
+        "model's parameters in addition to their own; the other estimators have their own equations.",
     ),
-    "metrics": (fl.metrics, "What estimates are judged by."),
+    "metrics": (fl.metrics, "Metrics that judge estimates."),
 }
 PLACES = [f"reference/{name}.md" for name in ("commands", "python", "messages", "speed", *KINDS)]
 TYPES = {
@@ -84,8 +84,8 @@ def _python() -> str:
     lines = [
         "# Python",
         "",
-        "`import fuselog` has these names; [Python](../python.md) shows how to use them. "
-        "`fuselog.schemas` has the [messages](messages.md).",
+        "The package `fuselog` exports these names; [Python](../python.md) shows how to use them. "
+        "`fuselog.schemas` contains the [messages](messages.md).",
     ]
     for room, nodes in groupby(imports, lambda node: (node.module or "").split(".")[1]):
         names = [alias.name for node in nodes for alias in node.names if alias.name != "schemas"]
@@ -100,8 +100,9 @@ def _messages() -> str:
     lines = [
         "# Messages",
         "",
-        "Every message of a log: a protobuf message of syntax proto3, whose fields are always written, "
-        "numbered in this order. Each opens with `sensor_time_ns`, the sensor's own clock reading.",
+        "All messages of a log. Each is a protobuf message of syntax proto3. All fields are always "
+        "written, and are numbered in this order. The first is `sensor_time_ns`, the time of the "
+        "sensor's own clock.",
         "",
     ]
     for schema in SCHEMAS.values():
@@ -115,13 +116,13 @@ def _schema(schema: Schema) -> Iterator[str]:
         [str(number), f"`{field.name}`", TYPES[field.kind], _missing(field)]
         for number, field in enumerate(schema.fields, start=1)
     ]
-    yield from table(["number", "field", "type", "where it is missing"], rows)
+    yield from table(["number", "field", "type", "missing value"], rows)
 
 
 def _missing(field: Field) -> str:
     says = {
         "NaN": field.may_be_nan,
-        "left out by logs of before there was the field": field.may_be_absent,
+        "absent from logs that are older than the field": field.may_be_absent,
     }
     return "; ".join(text for text, holds in says.items() if holds)
 
@@ -138,8 +139,8 @@ def _speed() -> str:
     lines = [
         "# Speed",
         "",
-        "fuselog beside other software, in one run and with the same estimates, as `make bench` last "
-        "measured it. `python -m tests.bench NAME` measures one table.",
+        "fuselog compared with other software, in one run and with the same estimates, as last measured "
+        "by `make bench`. `python -m tests.bench NAME` measures one table.",
         "",
     ]
     for name, kept in json.loads(SPEED.read_text(encoding="utf-8")).items():
