@@ -18,6 +18,7 @@ CODE = re.compile(
     r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+", re.DOTALL
 )
 LEAST_BLANKS = 2  # of a string that counts as prose
+LETTERS = re.compile("[a-z]{2}")
 
 
 class Habit(NamedTuple):
@@ -61,7 +62,7 @@ def texts_of_code(source: str) -> Iterator[Text]:
             inner = [each for each in inner if not isinstance(each, ast.Constant)]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             words = node.value
-        if words.count(" ") >= LEAST_BLANKS or words.endswith("."):
+        if (words.count(" ") >= LEAST_BLANKS or words.endswith(".")) and LETTERS.search(words):
             yield Text(node.lineno, words)
         waiting += inner
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
