@@ -517,7 +517,7 @@ def test_what_no_run_can_use_is_bad_input():
         with pytest.raises(BadInput, match=rf"{said} .*; the log has /"):
             replayed("ekf", [without(source, topic)])
         foreign = replace(source.streams[topic], schema=schemas.SCAN)
-        with pytest.raises(BadInput, match=f"{said} .*which is fuselog.Scan here"):
+        with pytest.raises(BadInput, match=f"{said} .*which has type fuselog.Scan in this log"):
             replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])
     with pytest.raises(BadInput, match="gives no covariance"):
         unscented(3, -3.0)

@@ -114,7 +114,7 @@ def test_a_shift_by_leap_seconds_is_told(shift_s: int):
     how = align(moved, NavigationParameters()).how
     assert ("leap seconds" in how) == (shift_s != 0)
     if shift_s:
-        assert f"inertial_delay_s={shift_s} moves the unit's" in how
+        assert f"give inertial_delay_s={shift_s}" in how
         mended = align(moved, NavigationParameters(inertial_delay_s=float(shift_s)))
         assert "leap seconds" not in mended.how
 
@@ -125,7 +125,7 @@ UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 @pytest.mark.parametrize(
     ("scales", "words"),
     [
-        ({"specific_force_mps2": 1 / 9.80665}, "gravity reads 1.0.* it looks like g"),
+        ({"specific_force_mps2": 1 / 9.80665}, "specific force is 1.0.* looks like g"),
         ({"turn_rate_radps": 180 / np.pi}, "turn rate at rest is .* looks like deg/s"),
         (
             {"specific_force_mps2": UPSIDE_DOWN, "turn_rate_radps": UPSIDE_DOWN},
@@ -170,7 +170,7 @@ def test_several_units_are_told_apart_before_another_model_is_taken():
     estimator, _ = find_estimator("ekf")
     with pytest.raises(
         BadInput,
-        match=r"/body/prior is of model inertial, which needs /body/inertial .* the log has "
+        match=r"/body/prior belongs to model inertial, which needs /body/inertial .* the log has "
         r"/body/imu1/inertial, /body/imu2/inertial of that type: .*topics.inertial=/body/imu1/inertial",
     ):
         estimator.bind("ekf", topics, build(estimator.parameters, {}, "test"))

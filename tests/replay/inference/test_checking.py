@@ -169,7 +169,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a quaternion with a sign": (
         replace(ATTITUDE, sensors=COMPASS),
-        "orientation_w is of kind quaternion, but force_x is another at its negative",
+        "orientation_w is of kind quaternion, but force_x differs at its negative",
     ),
     "a quaternion that grows": (
         replace(ATTITUDE, motion=Motion(growing, attitude.noise)),

@@ -99,7 +99,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "one component, two kinds": (
         replace(VEHICLE_A, sensors=(RANGE_BEARING, replace(SPEED, measured={"bearing_rad": "linear"}))),
-        ("bearing_rad is linear here and angle elsewhere",),
+        ("bearing_rad is linear, but angle in another sensor",),
     ),
     "a control of a sensor alone": (
         with_sensor(SPEED, control=HELD),

@@ -463,7 +463,7 @@ BAD: dict[str, tuple[Mapping[str, Any], str]] = {
     "initial": (
         {"steady_at_start": 1.5},
         "initial probabilities of the modes are steady 1.5, agile -0.5; give numbers of zero or more "
-        "whose sum is",
+        "with sum one",
     ),
 }
 

@@ -32,7 +32,7 @@ def test_a_sharp_measurement_is_taken_in_by_parts() -> None:
         assert np.abs((found["state"]["mean"] - exact["state"]["mean"]) / spread).max() < 0.6
         assert_allclose(np.sqrt(found["state"]["covariance"]) / spread, 1.0, atol=0.3)
         assert found["innovation"]["log_likelihood"].sum() == pytest.approx(known, abs=1.0)
-    with pytest.raises(BadInput, match="give less"):
+    with pytest.raises(BadInput, match="must be less than 1"):
         outputs(SCALAR, "particles", [source], progressive=True, resample_below=1.0)
 
 

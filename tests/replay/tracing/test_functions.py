@@ -123,7 +123,7 @@ REFUSED = {
     ),
     "many ways": (
         in_many_ways,
-        r"more than 256 paths through .*; write np\.clip or np\.where",
+        r"there are more than 256 paths .*; write np\.clip or np\.where",
     ),
     "a reduction": (lambda x: np.add.reduce(x), r"it uses np\.add\.reduce; write it with operators"),
     "an option": (lambda x: np.sin(x, where=True), r"it uses np\.sin with where; write np\.where"),
