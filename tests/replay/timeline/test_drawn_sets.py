@@ -213,7 +213,7 @@ def test_where_a_thinned_estimate_begins_it_is_said(
         said = run.picture.moving[f"/events/robot1/{name}"]
         assert said["sim_time"] == [stream.publish_time_ns[0] - source.epoch_ns]
         [[text]] = said["TextLog:text"]
-        assert re.search(rf", {name}: drawn at \S+ Hz of \S+ Hz$", text)
+        assert re.search(rf", {name}: drawn at \S+ Hz instead of \S+ Hz$", text)
 
 
 def test_nothing_is_lost_where_a_block_ends_or_a_number_is_missing(

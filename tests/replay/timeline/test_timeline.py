@@ -348,7 +348,7 @@ def test_a_long_run_is_thinned_and_says_so(tmp_path: Path) -> None:
     rows = {entity: len(columns["utc"]) for entity, columns in found.items()}
     assert rows["/plots/robot1/error_x_m/ekf"] == DRAWN_ROWS
     assert max(rows.values()) <= DRAWN_ROWS
-    assert told(found["/events/robot1/ekf"])[0] == "ekf: drawn at 16.7 Hz of 20 Hz"
+    assert told(found["/events/robot1/ekf"])[0] == "ekf: drawn at 16.7 Hz instead of 20 Hz"
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1), st.integers(1, 50))
