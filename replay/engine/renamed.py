@@ -18,10 +18,6 @@ def renamed(**names: str) -> Callable[[Target], Target]:
         names: the new name of each argument, by the old one. The fields of a dataclass can be read
             under their old names as well.
 
-    Args:
-        names: the new name of each argument, by the old one. A dataclass lets the field be read by its
-            old name as well.
-
     >>> @renamed(length="length_m")
     ... def area(length_m):
     ...     return length_m**2
