@@ -112,7 +112,8 @@ class Finding:
             if name not in _OLD:
                 raise AttributeError(f"'{type(self).__name__}' has no '{name}'")
             warnings.warn(
-                f"Finding: '{name}' was renamed to '{_OLD[name]}'; the old name will be removed in the next release",
+                f"Finding: '{name}' was renamed to '{_OLD[name]}'; the old name will be removed in the "
+                "next release",
                 FutureWarning,
                 stacklevel=2,
             )
