@@ -162,9 +162,7 @@ def test_odometry_alone_begins_at_zero() -> None:
     """Also the model of odometry alone, which takes no fixes. A sighting needs its map all the same."""
     for model, others in ((ROBOT, ()), (RECKONING, (fix(), seen()))):
         found = outputs(model, "ekf", [log(odometry(), *others)])
-        assert sentences_of(found["started"].stream)[0].endswith(
-            "at zero, the origin of its frame"
-        )
+        assert sentences_of(found["started"].stream)[0].endswith("at zero, the origin of its frame")
         end = found["pose"]["mean"][-1]
         wanted = (0.0, 0.0, 0.0)
         for _ in range(STEPS - 1):
@@ -205,9 +203,7 @@ def test_sightings_need_a_prior_which_nothing_overrules() -> None:
 
 def test_poses_without_a_covariance() -> None:
     source = log(odometry(), seen(known=False))
-    with pytest.raises(
-        BadInput, match=r"can replace it: .*--set sigma_fix_m=...; give --set sigma_hea"
-    ):
+    with pytest.raises(BadInput, match=r"can replace it: .*--set sigma_fix_m=...; give --set sigma_hea"):
         outputs(ROBOT, "ekf", [source])
     found = outputs(ROBOT, "ekf", [source], sigma_fix_m=0.3, sigma_heading_rad=0.05)
     assert len(found["skipped"]) == 0
@@ -322,9 +318,7 @@ def test_headings_are_a_sensor() -> None:
 
 def test_a_pose_and_a_fix_in_planes_that_have_nothing_to_do_with_each_other() -> None:
     source = log(odometry(), seen(), fix())
-    with pytest.raises(
-        BadInput, match=r"on earth, /pose positions in frame map, and no channel"
-    ):
+    with pytest.raises(BadInput, match=r"on earth, /pose positions in frame map, and no channel"):
         bound(ROBOT, "ekf", [source])
     for left_out, streams in (("fix", ("/odometry", "/pose")), ("pose", ("/odometry", "/fix"))):
         (only,) = bound(ROBOT, "ekf", [source], topics={left_out: ""})
