@@ -46,8 +46,8 @@ def assert_golden(
         there = read(place) if place.exists() else None
         write(place, make(runs, chosen or (there or {"settings": {}})["settings"]["estimators"]).golden)
         return
-    mend = f"if this change is intended, run once with {UPDATE}=1 to write the golden again"
-    _require(check(runs, read(place), chosen), place, mend)
+    remedy = f"if this change is intended, run once with {UPDATE}=1 to write the golden again"
+    _require(check(runs, read(place), chosen), place, remedy)
 
 
 def assert_same(replayed: Replayed, golden: str | Path) -> None:

@@ -44,10 +44,10 @@ def check_format(path: object, stated: object, read: int) -> None:
     if type(stated) is not int:
         raise BadInput(f"{path}: format {stated!r} is not a format of fuselog; write it again")
     if stated != read:
-        age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
+        age, remedy = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
         raise BadInput(
             f"{path}: {age} version of fuselog wrote it (format {stated}, this version reads {read}); "
-            f"{mend}"
+            f"{remedy}"
         )
 
 

@@ -162,12 +162,12 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         with np.errstate(over="ignore"):  # an infinite length is rejected like any other
             norm = np.linalg.norm(quaternion, axis=1)
         bad = np.abs(norm - 1) > TOLERANCE
-        mend = (
+        remedy = (
             "scale it to 1"
             if np.all(np.abs(norm - 1) < NEARLY)
             else f"check what it is; {_wanted(found)}"
         )
-        _refuse(bad, path, numbers, f"has a quaternion that is not of unit length; {mend}")
+        _refuse(bad, path, numbers, f"has a quaternion that is not of unit length; {remedy}")
         rotation = Rotation.from_quat(quaternion, scalar_first=found == "euroc").as_matrix()
     position_m = values[:, layout.position]
     note = f"{path}: read as {found.upper().replace('EUROC', 'EuRoC')} ({layout.columns})"

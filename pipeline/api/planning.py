@@ -21,7 +21,7 @@ from fuselog.pipeline.runs.ensemble import (
 from fuselog.pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
 from fuselog.pipeline.runs.settings import with_settings
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Clock, Companions, RunMetadata, open_log
+from fuselog.recorders.log import Clock, Mirrors, RunMetadata, open_log
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.replaying.estimator import Estimator
 from fuselog.replay.engine.replaying.late import Late
@@ -63,7 +63,7 @@ class Plan:
         *,
         save: Path | None = None,
         connect: str | None = None,
-        companions: Companions | None = None,
+        mirrors: Mirrors | None = None,
         progress: Progress = no_progress,
     ) -> Pass:
         """Replay the logs, write estimates logs, and judge the estimates if there is truth.
@@ -86,7 +86,7 @@ class Plan:
             late=self.late,
             save=save,
             connect=connect,
-            companions=companions,
+            mirrors=mirrors,
             progress=progress,
         ).check()
 

@@ -50,7 +50,7 @@ from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, sp
 from fuselog.recorders.atomic import scratch_folder, whole_file
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Companions, Log, open_log
+from fuselog.recorders.log import Log, Mirrors, open_log
 from fuselog.replay.engine.streams.linting import lint_source, worst
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.moments import Moment
@@ -111,7 +111,7 @@ def replay_logs(
         list(zip(paths, logs, strict=True)),
         save=save,
         connect=connect,
-        companions=companions_if(foxglove),
+        mirrors=mirrors_if(foxglove),
         progress=progress,
     )
     for path, run in before.items():
@@ -161,13 +161,13 @@ def say_left_out(path: Path, foxglove: bool) -> None:
             warn(f"{path}: {sentence}")
 
 
-def companions_if(foxglove: bool) -> Companions | None:
+def mirrors_if(foxglove: bool) -> Mirrors | None:
     """Import and return the Foxglove mirror if it is asked for; the import is slow."""
     if not foxglove:
         return None
-    from fuselog.pipeline.logs.foxglove import companions
+    from fuselog.pipeline.logs.foxglove import mirrors
 
-    return companions
+    return mirrors
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:

@@ -51,7 +51,7 @@ def record(
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
-    from fuselog.pipeline.command_line.commands import companions_if, say_left_out
+    from fuselog.pipeline.command_line.commands import mirrors_if, say_left_out
     from fuselog.pipeline.output.outputs import RECORDED, check_files, replaced, run_written
     from fuselog.pipeline.output.terminal import warn
     from fuselog.pipeline.runs.inputs import load_scenario
@@ -75,8 +75,8 @@ def record(
     check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
     before = run_written(path)
     recording, metadata = record_run(name, values, seed or 0, run or 0)
-    beside = companions_if(foxglove)
-    write_log(path, recording.streams, metadata, compression=compression, companions=beside)
+    beside = mirrors_if(foxglove)
+    write_log(path, recording.streams, metadata, compression=compression, mirrors=beside)
     say_left_out(path, foxglove)
     if sentence := replaced(path, before, open_log(path).run):
         warn(sentence)

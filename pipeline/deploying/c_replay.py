@@ -13,14 +13,16 @@ from fuselog.replay.inference.model.model import Map, Sensor
 
 def why_no_replay(made: CFilter) -> str:
     """Explain why fuselog cannot replay the C; "" if it can."""
-    stage, found = made.filtering.stage, made.filtering.found
+    bound_model, found = made.filtering.bound_model, made.filtering.found
     if made.is_interpolated:
         return "its control is interpolated, so that messages have to wait for the next control"
-    if found.fallbacks or (stage.model.control is not None and stage.model.control.read is not None):
+    if found.fallbacks or (
+        bound_model.model.control is not None and bound_model.model.control.read is not None
+    ):
         return "its control is computed from messages in Python"
     if found.geodetic:
         return f"{found.geodetic[0].name} has latitudes and longitudes"
-    for sensor in stage.sensors:
+    for sensor in bound_model.sensors:
         if sensor.read is not None:
             return f"the measurement of {sensor.topic} is computed from its messages in Python"
         if sensor.is_numbered:
@@ -43,8 +45,8 @@ def _fields(sensor: Sensor) -> list[str]:
 
 
 def _description(made: CFilter, reading: Reading) -> str:
-    stage = made.filtering.stage
-    model, single = stage.model, " in single precision" if made.precision.ending else ""
+    bound_model = made.filtering.bound_model
+    model, single = bound_model.model, " in single precision" if made.precision.ending else ""
     told = {identifier(name): meaning for name, meaning in meanings(model.parameters).items()}
     topics: list[dict[str, Any]] = [
         {
@@ -175,7 +177,7 @@ def replay_text(made: CFilter, reading: Reading) -> str:
     )
     angles = "".join(
         f"    mean[{index}] = wrapped(mean[{index}]);\n"
-        for index, kind in enumerate(made.filtering.stage.model.kinds)
+        for index, kind in enumerate(made.filtering.bound_model.model.kinds)
         if kind == "angle"
     )
     wrap = (

@@ -52,7 +52,7 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     Raises BadInput if the filter does not start in the log, estimates nothing, or accepts nothing.
     """
     start, events = _handed(source, bound, filtering)
-    first, sensors = start.carried, filtering.stage.sensors
+    first, sensors = start.carried, filtering.bound_model.sensors
     events = _with_outliers(filtering, _from_start(events, int(first.time_ns[0]), len(sensors)))
     count, time_ns = len(events.time_ns), events.time_ns
     last = np.append(np.diff(time_ns) > 0, True)
@@ -130,7 +130,7 @@ def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
     """Add a distant copy of the last message of every sensor with a gate, as an outlier."""
     source, data = events.source, events.data
     rows, far = [np.arange(len(source))], [data]
-    for number, sensor in enumerate(filtering.stage.sensors):
+    for number, sensor in enumerate(filtering.bound_model.sensors):
         m = len(sensor.measured)
         own = np.flatnonzero((source == number) & ~np.isnan(data[:, :m]).all(axis=1))
         if len(own) and np.isfinite(filtering.gates[number, 1]):

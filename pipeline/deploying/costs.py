@@ -239,7 +239,7 @@ def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) ->
 
 
 def _correction(made: CFilter) -> Cost:
-    model, step, t = made.filtering.stage.model, made.steps.correct, made.tangent
+    model, step, t = made.filtering.bound_model.model, made.steps.correct, made.tangent
     kinds, square = model.kinds, Shape((t, t))
     mean, vector = Shape((model.size,)), Shape((t,))
     own = added(_cost_of_step(step), _products(step, "F", t, t, is_root=made.is_root)[1])

@@ -146,7 +146,7 @@ def _made(
 ) -> tuple[Recursive, CFilter]:
     """Bind a filter to a log, and trace its steps."""
     bound, filtering, kind = _bound(label, dict(settings), run)
-    origin = f"{filtering.stage.model.summary}: {filtering.method.summary}."
+    origin = f"{filtering.bound_model.model.summary}: {filtering.method.summary}."
     return bound, CFilter(name, filtering, whole_steps(filtering, kind), precision, origin)
 
 

@@ -99,10 +99,10 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
 
 def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
     """Describe from when on single precision loses the covariance, and what to use instead."""
-    mend = "" if is_root else "; use a square-root form, sqrt:ekf or sqrt:ukf"
+    remedy = "" if is_root else "; use a square-root form, sqrt:ekf or sqrt:ukf"
     return (
         f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
-        f"covariance in single precision is no longer positive definite, unlike in double{mend}"
+        f"covariance in single precision is no longer positive definite, unlike in double{remedy}"
     )
 
 

@@ -20,7 +20,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     noise_gain_over,
 )
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
-from fuselog.pipeline.diagnosing.joint import Fit, Supposed, fit, promised, undone
+from fuselog.pipeline.diagnosing.joint import Fit, Supposed, corrected, fit, promised
 from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
 from fuselog.pipeline.diagnosing.search import NUMBER_COST, Peak, peak, rival
 from fuselog.pipeline.optimise import DROP_95, QUANTILE, curvature, end, side_by_side
@@ -218,7 +218,7 @@ class _Search:
 
     def without(self, found: Sequence[Found]) -> Trial:
         """Correct the causes in the log."""
-        return undone(self.base, [each.supposed for each in found])
+        return corrected(self.base, [each.supposed for each in found])
 
     def more(
         self,
@@ -375,7 +375,7 @@ class _Search:
             *others, own = fitted.faults
             [before] = self.likelihood([self.without(look.found)])
             gains = Peak(own.value, fitted.log_likelihood - before)
-            now = undone(self.base, others)
+            now = corrected(self.base, others)
             alike, _ = _likeliest(self.likelihood, now, [(gains, of)], self.count)
             if alike:
                 return self._together([*look.found, Found(alike, now)])
@@ -477,7 +477,7 @@ class _Search:
         causes = []
         for place, each in enumerate(found):
             before, after = main.faults[:place], main.faults[place + 1 :]
-            [without] = self.likelihood([undone(self.base, [*before, *after])])
+            [without] = self.likelihood([corrected(self.base, [*before, *after])])
             gain, others = main.log_likelihood - without, []
             for at, of in each.names[1:]:
                 faults = [*before, Supposed(of, at.value), *after]

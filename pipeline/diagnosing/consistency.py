@@ -27,9 +27,9 @@ BIASED = 0.7
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
     """Yield errors that innovations do not show; causes that were found may explain them or not."""
-    mend = "estimate a bias as a state, or see fuselog observability LOG"
+    remedy = "estimate a bias as a state, or see fuselog observability LOG"
     if has_causes:
-        mend = "fix the causes above first, then check again"
+        remedy = "fix the causes above first, then check again"
     metrics = done.judge.metrics
     for key, (_, high) in done.judge.bounds.items():
         _, quantity, case = split_metric(key)
@@ -44,7 +44,7 @@ def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Fin
                 f"{case or 'the estimate'}: NEES is {value:.3g} (consistent up to {high:.3g}), but NIS "
                 f"is only {nis:.3g} per component: the state follows an error that the innovations do "
                 "not show",
-                otherwise=mend,
+                otherwise=remedy,
             )
 
 
@@ -117,7 +117,7 @@ class _Seen(NamedTuple):
     nis: float
     low: float
     high: float
-    mend: str
+    remedy: str
 
     @property
     def times(self) -> float:
@@ -141,8 +141,8 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
     for topic, stream in innovations.items():
         case, alike = split_topic(topic)[1], dict[tuple[bool, str], list[_Seen]]()
         for each in _inconsistent(stream):
-            alike.setdefault((each.is_small, each.mend), []).append(each)
-        for (is_small, mend), some in alike.items():
+            alike.setdefault((each.is_small, each.remedy), []).append(each)
+        for (is_small, remedy), some in alike.items():
             less = "smaller" if is_small else "larger"
             times, nis = (
                 " to ".join(dict.fromkeys(f"{value:.3g}" for value in (min(values), max(values))))
@@ -156,7 +156,7 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
                 max(each.times for each in some),
                 f"{case}: the innovations of {listed([each.name for each in some])} are {times} times "
                 f"{less} than their variances state (NIS is {nis}, consistent from {low:.3g} to "
-                f"{high:.3g}): {mend}",
+                f"{high:.3g}): {remedy}",
             )
 
 
@@ -173,14 +173,14 @@ def _inconsistent(stream: Stream) -> Iterator[_Seen]:
             continue
         mean = float(np.nanmean(column))
         if abs(mean) > BIASED * max(np.sqrt(tested.mean_square), 1.0):
-            mend = f"their mean is {mean:.3g} standard deviations: the sensor is biased"
+            remedy = f"their mean is {mean:.3g} standard deviations: the sensor is biased"
         elif tested.mean_square < low:
-            mend = f"{noise} is stated too large"
+            remedy = f"{noise} is stated too large"
         elif tested.correlation[0] > tested.bound:
-            mend = "they are autocorrelated: the sensor is late, or the process noise is too small"
+            remedy = "they are autocorrelated: the sensor is late, or the process noise is too small"
         else:
-            mend = f"{noise} is stated too small"
-        yield _Seen(name, tested.mean_square, low, high, mend)
+            remedy = f"{noise} is stated too small"
+        yield _Seen(name, tested.mean_square, low, high, remedy)
 
 
 def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> dict[str, Chart]:

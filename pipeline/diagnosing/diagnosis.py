@@ -315,10 +315,10 @@ def _without_likelihood(label: str, settings: Mapping[str, Any], innovations: Ou
         np.isneginf(each["log_likelihood"]).any() for each in innovations.values()
     ):
         return f"{label} diverged: its log-likelihood is -inf, so no fault was tried"
-    mend = for_likelihood(settings)
+    remedy = for_likelihood(settings)
     return (
         f"{label} states no likelihood of its innovations: faults are only found by unusual "
-        f"measurements{'; ' if mend else ''}{mend}"
+        f"measurements{'; ' if remedy else ''}{remedy}"
     )
 
 
@@ -398,11 +398,11 @@ def _followed(
         if not mended:
             raise
         trying = Trying(label, alterations_of(source), is_own=False)
-        mends = [trying.over(Advice.of(each.setting)) for each in mended]
-        settings_given = " ".join(f"--set {each.setting}" for each in mends)
+        remedies = [trying.over(Advice.of(each.setting)) for each in mended]
+        settings_given = " ".join(f"--set {each.setting}" for each in remedies)
         note = f"everything else is about the log with {settings_given}, because without it: {error}"
         with suppress(BadInput):
-            other = alter(source, {each.key: each.value for each in mends})
+            other = alter(source, {each.key: each.value for each in remedies})
             return replayed(other)._replace(mended=mended, notes=[note])
         raise
 

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 FIRST = ("lost messages", "gap", "stamps")  # findings that precede causes: they need no filter
 TAIL = 3.0  # standard deviations
 LOCKED_OUT = 20  # measurements in a row that a gate rejects
-KEPT_OUT = 0.05  # share of measurements that a gate rejects although they are no outliers
+REJECTED = 0.05  # share of measurements that a gate rejects although they are no outliers
 FEWEST = 20
 FLOOR = 0.1  # share of estimates with the smallest variance
 FLOOR_STEP = 1e-4  # relative step from the smallest variance to the next
@@ -150,7 +150,7 @@ def of_innovations(
                 otherwise=reopened,
                 time_ns=int(times_ns[begin]),
             )
-        elif share > KEPT_OUT and not has_outliers:
+        elif share > REJECTED and not has_outliers:
             yield Finding(
                 "gate",
                 topic,

@@ -63,7 +63,7 @@ class Supposed(NamedTuple):
         return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
 
 
-def undone(base: Trial, faults: Sequence[Supposed]) -> Trial:
+def corrected(base: Trial, faults: Sequence[Supposed]) -> Trial:
     """Correct all faults in a trial."""
     return reduce(lambda trial, each: each.without(trial), faults, base)
 
@@ -110,7 +110,7 @@ def fit(
             together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
         )
     except BadInput:  # one of the numbers has no effect
-        [found] = likelihood([undone(base, faults)])
+        [found] = likelihood([corrected(base, faults)])
         is_free = ~(together.is_flat(start) | together.at_limits(start))
         are_estimates = [bool(is_free[own].all()) for own in together.places]
         return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
@@ -186,7 +186,7 @@ class _Together:
             [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
             for point in points
         ]
-        return -np.array(self.likelihood([undone(self.base, faults) for faults in of_points]))
+        return -np.array(self.likelihood([corrected(self.base, faults) for faults in of_points]))
 
     def is_flat(self, point: Floats) -> NDArray[np.bool_]:
         """Test which numbers (k,) have no effect near a point (k,)."""

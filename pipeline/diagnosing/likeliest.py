@@ -69,8 +69,8 @@ def _mended(logs: list[Path], label: str, own: dict[str, Any], first: Finding, m
     """Describe the metrics of the same runs with the correction; "" if it is not a parameter."""
     if not first.setting or first.setting.startswith("/"):
         return ""
-    mend = merge(own, parse_settings([first.setting]))
-    table = compare(*logs, estimators=[{label: own}, {MENDED: mend}]).table
+    remedy = merge(own, parse_settings([first.setting]))
+    table = compare(*logs, estimators=[{label: own}, {MENDED: remedy}]).table
     effects, left = [], []
     for key in (main, "nees", "nis_per_component"):
         rows = table[table["quantity"] == key].to_dict("records")[:1]

@@ -281,9 +281,9 @@ class Likelihood:
             if not is_in.all():
                 missing = np.isnan(stream["innovation"][~is_in])
                 total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
-                kept_out = len(missing) / len(stream)
-                if kept_out < 1.0:
-                    total += len(missing) * np.log(kept_out) + is_in.sum() * np.log(1.0 - kept_out)
+                rejected = len(missing) / len(stream)
+                if rejected < 1.0:
+                    total += len(missing) * np.log(rejected) + is_in.sum() * np.log(1.0 - rejected)
             if name in self.readings:
                 own = [self.broad[each] for each in self.readings[name].kinds if each in self.broad]
                 more = lacking * float(np.mean(own)) if lacking else 0.0

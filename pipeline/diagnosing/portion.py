@@ -54,10 +54,10 @@ def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str,
     """Return the error for an estimator that gives no innovations on a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
-    mend = for_likelihood(settings) or "use a filter of the same model, such as -e ekf"
+    remedy = for_likelihood(settings) or "use a filter of the same model, such as -e ekf"
     if topic:
-        mend = f"it does not use {topic}, unless you give {setting}"
-    return BadInput(f"{name}: {label} gives no innovations, which a diagnosis needs; {mend}")
+        remedy = f"it does not use {topic}, unless you give {setting}"
+    return BadInput(f"{name}: {label} gives no innovations, which a diagnosis needs; {remedy}")
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:

@@ -64,8 +64,8 @@ def ranked(
     A finding with a setting that corrects it comes before causes that are only its consequence, such as
     noise. Findings that a cause names or advises are not repeated.
     """
-    mends = [cause.hypothesis.mend(cause.value) for cause in causes]
-    advised = {key for mend in mends if mend is not None for key in mend.settings}
+    remedies = [cause.hypothesis.remedy(cause.value) for cause in causes]
+    advised = {key for remedy in remedies if remedy is not None for key in remedy.settings}
     of_stamps = [each for each in of_log if each.kind in FIRST]
     alike = [each.hypothesis for cause in causes for each in (cause, *cause.others)]
     kinds = {(each.kind, each.topic) for each in alike}
@@ -156,12 +156,12 @@ def _finding(
     `before` are findings on stamps, of which a cause may be a consequence.
     """
     of, words = cause.hypothesis, cause.words
-    mend = of.mend(cause.value)
+    remedy = of.remedy(cause.value)
     found = CauseFinding(of.kind, of.topic, of.part, cause.numbers[0].value, words, cause=cause)
-    if mend is None or trying.is_set(mend):
+    if remedy is None or trying.is_set(remedy):
         return replace(found, evidence=f"{words}; the gate that is set rejects these")
-    advice = trying.over(mend)
-    words += rest(mend.settings) if rest is not None else ""
+    advice = trying.over(remedy)
+    words += rest(remedy.settings) if rest is not None else ""
     if before and of.kind in CONSEQUENCES:
         words += f"; this may be a consequence of the faulty stamps of {before[0].where}"
     tried = f"try {trying.words(advice)}"

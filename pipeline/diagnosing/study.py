@@ -115,7 +115,7 @@ def _outliers(_: MemorySource, seed: int) -> alter.Alteration:
     return alter.strayed(seed, "position_m")
 
 
-TOO_SURE = _plain(alter.spread("covariance_m2"))
+OVERCONFIDENT = _plain(alter.spread("covariance_m2"))
 SEEN, FIX, VELOCITY = "/robot1/range_bearing", "/body/fix", "/body/velocity"
 OF_VEHICLE = "/vehicle2/fix"
 NOISE: Kind = "measurement noise"
@@ -155,7 +155,7 @@ SCENARIOS = {
         {"duration_s": 40.0, "unit": {"rate_hz": 50.0, "force_noise_density": 0.02}},
         "ekf",
         {
-            "R": Fault(NOISE, FIX, np.log(3.0), alteration=TOO_SURE, by=-np.log(3.0)),
+            "R": Fault(NOISE, FIX, np.log(3.0), alteration=OVERCONFIDENT, by=-np.log(3.0)),
             "Q": Fault(
                 "process noise",
                 "force_noise_density",
@@ -178,7 +178,7 @@ SCENARIOS = {
         {"stochastic": True},
         "vehicle-kalman",
         {
-            "R": Fault(NOISE, OF_VEHICLE, np.log(3.0), alteration=TOO_SURE, by=-np.log(3.0)),
+            "R": Fault(NOISE, OF_VEHICLE, np.log(3.0), alteration=OVERCONFIDENT, by=-np.log(3.0)),
             "Q": Fault(
                 "process noise",
                 "acceleration_sigma_mps2",

@@ -78,7 +78,7 @@ def export(
         return _export_frames(log, to, topics, Path(out or f"{log.path.stem}-{to}"), notes)
     chosen = _chosen(log, to, topics, notes)
     if to == "foxglove":
-        return _export_companions(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
+        return _export_mirrors(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
     names = {topic: _file_name(topic, to) for topic in chosen}
     for topic, name in names.items():
         if list(names.values()).count(name) > 1:
@@ -130,16 +130,16 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
     return chosen
 
 
-def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+def _export_mirrors(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
     """Write one log of the companions of all topics that have some."""
-    from fuselog.pipeline.logs.foxglove import companions, sentence_of  # which take long to import
+    from fuselog.pipeline.logs.foxglove import mirrors, sentence_of  # which take long to import
 
     check_files([(place, _new("foxglove"))], {"log": [log.path]})
     written = dict.fromkeys(topics, 0)
     with LogWriter(place) as writer:
         for block in read_blocks(log, topics):
             for topic, stream in block.items():
-                written[topic] += writer.write_companions(companions(stream))
+                written[topic] += writer.write_mirrors(mirrors(stream))
         if not any(written.values()):
             raise BadInput(f"{log.path}: has nothing that Foxglove can show; export it as csv")
     without = [topic for topic, messages in written.items() if messages == 0]

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from fuselog.recorders.errors import some_of
 from fuselog.recorders.extras import extra
-from fuselog.recorders.log import Companion, Log, Stream, schemas
-from fuselog.recorders.log.companions import COMPANION_OF
+from fuselog.recorders.log import Log, Mirror, Stream, schemas
+from fuselog.recorders.log.mirrors import MIRROR_OF
 from fuselog.recorders.log.planes import FRAME, body_of
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
 from fuselog.replay.engine.vectors.tangent import manifold_blocks
@@ -44,7 +44,7 @@ TRACK_S = 60
 Made = Iterator[tuple[str, Message, int]]
 
 
-def companions(stream: Stream) -> Iterator[Companion]:
+def mirrors(stream: Stream) -> Iterator[Mirror]:
     """Yield the companions of a stream, or of a block of it: none of a prior or of no messages.
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
@@ -59,7 +59,7 @@ def companions(stream: Stream) -> Iterator[Companion]:
     if make is None or is_prior or len(stream) == 0:
         return
     for leaf, message, row in make(stream):
-        yield Companion(
+        yield Mirror(
             f"/foxglove{stream.topic}/{leaf}",
             stream.topic,
             message,
@@ -70,7 +70,7 @@ def companions(stream: Stream) -> Iterator[Companion]:
 
 def left_out(log: Log) -> str:
     """Say which streams of a log have no companion; empty if all have some."""
-    shown = {topic.metadata[COMPANION_OF] for topic in log.companions.values()}
+    shown = {topic.metadata[MIRROR_OF] for topic in log.mirrors.values()}
     topics = [name for name, topic in log.topics.items() if topic.messages and name not in shown]
     return sentence_of(topics) if topics else ""
 

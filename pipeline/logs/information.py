@@ -82,9 +82,9 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
         for topic in log.topics.values()
     ]
     print_table(["topic", "schema", "messages", "per second"], rows)
-    if log.companions:
-        count = sum(topic.messages for topic in log.companions.values())
-        say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
+    if log.mirrors:
+        count = sum(topic.messages for topic in log.mirrors.values())
+        say(f"beside them, for viewers: {count} messages on {len(log.mirrors)} topics of Foxglove")
     for sentence in worst(_findings(log), path):
         say(sentence)
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):

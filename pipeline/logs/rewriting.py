@@ -76,7 +76,7 @@ def losses_of(log: Log) -> list[str]:
     """Find what is missing from a log, or is in it beside its topics and is not carried over."""
     foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
     losses = [log.loss_statement] if log.loss_statement else []
-    if log.companions:
+    if log.mirrors:
         losses.append(
             f"{log.path}: the companions for viewers are left out; to have them of the new log: "
             "fuselog export LOG --to foxglove"

@@ -20,7 +20,7 @@ from fuselog.pipeline.output.coverage import added, replayed_note, rows_of, unta
 from fuselog.pipeline.runs.initial_states import Origin, start_from
 from fuselog.pipeline.runs.settings import meanings_of
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Clock, Companions, LogWriter, RunMetadata
+from fuselog.recorders.log import Clock, LogWriter, Mirrors, RunMetadata
 from fuselog.recorders.log.impossible import Rejections
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.replaying.estimator import Bound, bind
@@ -161,7 +161,7 @@ def replay_parts(
     connect: str | None = None,
     on_errors: Callable[[Errors], None] | None = None,
     block_messages: int = BLOCK_MESSAGES,
-    companions: Companions | None = None,
+    mirrors: Mirrors | None = None,
     progress: Progress = no_progress,
 ) -> Pass:
     """Replay an ensemble part by part, and pass blocks to estimates logs, judge and timeline.
@@ -202,7 +202,7 @@ def replay_parts(
                         LogWriter(
                             path,
                             estimates_metadata(source, estimators, path, log, order),
-                            companions=companions,
+                            mirrors=mirrors,
                         )
                     )
                     for (path, log), source in zip(part.estimates, part.sources, strict=False)

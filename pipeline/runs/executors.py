@@ -190,8 +190,8 @@ def dask(scheduler: str) -> PoolFactory:
             from dask import config
             from distributed import Client, KilledWorker
         except ImportError:
-            mend = "pip install 'fuselog[dask]'"
-            raise BadInput(f"--scheduler {scheduler}: Dask is not installed; {mend}") from None
+            remedy = "pip install 'fuselog[dask]'"
+            raise BadInput(f"--scheduler {scheduler}: Dask is not installed; {remedy}") from None
         for name in [each for each in logging.root.manager.loggerDict if each.startswith("distributed")]:
             logging.getLogger(name).setLevel(logging.CRITICAL)  # errors are raised as well
         with ExitStack() as stack:

@@ -346,13 +346,13 @@ def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
     return {"runs": experiment.runs, **{name: of for name, of in options if isinstance(of, int | float)}}
 
 
-def require_campaign(experiment: Experiment, mend: str) -> None:
+def require_campaign(experiment: Experiment, remedy: str) -> None:
     """Raise BadInput if an experiment's study replays all runs together, in one process."""
     study: Study = load("studies", experiment.study, Study)
     if not study.is_campaign:
         raise BadInput(
             f"experiment '{experiment.title}': its study, {experiment.study}, replays all runs "
-            f"together, in one process; {mend}"
+            f"together, in one process; {remedy}"
         )
 
 

@@ -103,7 +103,9 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
     """
     folders = {path.resolve().parent for path in held_out}
     beside = [path for path in logs if path.resolve().parent in folders]
-    mend = "to hold out several logs, give --validate their folder, or repeat --validate before each log"
+    remedy = (
+        "to hold out several logs, give --validate their folder, or repeat --validate before each log"
+    )
     for path in logs:
         if path.resolve() in {each.resolve() for each in held_out}:
             raise BadInput(f"{path}: is among both the tuned and the held-out logs; remove it from one")
@@ -111,10 +113,10 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
         more = f", together with {len(beside) - 1} more from its folder" if len(beside) > 1 else ""
         raise BadInput(
             f"{beside[0]}: would be tuned on{more}, although {held_out[0]} in the same folder is held "
-            f"out; {mend}"
+            f"out; {remedy}"
         )
     if len(beside) > 1:
-        warn(f"the {len(beside)} logs to tune on are in the same folder as those held out; {mend}")
+        warn(f"the {len(beside)} logs to tune on are in the same folder as those held out; {remedy}")
 
 
 def progress_of(best: Best) -> str:

@@ -302,11 +302,11 @@ class Objective:
                     "log-likelihood is -inf; give other values with --set"
                 )
             if not np.isfinite(self._cost([total])):
-                mend = for_likelihood(self.settings) if self.by == "likelihood" else ""
+                remedy = for_likelihood(self.settings) if self.by == "likelihood" else ""
                 raise BadInput(
                     f"{run.name}: {self.label} has no {CRITERIA[self.by].lacks} on this log; tune by "
                     f"one of {', '.join(each for each in CRITERIA if each != self.by)} instead"
-                    f"{', or ' if mend else ''}{mend}"
+                    f"{', or ' if remedy else ''}{remedy}"
                 )
             counts.append(count)
         self.runs, self._counts = runs, counts

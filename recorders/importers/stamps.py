@@ -18,7 +18,7 @@ def to_ns(
     since_ns: int | Stamps = 0,
     *,
     where: str,
-    mend: str = "correct them, or leave them out",
+    remedy: str = "correct them, or leave them out",
 ) -> Stamps:
     """Compute stamps (n,) as `since_ns` plus values times a unit.
 
@@ -45,7 +45,7 @@ def to_ns(
     if np.any(known & ~fits):
         value = given[np.argmax(known & ~fits)]
         raise BadInput(
-            f"{where}: a stamp is before 1970 or after 2262 ({value} times {unit_ns} ns); {mend}"
+            f"{where}: a stamp is before 1970 or after 2262 ({value} times {unit_ns} ns); {remedy}"
         )
     filled = np.where(known, given, 0)
     if given.dtype.kind in "iu":

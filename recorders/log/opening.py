@@ -8,8 +8,8 @@ from pathlib import Path
 from mcap import records
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log.companions import COMPANION_OF
 from fuselog.recorders.log.container.reading import Container, open_container
+from fuselog.recorders.log.mirrors import MIRROR_OF
 from fuselog.recorders.log.run import RECORD_NAME, RunMetadata
 from fuselog.recorders.log.schemas import Schema
 
@@ -55,12 +55,12 @@ class Log:
     @cached_property
     def topics(self) -> dict[str, Topic]:
         """Return the topics by name, sorted, without companions."""
-        return {name: topic for name, topic in self._all.items() if COMPANION_OF not in topic.metadata}
+        return {name: topic for name, topic in self._all.items() if MIRROR_OF not in topic.metadata}
 
     @cached_property
-    def companions(self) -> dict[str, Topic]:
+    def mirrors(self) -> dict[str, Topic]:
         """Return the topics that are only for viewers, by name, sorted."""
-        return {name: topic for name, topic in self._all.items() if COMPANION_OF in topic.metadata}
+        return {name: topic for name, topic in self._all.items() if MIRROR_OF in topic.metadata}
 
     @cached_property
     def _all(self) -> dict[str, Topic]:

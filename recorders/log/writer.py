@@ -8,21 +8,21 @@ from typing import Any, Self
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log.companions import (
-    COMPANION_OF,
-    Companion,
-    Numbered,
-    chunks_of_companions,
-    descriptor_set,
-)
 from fuselog.recorders.log.container.packing import chunks_of
 from fuselog.recorders.log.container.writing import ContainerWriter
 from fuselog.recorders.log.layout import layout_of
+from fuselog.recorders.log.mirrors import (
+    MIRROR_OF,
+    Mirror,
+    Numbered,
+    chunks_of_mirrors,
+    descriptor_set,
+)
 from fuselog.recorders.log.run import RECORD_NAME, RunMetadata
 from fuselog.recorders.log.schemas import Schema
 from fuselog.recorders.log.streams import Stream, check_stream
 
-Companions = Callable[[Stream], Iterable[Companion]]
+Mirrors = Callable[[Stream], Iterable[Mirror]]
 
 
 @dataclass
@@ -64,14 +64,14 @@ class LogWriter:
         *,
         compression: str = "zstd",
         chunk_bytes: int = 1 << 20,
-        companions: Companions | None = None,
+        mirrors: Mirrors | None = None,
     ) -> None:
         self.path = Path(path)
         self._container = ContainerWriter(self.path, compression)
         self._run = None if run is None else run.to_record()
         self._chunk_bytes = chunk_bytes
         self._topics: dict[str, _Topic] = {}
-        self._companions = companions
+        self._mirrors = mirrors
         self._channels: dict[str, _Channel] = {}
 
     def __enter__(self) -> Self:
@@ -114,25 +114,23 @@ class LogWriter:
                 topic.messages += len(stream)
         if parts:
             self._container.add_chunks(list(chunks_of(parts, self._chunk_bytes)))
-        if self._companions is not None:
-            self.write_companions(each for stream in block for each in self._companions(stream))
+        if self._mirrors is not None:
+            self.write_mirrors(each for stream in block for each in self._mirrors(stream))
 
-    def write_companions(self, companions: Iterable[Companion]) -> int:
+    def write_mirrors(self, mirrors: Iterable[Mirror]) -> int:
         """Write messages for viewers, in log-time order; return their number."""
         numbered = []
-        for companion in companions:
-            channel = self._channels.get(companion.topic)
+        for mirror in mirrors:
+            channel = self._channels.get(mirror.topic)
             if channel is None:
-                description = descriptor_set(companion.message)
-                schema_id = self._container.add_schema(
-                    companion.message.DESCRIPTOR.full_name, description
-                )
-                stated = {COMPANION_OF: companion.of}
-                channel = _Channel(self._container.add_channel(companion.topic, schema_id, stated))
-                self._channels[companion.topic] = channel
-            numbered.append(Numbered(channel.channel_id, channel.messages, companion))
+                description = descriptor_set(mirror.message)
+                schema_id = self._container.add_schema(mirror.message.DESCRIPTOR.full_name, description)
+                stated = {MIRROR_OF: mirror.of}
+                channel = _Channel(self._container.add_channel(mirror.topic, schema_id, stated))
+                self._channels[mirror.topic] = channel
+            numbered.append(Numbered(channel.channel_id, channel.messages, mirror))
             channel.messages += 1
-        self._container.add_chunks(list(chunks_of_companions(numbered, self._chunk_bytes)))
+        self._container.add_chunks(list(chunks_of_mirrors(numbered, self._chunk_bytes)))
         return len(numbered)
 
     def _declare(self, stream: Stream) -> None:
@@ -174,7 +172,7 @@ def write_log(
     run: RunMetadata | None = None,
     *,
     compression: str = "zstd",
-    companions: Companions | None = None,
+    mirrors: Mirrors | None = None,
 ) -> None:
     """Write one log from streams in memory; see `LogWriter`.
 
@@ -184,7 +182,7 @@ def write_log(
     >>> read_streams(open_log("run.mcap"), ["/range"])["/range"]["range_m"].tolist()
     [5.0, 3.0]
     """
-    with LogWriter(path, run, compression=compression, companions=companions) as log:
+    with LogWriter(path, run, compression=compression, mirrors=mirrors) as log:
         log.write(streams)
 
 

@@ -27,7 +27,7 @@ from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.model.augmentation import (
     Start,
     augmented,
-    augmented_stage,
+    augmented_model,
     begin,
     check_augmentable,
     estimated,
@@ -41,6 +41,7 @@ from fuselog.replay.inference.model.binding import (
     topics_of,
     with_more,
 )
+from fuselog.replay.inference.model.bound_model import BoundModel, bound_model_of
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.own_parameters import check_tables, with_own_parameters
 from fuselog.replay.inference.model.parameters import CombinedParameters, ModelParameters
@@ -48,7 +49,6 @@ from fuselog.replay.inference.model.settings import (
     assumed_of,
     settings_of,
 )
-from fuselog.replay.inference.model.stage import Stage, stage_of
 from fuselog.replay.inference.requirements import (
     OWN_MODEL,
     elsewhere,
@@ -313,7 +313,9 @@ def bind_model(
     things = [with_more(label, model, each, topics, more) for each in topics_of(model, topics, renamed)]
     tables, kind, given = parameters.of_topics or {}, model, parameters
     check_tables(label, model, things, tables)
-    stages: dict[tuple[Model, tuple[Sensor, ...]], Stage] = {}  # shared by objects with the same sensors
+    bound_models: dict[
+        tuple[Model, tuple[Sensor, ...]], BoundModel
+    ] = {}  # shared by objects with the same sensors
     for found in things:
         found = in_its_plane(label, kind, found, topics)
         model, found, parameters = with_own_parameters(kind, found, tables, given)
@@ -324,18 +326,18 @@ def bind_model(
                 f"estimator {label}: with estimate = {', '.join(parameters.estimate)} the model lacks "
                 f"{lacking}, which this method needs"
             )
-        own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
+        own = BoundModel(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        if (model, own.sensors) not in stages:
+        if (model, own.sensors) not in bound_models:
             try:
-                stages[model, own.sensors] = stage_of(*augmented_stage(own, added))
+                bound_models[model, own.sensors] = bound_model_of(*augmented_model(own, added))
             except BadInput as error:
                 raise BadInput(f"estimator {label}: {error}") from error
-        stage = stages[model, own.sensors]
+        bound_model = bound_models[model, own.sensors]
         name = label + found.prefix
-        samplers = samplers_of(stage, method, parameters)
+        samplers = samplers_of(bound_model, method, parameters)
         settings = with_gauss_markov(numbers, added)
-        made_of = (name, found, stage, method, parameters, settings, samplers)
+        made_of = (name, found, bound_model, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
         read = (*found.fallbacks, *found.sensors)

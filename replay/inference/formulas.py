@@ -7,8 +7,8 @@ import numpy as np
 from fuselog.recorders.registry import load
 from fuselog.replay.engine.arrays import AnyArgument
 from fuselog.replay.engine.vectors.tangent import tangent_components
+from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
-from fuselog.replay.inference.model.stage import stage_of
 from fuselog.replay.tracing.formulas import formulas_of
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
@@ -50,18 +50,18 @@ def formulas_by_function(model: str | Model) -> dict[str, list[str]]:
     """Return the lines of `formulas` for each function, by titles such as "motion, move"."""
     found = load("models", model, Model) if isinstance(model, str) else model
     motions = found.modes or {"": found.motion}
-    stage = stage_of(found, found.motion, found.all_sensors, tuple(motions.values()))
+    bound_model = bound_model_of(found, found.motion, found.all_sensors, tuple(motions.values()))
     parts = [
         (f"mode {name}" if name else "motion", _of_motion(found, motion))
-        for name, motion in zip(motions, stage.modes, strict=True)
+        for name, motion in zip(motions, bound_model.modes, strict=True)
     ]
     parts += [
         (f"sensor {each.topic} ({', '.join(each.measured)})", _of_sensor(found, each))
-        for each in stage.sensors
+        for each in bound_model.sensors
     ]
-    if stage.model.switching is not None:
+    if bound_model.model.switching is not None:
         changes = [f"rate of {a} to {b}" for a in motions for b in motions if a != b]
-        rates = _lines(stage.model.switching.rates, {"parameters": None}, changes)
+        rates = _lines(bound_model.model.switching.rates, {"parameters": None}, changes)
         parts.append(("switching", iter([("rates", rates)])))
     return {f"{part}, {function}": lines for part, made in parts for function, lines in made if lines}
 

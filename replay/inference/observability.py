@@ -53,10 +53,10 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 )
 from fuselog.replay.inference.linear_algebra.manifold import boxminus, is_flat
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel, title_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import reading_settings
-from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.filtering import FilterState
 from fuselog.replay.inference.run.recursion import (
     EstimateRows,
@@ -101,10 +101,10 @@ class LinearizationTrajectory(NamedTuple):
     offset: Floats
 
 
-def gramian_steps(stage: Stage) -> Steps:
+def gramian_steps(bound_model: BoundModel) -> Steps:
     """Make the steps that accumulate the Gramian along the trajectory, the only set of `memory`."""
-    motion = _carried_by_motion(stage)
-    sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
+    motion = _carried_by_motion(bound_model)
+    sensors = tuple(_added_by_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
 
     def estimate(run: int, belief: Gramian, found: EstimateRows, row: int, _: Workspace) -> None:
         """Store the Gramian, with the number of its messages as the mean, and reset it."""
@@ -115,12 +115,12 @@ def gramian_steps(stage: Stage) -> Steps:
         information[:, :] = 0.0
         fill_identity(transition)
 
-    return Steps(lambda sets: workspace(stage, sets), motion, sensors, estimate)
+    return Steps(lambda sets: workspace(bound_model, sets), motion, sensors, estimate)
 
 
-def _carried_by_motion(stage: Stage) -> PredictRun:
-    model = stage.model
-    linearise = motion_derivative(model, stage.motion, by_state=True)
+def _carried_by_motion(bound_model: BoundModel) -> PredictRun:
+    model = bound_model.model
+    linearise = motion_derivative(model, bound_model.motion, by_state=True)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     subtract, flat, carry = boxminus(model.kinds), is_flat(model.kinds), carrying(model.kinds)
 
@@ -140,8 +140,8 @@ def _carried_by_motion(stage: Stage) -> PredictRun:
     return predict
 
 
-def _added_by_sensor(stage: Stage, number: int) -> UpdateRun:
-    model, sensor = stage.model, stage.sensors[number]
+def _added_by_sensor(bound_model: BoundModel, number: int) -> UpdateRun:
+    model, sensor = bound_model.model, bound_model.sensors[number]
     m, t = len(sensor.measured), model.tangent
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
@@ -181,11 +181,11 @@ def _added_by_sensor(stage: Stage, number: int) -> UpdateRun:
 
 
 @lru_cache(maxsize=64)
-def _summing(stage: Stage) -> tuple[OverRuns, Steps]:
-    steps = gramian_steps(stage)
-    settings_of = reading_settings(number_fields(stage.model.parameters))
-    title = title_of(stage.model, "observability")
-    return compile_over_runs(recursion(stage, steps, settings_of), title=title), steps
+def _summing(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
+    steps = gramian_steps(bound_model)
+    settings_of = reading_settings(number_fields(bound_model.model.parameters))
+    title = title_of(bound_model.model, "observability")
+    return compile_over_runs(recursion(bound_model, steps, settings_of), title=title), steps
 
 
 class Observability(IteratedSmoother):
@@ -207,7 +207,7 @@ class Observability(IteratedSmoother):
         is_first = np.ones(len(run), bool)
         is_first[1:] = run[1:] != run[:-1]
         before_ns = np.append(0, found.time_ns[:-1])
-        t = self.stage.model.tangent
+        t = self.bound_model.model.tangent
         stream = make_stream(
             f"/estimates/{self.name}/observability",
             schemas.OBSERVABILITY,
@@ -224,13 +224,13 @@ class Observability(IteratedSmoother):
     @property
     def components(self) -> list[str]:
         """Names of the components of the tangent space."""
-        model = self.stage.model
+        model = self.bound_model.model
         return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
     def _scales(self, state: FilterState) -> Floats:
         """Return the scale of every tangent component (runs, t)."""
         scales: Floats = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
-        model = self.stage.model
+        model = self.bound_model.model
         for name, scale in named_now(self.parameters.scales, list(model.state), model.kinds).items():
             if name not in self.components:
                 raise BadInput(
@@ -256,15 +256,17 @@ class Observability(IteratedSmoother):
         self, state: FilterState, way: Way, window_of: Integers
     ) -> tuple[EstimateRows, Integers]:
         """Return the Gramian and the number of messages of every window, and the offsets of the runs."""
-        stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
-        t, (loop, steps) = stage.model.tangent, _summing(stage)
+        bound_model, offsets, runs = self.bound_model, way.offsets, len(way.offsets) - 1
+        t, (loop, steps) = bound_model.model.tangent, _summing(bound_model)
         ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
         ends[offsets[1:][np.diff(offsets) > 0] - 1] = True
         events = way.events
         events = events._replace(wants_estimate=events.wants_estimate & ends[way.node])
         due = np.append(0, np.cumsum(ends))[offsets]
         one = np.arange(runs + 1)
-        _, innovations = no_results(due, one, stage.model, len(innovation_components(stage.sensors)))
+        _, innovations = no_results(
+            due, one, bound_model.model, len(innovation_components(bound_model.sensors))
+        )
         count = due[-1]
         found = EstimateRows(
             due[:-1].copy(), np.empty(count, np.int64), np.empty((count, 1)), np.empty((count, t, t))

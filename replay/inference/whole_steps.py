@@ -88,8 +88,12 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 
     Raises BadInput if a step cannot be traced.
     """
-    stage = filtering.stage
-    model, motion, names = stage.model, stage.motion, number_fields(stage.model.parameters)
+    bound_model = filtering.bound_model
+    model, motion, names = (
+        bound_model.model,
+        bound_model.motion,
+        number_fields(bound_model.model.parameters),
+    )
     gaussian: tuple[Argument, ...] = (Shape((model.size,)), Shape((model.tangent, model.tangent)))
     [(_, sets)] = sample_sets(filtering.samplers, (), np.zeros(1, np.int64))
     drawn = iter(sets)
@@ -107,7 +111,7 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
     if motion.gap_noise is not None:
         gap = traced_step("the prediction in a gap", _gap_noise(model, motion), given)
     innovations, step = [], Shape((model.tangent,))
-    for sensor in stage.sensors:
+    for sensor in bound_model.sensors:
         what = f"sensor {sensor.topic}"
         given = *gaussian, Shape((message_layout(sensor).width,)), names
         if kind == SAMPLED and not sensor.linear:

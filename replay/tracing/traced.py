@@ -22,7 +22,7 @@ class CannotTrace(TypeError):
 
 
 MOST_WAYS = 256
-_MENDS = {
+_REMEDIES = {
     "float()": "leave the number as it is, or write np.where(condition, a, b)",
     "an array of float": "build the array from its numbers: np.array([a, b])",
     "int()": "write np.floor or np.trunc, and np.choose for an index",
@@ -35,8 +35,8 @@ _INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 
 def refused(what: str) -> CannotTrace:
     """Make the error for a use of a traced number that is not supported."""
-    mend = _MENDS.get(what, "write it with operators, np.where and functions such as np.exp")
-    return CannotTrace(f"it uses {what} on a number that is only known later; {mend}")
+    remedy = _REMEDIES.get(what, "write it with operators, np.where and functions such as np.exp")
+    return CannotTrace(f"it uses {what} on a number that is only known later; {remedy}")
 
 
 def too_many_ways() -> CannotTrace:

@@ -61,13 +61,13 @@ def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
     ],
 )
 def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
-    run: fl.MemorySource, topic: str, fault: put.Alteration, by: float, undone: str
+    run: fl.MemorySource, topic: str, fault: put.Alteration, by: float, corrected: str
 ) -> None:
     faulty = put.altered(run, topic, fault, by)
     value, _, high = nis(faulty)
     assert value > high
     told = fl.diagnose(faulty, "ekf", set=OPEN).sentences[0]
-    assert told.setting.partition("=")[0] == undone
+    assert told.setting.partition("=")[0] == corrected
     assert f"; try --set {told.setting}" in told.sentence
     value, low, high = nis(faulty, **parse_settings([told.setting]))
     assert low < value < high
@@ -293,8 +293,8 @@ def test_every_command_alters_alike_and_says_so(
     log, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
     fl.write(log, put.altered(run, SEEN, put.shifted("range_m"), 0.2))
     key = f"{SEEN}.range_bias"
-    mend = ["-e", "ekf", "--set", f"{key}=.2"]
-    told = fuselog("replay", log, *mend, "-o", estimates, "--json").json["metrics"]
+    remedy = ["-e", "ekf", "--set", f"{key}=.2"]
+    told = fuselog("replay", log, *remedy, "-o", estimates, "--json").json["metrics"]
     stated = fl.open(estimates).run.notes["alterations"]  # type: ignore[union-attr]
     assert json.loads(stated) == {key: 0.2}
     in_python = fl.replay(log, "ekf", set={key: 0.2})
@@ -307,10 +307,10 @@ def test_every_command_alters_alike_and_says_so(
     assert "ekf.nees.robot1" in same
     tuned = ["--free", "sigma_range_m", "--out", tmp_path / "tuned"]
     for command in (
-        ["run", log, *mend, "--out", tmp_path / "ran"],
-        ["tune", log, *mend, *tuned],
-        ["diagnose", log, *mend, "--out", tmp_path / "diagnosed"],
-        ["compare", log, *mend, "-e", "ukf"],
+        ["run", log, *remedy, "--out", tmp_path / "ran"],
+        ["tune", log, *remedy, *tuned],
+        ["diagnose", log, *remedy, "--out", tmp_path / "diagnosed"],
+        ["compare", log, *remedy, "-e", "ukf"],
     ):
         assert fuselog(*command).code == 0
     for folder in ("ran", "tuned", "diagnosed", "judged"):

@@ -204,8 +204,8 @@ def test_several_ordinary_faults_are_fitted_together(*, has_gyro: bool) -> None:
     assert named.keys() == planted.keys()
     for key, value in planted.items():
         assert named[key].low < value < named[key].high, (key, named[key])
-    mends = [cause.hypothesis.mend(cause.value) for cause in causes]
-    settings = {key: float(value) for mend in mends for key, value in mend.settings.items()}
+    remedies = [cause.hypothesis.remedy(cause.value) for cause in causes]
+    settings = {key: float(value) for remedy in remedies for key, value in remedy.settings.items()}
     factor = settings.pop(f"{ODOMETRY}.forward_scale")
     assert lost_by(log, {**settings, "forward_scale": factor}) < 2.0
 
@@ -279,10 +279,10 @@ def test_another_origin_of_positions_is_one_cause_of_two_numbers() -> None:
     [cause] = seek(shifted, "ekf", OPEN, 1).causes
     assert "too far along y: its origin is different" in cause.words
     assert cause.value == pytest.approx((40.0, -25.0), abs=3.0)
-    mend = cause.hypothesis.mend(cause.value)
-    assert mend is not None
-    assert mend.key == f"{FIX}.origin"
-    mended = alter(shifted, mend.settings).streams[FIX]["position_m"]
+    remedy = cause.hypothesis.remedy(cause.value)
+    assert remedy is not None
+    assert remedy.key == f"{FIX}.origin"
+    mended = alter(shifted, remedy.settings).streams[FIX]["position_m"]
     assert_allclose(mended, car.fix_m, atol=3.0)
     [other] = seek(turned, "ekf", OPEN, 1).causes
     assert "origin" not in other.words

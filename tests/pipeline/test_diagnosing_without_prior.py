@@ -295,11 +295,11 @@ def test_a_gate_that_is_set_is_no_advice() -> None:
     base = Trial(car(2000), {"kind": "ekf", **OPEN})
     tried = hypotheses(bind("ekf", [base.source], base.settings), base, {}, {})
     [outliers] = [each for each in tried if each.kind == "outliers"]
-    mend = outliers.mend(1.0)
-    assert mend is not None
-    assert mend.setting == "gate_probability=0.999"
+    remedy = outliers.remedy(1.0)
+    assert remedy is not None
+    assert remedy.setting == "gate_probability=0.999"
     is_set = {
-        gate: Trying("ekf", {}, is_own=False, gate=gate).is_set(mend) for gate in (1.0, 0.999, 0.9)
+        gate: Trying("ekf", {}, is_own=False, gate=gate).is_set(remedy) for gate in (1.0, 0.999, 0.9)
     }
     assert is_set == {1.0: False, 0.999: True, 0.9: True}
 

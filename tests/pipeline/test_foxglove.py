@@ -102,7 +102,7 @@ def test_estimates_have_their_ellipses_and_replays_do_not_see_companions(fuselog
     assert_allclose(squared, chi2.ppf(0.95, 2), rtol=1e-6)
     assert fuselog(*RECORD, "-o", "run.mcap").code == 0
     assert fuselog(*replay, "again.mcap").code == 0
-    assert not open_log("again.mcap").companions
+    assert not open_log("again.mcap").mirrors
     again = read_streams(open_log("again.mcap"), [topic])[topic]
     assert_array_equal(again["mean"], estimates["mean"])
 
@@ -241,5 +241,5 @@ def test_parts_of_a_log_say_that_its_companions_are_left_out(fuselog: Fuselog) -
     assert said.code == 0
     assert "the companions for viewers are left out" in said.err
     assert "--to foxglove" in said.err
-    assert not open_log("part.mcap").companions
+    assert not open_log("part.mcap").mirrors
     assert open_log("part.mcap").topics

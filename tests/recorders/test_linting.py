@@ -441,13 +441,13 @@ def test_what_is_missing_is_not_frozen() -> None:
 
 
 def test_a_frames_name_says_how_its_axes_are_turned() -> None:
-    for frame, ours, mend in (
+    for frame, ours, remedy in (
         ("base_link_frd", "forward, left, up", "mounting_deg = [180, 0, 0]"),
         ("odom_ned", "east, north, up", "swap north and east"),
     ):
         [found] = frames(replace(clean(1)[IMU], metadata={"frame_id": frame}), {})
         assert found.evidence.endswith(f"fuselog have {ours}"), frame
-        assert mend in found.otherwise, frame
+        assert remedy in found.otherwise, frame
 
 
 def test_the_share_that_is_lost_is_the_sheets() -> None:

@@ -17,9 +17,9 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import (
-    Companion,
     Field,
     LogWriter,
+    Mirror,
     RunMetadata,
     Schema,
     make_stream,
@@ -82,7 +82,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", lambda *_: open("/dev/full", "wb"))  # noqa: PTH123, SIM115
     with pytest.raises(BadInput, match=r"run\.mcap: cannot be written \(No space left on device\)$"):
         write_log(path, some_streams(1, count=5000))
-    monkeypatch.undo()
+    monkeypatch.correct()
     assert path.read_bytes() == before
     assert names_in(tmp_path) == ["run.mcap"]
 
@@ -272,11 +272,11 @@ def test_companions_stand_in_the_order_of_log_time_and_ties_as_given(tmp_path_fa
     """In chunks of about two messages, whose spans are those of their messages."""
     path = tmp_path_factory.mktemp("companions") / "run.mcap"
     given = [
-        Companion("/viewer", "/scan", Timestamp(seconds=number), *clocks)
+        Mirror("/viewer", "/scan", Timestamp(seconds=number), *clocks)
         for number, clocks in enumerate(stamps)
     ]
     with LogWriter(path, chunk_bytes=80) as log:
-        assert log.write_companions(given) == len(given)
+        assert log.write_mirrors(given) == len(given)
     written = []
     with path.open("rb") as file:
         for record in StreamReader(file, emit_chunks=True).records:

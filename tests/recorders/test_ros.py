@@ -551,7 +551,7 @@ def test_a_database_that_was_cut_off_gives_no_message_that_is_not_whole(
         database.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
         database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
     whole, cut = path.read_bytes(), tmp_path / "cut.db3"
-    mend = f"`sqlite3 {cut} .recover | sqlite3 whole.db3`"
+    remedy = f"`sqlite3 {cut} .recover | sqlite3 whole.db3`"
     for size in np.linspace(0.2 * len(whole), len(whole), 20).astype(int).tolist():
         cut.write_bytes(whole[:size])
         with open_bag(cut) as bag:
@@ -561,7 +561,7 @@ def test_a_database_that_was_cut_off_gives_no_message_that_is_not_whole(
                 for begin, length in zip(batch.begins, batch.lengths, strict=True)
             ]
             assert found == [row[2] for row in rows[: len(found)]]
-            assert any(mend in loss for loss in bag.losses) == (len(found) < len(rows))
+            assert any(remedy in loss for loss in bag.losses) == (len(found) < len(rows))
     assert len(found) == len(rows)
 
 

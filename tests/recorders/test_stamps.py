@@ -34,7 +34,7 @@ odd = st.sampled_from(
 def test_a_text_gives_its_stamp_or_a_sentence(text: str, places: int) -> None:
     """And its neighbour keeps the last digit."""
     try:
-        found, beside = read_ns(pa.array([text, "1767225600.123456789"]), places, where="t", mend="m")
+        found, beside = read_ns(pa.array([text, "1767225600.123456789"]), places, where="t", remedy="m")
     except BadInput:
         return
     assert beside == round(Decimal("1767225600.123456789").scaleb(places))

@@ -17,7 +17,7 @@ void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANG
 
 def header(made: CFilter) -> str:
     """Write the text of NAME.h."""
-    model, upper = made.filtering.stage.model, made.name.upper()
+    model, upper = made.filtering.bound_model.model, made.name.upper()
     state = [(identifier(name), kind) for name, kind in model.state.items()]
     axes = [identifier(name) for name, _ in tangent_components(list(model.state), model.kinds)]
     lines = [
@@ -96,7 +96,7 @@ def _enum(made: CFilter, part: str, names: Sequence[str], count: str) -> Iterato
 
 
 def _struct(made: CFilter) -> Iterator[str]:
-    meaning = meanings(made.filtering.stage.model.parameters)
+    meaning = meanings(made.filtering.bound_model.model.parameters)
     for part, values in made.values.items():
         yield "    struct {"
         for name in values:
@@ -156,7 +156,7 @@ def _predict_comment(made: CFilter) -> str:
 
 
 def _between_comment(made: CFilter) -> str:
-    control = made.filtering.stage.model.control
+    control = made.filtering.bound_model.model.control
     assert control is not None
     note = "Predicts to a time with the mean of the last control and that at this time."
     if not made.has_gaps:

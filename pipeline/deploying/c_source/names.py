@@ -44,17 +44,17 @@ class CFilter(NamedTuple):
     @property
     def states(self) -> int:
         """Return the number of components of the state."""
-        return self.filtering.stage.model.size
+        return self.filtering.bound_model.model.size
 
     @property
     def tangent(self) -> int:
         """Return the number of components of its tangent space."""
-        return self.filtering.stage.model.tangent
+        return self.filtering.bound_model.model.tangent
 
     @property
     def controls(self) -> tuple[str, ...]:
         """Return the names of its controls."""
-        control = self.filtering.stage.model.control
+        control = self.filtering.bound_model.model.control
         return control.components if control else ()
 
     @property
@@ -65,13 +65,13 @@ class CFilter(NamedTuple):
     @property
     def is_interpolated(self) -> bool:
         """Test whether the motion gets the mean of the controls at both ends of a step."""
-        control = self.filtering.stage.model.control
+        control = self.filtering.bound_model.model.control
         return control is not None and control.interpolated
 
     @property
     def has_gaps(self) -> bool:
         """Test whether its control may be silent for so long that nothing is known meanwhile."""
-        control = self.filtering.stage.model.control
+        control = self.filtering.bound_model.model.control
         return control is not None and bool(control.gap)
 
     @property
@@ -82,7 +82,7 @@ class CFilter(NamedTuple):
         for sensor, topic in self.filtering.found.sensors:
             topics.setdefault(sensor.topic, set()).add(topic.name)
         for sensor, (_, topic) in zip(
-            self.filtering.stage.sensors, self.filtering.found.sensors, strict=True
+            self.filtering.bound_model.sensors, self.filtering.found.sensors, strict=True
         ):
             if len(topics[sensor.topic]) > 1:
                 sensor = replace(sensor, topic=topic.name)
@@ -98,7 +98,7 @@ class CFilter(NamedTuple):
     @property
     def innovation(self) -> list[str]:
         """Return the components of innovations."""
-        return list(innovation_components(self.filtering.stage.sensors)) or ["none"]
+        return list(innovation_components(self.filtering.bound_model.sensors)) or ["none"]
 
     @property
     def parts(self) -> list[str]:
@@ -108,7 +108,7 @@ class CFilter(NamedTuple):
     @property
     def values(self) -> dict[str, dict[str, float]]:
         """Return the parameters that motion and sensors read, by part, with their values."""
-        names = number_fields(self.filtering.stage.model.parameters)
+        names = number_fields(self.filtering.bound_model.model.parameters)
         return {
             part: {
                 name: float(self.filtering.settings[row, names.index(name)])
@@ -120,7 +120,7 @@ class CFilter(NamedTuple):
 
     def robustness(self, row: int) -> dict[str, float]:
         """Return the options of the gate and of robust updates, NaN if they are off."""
-        names = number_fields(self.filtering.stage.model.parameters)
+        names = number_fields(self.filtering.bound_model.model.parameters)
         options = ("gate_reopens_s", "inflate_nis", "student_freedom", "switch_nis")
         return {
             name.removeprefix("gate_"): float(self.filtering.settings[row, names.index(name)])

@@ -16,7 +16,7 @@ class Inputs:
     """The names of a step's inputs, and declarations of those that it uses."""
 
     def __init__(self, made: CFilter, part: str) -> None:
-        model = made.filtering.stage.model
+        model = made.filtering.bound_model.model
         self.state = [identifier(name) for name in model.state]
         self.controls = [identifier(name) for name in made.controls]
         self.part, self.made = part, made
@@ -59,7 +59,7 @@ class Inputs:
 
 def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
     """Name the components of the mean after a step, and write the assignments."""
-    state = [identifier(name) for name in made.filtering.stage.model.state]
+    state = [identifier(name) for name in made.filtering.bound_model.model.state]
     named: dict[str, Node] = {}
     lines: list[str] = []
     for (array, place), node in step.outputs.items():
@@ -136,14 +136,14 @@ def count_gains(step: Step) -> int:
 
 def turned_axes(made: CFilter) -> list[int]:
     """List the first axes of orientations with which the covariance is rotated."""
-    model = made.filtering.stage.model
+    model = made.filtering.bound_model.model
     blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
     return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
 
 
 def retriangulates(made: CFilter) -> bool:
     """Test whether a correction rotates the covariance, so that its factor is no longer triangular."""
-    model = made.filtering.stage.model
+    model = made.filtering.bound_model.model
     return bool(made.sensors) and model.correct is None and not is_flat(model.kinds)
 
 

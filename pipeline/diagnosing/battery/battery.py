@@ -149,7 +149,7 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
         values = [one.value for one in named_by(cause) if one[:3] in right]
         value = values[0] if values and values[0] is not None else np.nan
         gain = cause.gain
-    mends = [cause.hypothesis.mend(cause.value) for cause in found.causes[:1]]
+    remedies = [cause.hypothesis.remedy(cause.value) for cause in found.causes[:1]]
     planted, within = RIGHT[cell.fault], np.nan
     if planted and planted[0].value is not None:
         spread = SPREADS[cell.fault][0 if cell.has_compass else 1]
@@ -164,7 +164,7 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
         "value": value,
         "is_within": within,
         "gain": gain,
-        "setting": " ".join(mend.setting for mend in mends if mend is not None),
+        "setting": " ".join(remedy.setting for remedy in remedies if remedy is not None),
     }
 
 

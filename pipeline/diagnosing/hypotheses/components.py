@@ -100,7 +100,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         factor, least, most = (number(np.exp(each), 4) for each in (abs(at), *ends))
         return f"{topic}: {entry.name} is {factor} times ({least} to {most}) too {size}{more}"
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         key, free = f"{topic}.{bare(entry.name)}_scale", own.factor if own else ""
         return Advice(key, precise(np.exp(-at)), free=free)
 
@@ -113,7 +113,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         LARGEST_FACTOR,
         without,
         words,
-        mend,
+        remedy,
         tuple(specials),
         reported=lambda at: float(np.exp(at)),
     )
@@ -140,7 +140,7 @@ def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
             return bias
         return f"{bias}, or equivalently the sensor's frame is rotated by {np.degrees(-at):.2g} deg"
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         if own and own.bias:
             return Advice(own.bias, rounded(own.bias_value + own.bias_sign * at), free=own.bias)
         return Advice(f"{topic}.{bare(entry.name)}_bias", precise(at))
@@ -153,7 +153,7 @@ def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
         np.pi if entry.is_angle else np.inf,
         in_topic(topic, alter.shifted(entry.field, entry.place)),
         words,
-        mend,
+        remedy,
     )
 
 
@@ -176,11 +176,11 @@ def _growing(
             "second"
         )
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         return Advice(f"{topic}.{bare(name)}_drift", precise(at))
 
     kind: Kind = "drifting bias"
-    return Hypothesis(kind, topic, name, tried, np.inf, in_topic(topic, alteration), words, mend)
+    return Hypothesis(kind, topic, name, tried, np.inf, in_topic(topic, alteration), words, remedy)
 
 
 def _turn(topic: str, field: str) -> Hypothesis:
@@ -189,12 +189,12 @@ def _turn(topic: str, field: str) -> Hypothesis:
         size = f"{at:.3g} ({low:.3g} to {high:.3g}) deg"
         return f"{topic}: {field} is rotated about the vertical by {size}"
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         return Advice(f"{topic}.{bare(field)}_turn", precise(at))
 
     without = in_topic(topic, alter.turned(field))
     kind: Kind = "bias or turned frame"
-    return Hypothesis(kind, topic, field, ANGLES_RAD, np.pi, without, words, mend, TURNS_RAD)
+    return Hypothesis(kind, topic, field, ANGLES_RAD, np.pi, without, words, remedy, TURNS_RAD)
 
 
 def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:

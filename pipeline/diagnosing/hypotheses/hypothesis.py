@@ -56,7 +56,7 @@ class Hypothesis:
     limit: float
     without: Callable[[Trial, Any], Trial]
     words: Callable[[Any, Any, Any], str]
-    mend: Callable[[Any], Advice | None]
+    remedy: Callable[[Any], Advice | None]
     specials: Sequence[float] = ()
     size: int = 1
     floor: float = 0.0

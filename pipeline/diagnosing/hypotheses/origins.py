@@ -37,11 +37,11 @@ def _of_positions(stream: Stream) -> Hypothesis:
         x, y = _too_far(at, low, high)
         return f"{stream.topic}: its positions are {x} along x and {y} along y: its origin is different"
 
-    def mend(at: Metres) -> Advice:
+    def remedy(at: Metres) -> Advice:
         place = ",".join(f"{precise(-each)}" for each in at)
         return Advice(f"{stream.topic}.origin", place, is_moved=True)
 
-    return _origin(stream, "x_m, y_m", without, words, mend)
+    return _origin(stream, "x_m, y_m", without, words, remedy)
 
 
 def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
@@ -70,11 +70,11 @@ def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
             "plane is different"
         )
 
-    def mend(at: Metres) -> Advice:
+    def remedy(at: Metres) -> Advice:
         mended = right(at)
         return Advice(f"{stream.topic}.origin", f"{mended.latitude_deg:.8f},{mended.longitude_deg:.8f}")
 
-    yield _origin(stream, "east_m, north_m", without, words, mend)
+    yield _origin(stream, "east_m, north_m", without, words, remedy)
 
 
 def _too_far(at: Metres, low: Metres, high: Metres) -> list[str]:
@@ -89,8 +89,8 @@ def _origin(
     part: str,
     without: Callable[[Trial, Metres], Trial],
     words: Callable[[Metres, Metres, Metres], str],
-    mend: Callable[[Metres], Advice],
+    remedy: Callable[[Metres], Advice],
 ) -> Hypothesis:
     kind: Kind = "bias or turned frame"
     tried = ((STEP_M, STEP_M),)
-    return Hypothesis(kind, stream.topic, part, tried, np.inf, without, words, mend, size=2)
+    return Hypothesis(kind, stream.topic, part, tried, np.inf, without, words, remedy, size=2)

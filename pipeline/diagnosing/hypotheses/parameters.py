@@ -96,10 +96,10 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
         so = f", so that {letter} is too {size_of(at)}" if letter else ""
         return f"{named} is {times(at, low, high)}{so}"
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
 
-    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor)
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, remedy, reported=_factor)
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
@@ -127,14 +127,14 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
             changes = f"the standard deviation of {field} is {times(at, low, high)}"
             return f"{stream.topic}: {changes}, so that R is too {size_of(at)}"
 
-        def mend(at: float) -> Advice:
+        def remedy(at: float) -> Advice:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
 
         # a covariance stated too small is corrected by a larger one
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
         yield Hypothesis(
-            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor
+            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, remedy, reported=_factor
         )
 
 
@@ -202,7 +202,7 @@ def _parameters(
         given = ", ".join(number(value) for value in values)
         return f"{where}{': ' if where else ''}{', '.join(changes)}, not {given}"
 
-    def mend(at: Any) -> Advice:
+    def remedy(at: Any) -> Advice:
         (name, value), *more = zip(
             names, (rounded(each) for each in np.add(values, numbers(at))), strict=True
         )
@@ -218,7 +218,7 @@ def _parameters(
         np.pi if is_round else np.inf,
         without,
         words,
-        mend,
+        remedy,
         TURNS_RAD if is_round else (),
         size,
     )

@@ -46,9 +46,9 @@ def _start(
         size = f"{at:.3g} ({low:.3g} to {high:.3g}){' ' if unit else ''}{unit}"
         return f"{topic}: {name} at the start is {is_so} by {size}, {at / sigma:.2g} of its sigmas"
 
-    def mend(at: float) -> Advice:
+    def remedy(at: float) -> Advice:
         wider = f"a prior whose sigma of {name} is at least {abs(at):.2g}"
         return Advice(f"{topic}.{bare(name)}_bias", precise(at), otherwise=wider)
 
     tried = tuple(sigma * each for each in SIGMAS if sigma * abs(each) < limit)
-    return Hypothesis("start", topic, name, tried, limit, in_topic(topic, alteration), words, mend)
+    return Hypothesis("start", topic, name, tried, limit, in_topic(topic, alteration), words, remedy)

@@ -18,7 +18,7 @@ _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 
 
 def read_ns(
-    cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, mend: str
+    cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, remedy: str
 ) -> Stamps:
     """Convert cells (n,) to stamps; texts keep all digits, while a double of today has steps of 200 ns.
 
@@ -39,15 +39,15 @@ def read_ns(
         cells = cells.dictionary_decode()
     if pa.types.is_timestamp(cells.type) or pa.types.is_duration(cells.type):
         values = cells.cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
-        return to_ns(values, _UNITS_NS[cells.type.unit], since_ns, where=where, mend=mend)
+        return to_ns(values, _UNITS_NS[cells.type.unit], since_ns, where=where, remedy=remedy)
     if pa.types.is_integer(cells.type):
-        stamps = to_ns(cells.fill_null(0).to_numpy(), 10**digits, since_ns, where=where, mend=mend)
+        stamps = to_ns(cells.fill_null(0).to_numpy(), 10**digits, since_ns, where=where, remedy=remedy)
         return np.where(cells.is_valid().to_numpy(zero_copy_only=False), stamps, NOT_A_TIME)
     is_text = pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type)
     if is_text:
         cells = pc.utf8_trim_whitespace(cells)
         if (plain := _plain(cells, digits)) is not None:
-            return to_ns(plain, 1, since_ns, where=where, mend=mend)
+            return to_ns(plain, 1, since_ns, where=where, remedy=remedy)
         cells = pc.replace_substring_regex(cells, r"^\+([0-9.])", r"\1")
     try:
         numbers = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
@@ -56,10 +56,10 @@ def read_ns(
         raise BadInput(
             f'{where} has cells that are not numbers ({why}); dates need unit = "date"'
         ) from None
-    found = to_ns(numbers, 10**digits, where=where, mend=mend)
+    found = to_ns(numbers, 10**digits, where=where, remedy=remedy)
     if is_text:
         found = _to_the_last_digit(cells, digits, found)
-    return to_ns(found, 1, since_ns, where=where, mend=mend)
+    return to_ns(found, 1, since_ns, where=where, remedy=remedy)
 
 
 def sided(cells: pa.Array) -> tuple[pa.Array, pa.Array]:

@@ -41,7 +41,13 @@ from fuselog.recorders.importers.tables.files import (
 from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
 from fuselog.recorders.importers.tables.order import Order, is_reversed
 from fuselog.recorders.importers.tables.plane import Plane
-from fuselog.recorders.importers.tables.times import MEND, Reading, TimeMapping, read_counter, stamps_ns
+from fuselog.recorders.importers.tables.times import (
+    REMEDY,
+    Reading,
+    TimeMapping,
+    read_counter,
+    stamps_ns,
+)
 from fuselog.recorders.log import Stream, make_stream
 from fuselog.recorders.log.planes import FRAME, is_planar
 from fuselog.recorders.units import conversion
@@ -535,7 +541,10 @@ class Rows:
                 return made[source]
             if source in self._exact:
                 return read_ns(
-                    batch[self.table.column(source)], 0, where=f"{self.path}: column {source}", mend=MEND
+                    batch[self.table.column(source)],
+                    0,
+                    where=f"{self.path}: column {source}",
+                    remedy=REMEDY,
                 )
             return self._floats(batch, source)
 

@@ -29,7 +29,7 @@ _WEEKS = 1024  # after which receivers with ten bits roll over to 0
 _WEEK_NS = 7 * 86400 * 10**9
 # Settings that do not go with a column of frames.
 _UNCOUNTED = {"unit", "week", "rollover"}
-MEND = "check `unit`, and give in `zero` the date that the times count from"
+REMEDY = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
 # Offsets from UTC in h of zones with short names, if the name is unambiguous.
 ZONES = {
@@ -278,7 +278,7 @@ class Reading:
         self.facts["rollovers of the counter, which is unwrapped"] += int(turns[-1]) - self.turns
         self.count_ns, self.turns = int(values[-1]), int(turns[-1])
         continued = counted.copy()
-        continued[known] = to_ns(turns, rollover_ns, values, where=label, mend=MEND)
+        continued[known] = to_ns(turns, rollover_ns, values, where=label, remedy=REMEDY)
         return continued
 
 
@@ -308,7 +308,7 @@ def stamps_ns(
             10**9,
             mapping.zero_ns,
             where=where,
-            mend="check `rate_hz` and `zero`",
+            remedy="check `rate_hz` and `zero`",
         )
     cells = [columns[name] for name in mapping.columns]
     label = f"{where}: column {' and '.join(mapping.columns)}"
@@ -318,9 +318,9 @@ def stamps_ns(
         units = mapping.units
         found = np.zeros(len(cells[0]), np.int64)
         for each, unit in zip(cells, units, strict=False):
-            found = read_ns(each, DIGITS[unit], found, where=label, mend=MEND)
+            found = read_ns(each, DIGITS[unit], found, where=label, remedy=REMEDY)
         if mapping.week:
-            weeks = read_ns(cells[-1], 0, where=label, mend=MEND)
+            weeks = read_ns(cells[-1], 0, where=label, remedy=REMEDY)
             known = weeks[weeks != NOT_A_TIME]
             if mapping.counts_all_weeks and len(known) and known.min() < _WEEKS:
                 raise Undecided(
@@ -328,20 +328,20 @@ def stamps_ns(
                     'state in `zero` of `time` the date of week 0: "2019-04-07" for recordings after '
                     'that day, "1999-08-22" or "1980-01-06" for earlier ones'
                 )
-            found = to_ns(weeks, _WEEK_NS, found, where=label, mend=MEND)
+            found = to_ns(weeks, _WEEK_NS, found, where=label, remedy=REMEDY)
         if mapping.rollover is not None:
             rollover_ns = round(mapping.rollover * 10 ** DIGITS[units[0]])
             found = reading.continued_ns(found, rollover_ns, label)
-        found = to_ns(found, 1, mapping.zero_ns, where=label, mend=MEND)
+        found = to_ns(found, 1, mapping.zero_ns, where=label, remedy=REMEDY)
     if np.any(found[found != NOT_A_TIME] < 0):
-        raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {MEND}")
+        raise BadInput(f"{label}: a stamp is before 1970 or after 2262; {REMEDY}")
     return found
 
 
 def _frames(cells: pa.Array, mapping: TimeMapping, where: str) -> NDArray[np.float64]:
     """Read frame numbers (n,), NaN for empty cells."""
     label = f"{where}: column {mapping.columns[0]}"
-    counts = read_ns(cells, 0, where=label, mend="give a column of whole numbers")
+    counts = read_ns(cells, 0, where=label, remedy="give a column of whole numbers")
     return np.where(counts == NOT_A_TIME, np.nan, counts)
 
 
@@ -352,10 +352,10 @@ def _dates_ns(
     leap_ns = round(mapping.leap_seconds * 1e9)
     zone = offset_of(mapping.zone) if mapping.zone is not None else mapping.utc_offset_h
     if len(cells) == 1 and pa.types.is_timestamp(cells[0].type):
-        found = read_ns(cells[0], 0, where=label, mend=MEND)
+        found = read_ns(cells[0], 0, where=label, remedy=REMEDY)
         if cells[0].type.tz is None:
             found = _from_zone(found, zone, rows, label, reading)
-        return to_ns(found, 1, -leap_ns, where=label, mend=MEND)
+        return to_ns(found, 1, -leap_ns, where=label, remedy=REMEDY)
     texts = [_padded(texts_of(each, is_part=len(cells) > 1), mapping.format) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
     if mapping.format == ISO:  # pandas accepts no fractions after a comma, and no space before an offset
@@ -381,8 +381,8 @@ def _dates_ns(
             f"{label} has cells that are not dates ({why}); give their `format`, or the unit of numbers"
         ) from None
     if mapping.format != ISO and not re.search("%[YyGcxs]", mapping.format):
-        of_day_ns = to_ns(since_ns, 1, -_date_ns("1900-01-01"), where=label, mend=MEND)
-        since_ns = to_ns(of_day_ns, 1, _date_ns(mapping.zero), where=label, mend=MEND)
+        of_day_ns = to_ns(since_ns, 1, -_date_ns("1900-01-01"), where=label, remedy=REMEDY)
+        since_ns = to_ns(of_day_ns, 1, _date_ns(mapping.zero), where=label, remedy=REMEDY)
     for name, own_zone in names.items():
         which = zones == name
         since_ns[which] = _from_zone(since_ns[which], own_zone, rows[which], label, reading)
@@ -400,7 +400,7 @@ def _dates_ns(
     if zone:
         local = ~own & (zones == 0)
         since_ns[local] = _from_zone(since_ns[local], zone, rows[local], label, reading)
-    return to_ns(since_ns, 1, -leap_ns, where=label, mend=MEND) if leap_ns else since_ns
+    return to_ns(since_ns, 1, -leap_ns, where=label, remedy=REMEDY) if leap_ns else since_ns
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
@@ -457,7 +457,7 @@ def _from_zone(
     known = np.flatnonzero(local_ns != NOT_A_TIME)
     placed = local_ns.copy()
     if not isinstance(zone, ZoneInfo):
-        return to_ns(local_ns, 1, -round(3600e9 * zone), where=label, mend=MEND)
+        return to_ns(local_ns, 1, -round(3600e9 * zone), where=label, remedy=REMEDY)
     local = pd.Series(local_ns[known].astype("datetime64[ns]"))
     first = _since_utc(local, zone, is_first=True)
     second = _since_utc(local, zone, is_first=False)

@@ -35,12 +35,12 @@ def stated(
             number: float = _number(topic.name, other, topic.metadata[other], _Noise, other) ** power
             return number
     if needed:
-        mend = (
+        remedy = (
             "record the log again with this number"
             if parameters is None
             else f"give it with --set {name}=..."
         )
-        raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
+        raise BadInput(f"topic {topics[0].name} does not state {name}; {remedy}")
     return np.nan
 
 

@@ -40,8 +40,8 @@ class Vectors(NamedTuple):
 
     def complaint(self, topic: str) -> str:
         """Return why messages of `topic` were not used; "" if no covariance can be missing."""
-        mend = f"; give --set {self.sigma}=..." if self.sigma else ""
-        return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
+        remedy = f"; give --set {self.sigma}=..." if self.sigma else ""
+        return f"topic {topic}: {self.covariance} is missing{remedy}" if self.covariance else ""
 
 
 class MeasuredVectors(NamedTuple):

@@ -18,8 +18,8 @@ from fuselog.replay.families.tracking.association.scans import ScanSensor
 from fuselog.replay.families.tracking.association.tracker import Newborn
 from fuselog.replay.families.tracking.targets import Targets
 from fuselog.replay.inference.linear_algebra.manifold import is_flat
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model, Motion
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 
 BY_SORT = ("registration", "correlated")
@@ -69,13 +69,15 @@ def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
     """
     if not errors.names:
         return targets
-    stage, (mean, covariance, mode) = targets.stage, targets.newborn
-    if not is_flat(stage.model.kinds) or any(each.noises for each in stage.modes or (stage.motion,)):
+    bound_model, (mean, covariance, mode) = targets.bound_model, targets.newborn
+    if not is_flat(bound_model.model.kinds) or any(
+        each.noises for each in bound_model.modes or (bound_model.motion,)
+    ):
         raise BadInput(
             f"{where}: sensor errors require a model with additive noise and without rotations in its "
             "state; use another model"
         )
-    if errors.shared and stage.modes:
+    if errors.shared and bound_model.modes:
         raise BadInput(
             f"{where}: registration errors require targets with one motion; set mode=..., or use "
             "correlated errors"
@@ -85,22 +87,29 @@ def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
     wider[:size, :size], wider[range(size, longer), range(size, longer)] = covariance, errors.sigma**2
     newborn = Newborn(np.append(mean, np.zeros(longer - size)), wider, mode)
     lengths = tuple(
-        len(each.noise(trial_state(stage.model.kinds), 1.0, targets.parameters))
-        for each in (stage.motion, *stage.modes)
+        len(each.noise(trial_state(bound_model.model.kinds), 1.0, targets.parameters))
+        for each in (bound_model.motion, *bound_model.modes)
         if each.noise is not None
     )
-    return Targets(_longer(stage, errors.names, lengths), targets.parameters, newborn)
+    return Targets(_longer(bound_model, errors.names, lengths), targets.parameters, newborn)
 
 
 @lru_cache(maxsize=64)
-def _longer(stage: Stage, names: tuple[str, ...], lengths: tuple[int, ...]) -> Stage:
+def _longer(bound_model: BoundModel, names: tuple[str, ...], lengths: tuple[int, ...]) -> BoundModel:
     motion, *modes = (
-        _moving(stage.model, each, names, length)
-        for each, length in zip((stage.motion, *stage.modes), lengths, strict=True)
+        _moving(bound_model.model, each, names, length)
+        for each, length in zip((bound_model.motion, *bound_model.modes), lengths, strict=True)
     )
-    state: Components = {**stage.model.state, **dict.fromkeys(names, "linear")}
-    model = Model(stage.model.summary, state, stage.model.parameters, (), motion, stage.model.modes)
-    return Stage(model, motion, (), tuple(modes))
+    state: Components = {**bound_model.model.state, **dict.fromkeys(names, "linear")}
+    model = Model(
+        bound_model.model.summary,
+        state,
+        bound_model.model.parameters,
+        (),
+        motion,
+        bound_model.model.modes,
+    )
+    return BoundModel(model, motion, (), tuple(modes))
 
 
 def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:

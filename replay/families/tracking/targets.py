@@ -17,10 +17,10 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.families.tracking.association.tracker import Newborn
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model, Motion
 from fuselog.replay.inference.model.parameters import ModelParameters, number_fields, settings_type
 from fuselog.replay.inference.model.settings import TracedParameters
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import check_motion, check_switching, switching_of
 from fuselog.replay.inference.run.first_messages import unknown
 
@@ -68,7 +68,7 @@ class Targets(NamedTuple):
         newborn: a target of which only the position is known.
     """
 
-    stage: Stage
+    bound_model: BoundModel
     parameters: Any
     newborn: Newborn
 
@@ -89,13 +89,13 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
         where, given = f"{where}: model {name}", parameters.motion
         model = load("models", name, Model)
     _check(where, model)
-    stage = _stage_of(where, model, parameters.mode)
+    bound_model = _bound_model_of(where, model, parameters.mode)
     values = build(model.parameters, given, where)
     names = number_fields(model.parameters)
     traced = TracedParameters({each: getattr(values, each) for each in names})
-    for motion in stage.modes or (stage.motion,):
+    for motion in bound_model.modes or (bound_model.motion,):
         check_motion(where, model, motion, traced)
-    if stage.modes:
+    if bound_model.modes:
         check_switching(where, model, traced)
     numbers = {}
     for each in names:
@@ -109,10 +109,10 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
             )
         numbers[each] = float(number)
     mode, own = np.ones(1), settings_type(names)(**numbers)
-    if stage.modes:
+    if bound_model.modes:
         _, mode = switching_of(where, model, own)
     mean, sigma = _unknown(where, model, parameters.birth_sigma_mps)
-    return Targets(stage, own, Newborn(mean, np.diag(sigma**2), mode))
+    return Targets(bound_model, own, Newborn(mean, np.diag(sigma**2), mode))
 
 
 def _check(where: str, model: Model) -> None:
@@ -127,15 +127,15 @@ def _check(where: str, model: Model) -> None:
         )
 
 
-def _stage_of(where: str, model: Model, mode: str | None) -> Stage:
+def _bound_model_of(where: str, model: Model, mode: str | None) -> BoundModel:
     """Bind the model with the motion of the named mode, or with all of its modes."""
     if mode is not None:
         if not model.modes or mode not in model.modes:
             raise BadInput(f"{where}: no mode '{mode}'; {choices(mode, model.modes or ())}")
-        return Stage(model, model.modes[mode], ())
+        return BoundModel(model, model.modes[mode], ())
     if model.modes and model.switching is not None:
-        return Stage(model, model.motion, (), tuple(model.modes.values()))
-    return Stage(model, model.motion, ())
+        return BoundModel(model, model.motion, (), tuple(model.modes.values()))
+    return BoundModel(model, model.motion, ())
 
 
 def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats]:

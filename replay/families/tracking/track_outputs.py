@@ -16,7 +16,7 @@ from fuselog.replay.families.tracking.association.scans import Scans
 from fuselog.replay.families.tracking.association.tracks import NEVER
 from fuselog.replay.families.tracking.scan_sensors import KINDS
 from fuselog.replay.families.tracking.scans import SensorTopics
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 UNUSED = (
     "there is no room for more tracks; use a larger --set most_tracks=...",
@@ -27,7 +27,7 @@ UNUSED = (
 def track_outputs(
     name: str,
     found: SensorTopics,
-    stage: Stage,
+    bound_model: BoundModel,
     scans: Scans,
     tracked: TrackOutputs,
     *,
@@ -40,10 +40,10 @@ def track_outputs(
     """
     topic = f"/estimates/{name}"
     return [
-        *_of_tracks(topic, found, stage, scans, tracked),
+        *_of_tracks(topic, found, bound_model, scans, tracked),
         _associations(topic, found, scans, tracked),
         *_of_scans(topic, scans, tracked, repeated),
-        *_modes(topic, stage, scans, tracked),
+        *_modes(topic, bound_model, scans, tracked),
         *_innovations(topic, found, scans, tracked),
     ]
 
@@ -65,10 +65,10 @@ def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
 
 
 def _of_tracks(
-    topic: str, found: SensorTopics, stage: Stage, scans: Scans, tracked: TrackOutputs
+    topic: str, found: SensorTopics, bound_model: BoundModel, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
     """Yield the number of tracks, the tracks and their existence after every scan."""
-    metadata = {**named(stage.model.state), **in_frame(found.frames[0])}
+    metadata = {**named(bound_model.model.state), **in_frame(found.frames[0])}
     ends = tracked.end[:, 0]
     used = np.flatnonzero(tracked.confirmed != NEVER)
     size = make_stream(
@@ -87,7 +87,7 @@ def _of_tracks(
         metadata=metadata,
         track_id=_filled(tracked.number, ends),
         mean=_filled(tracked.mean, ends),
-        covariance=covariance.reshape(len(covariance), stage.model.tangent**2),
+        covariance=covariance.reshape(len(covariance), bound_model.model.tangent**2),
     )
     yield Ragged(track, _bounds(ends))
     existence = _filled(tracked.existence, ends)
@@ -95,16 +95,16 @@ def _of_tracks(
     yield Ragged(stream, _bounds(ends))
 
 
-def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
+def _modes(topic: str, bound_model: BoundModel, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
     """Yield the probabilities of each track's modes, if there are several."""
-    if not stage.modes:
+    if not bound_model.modes:
         return
     ends = tracked.end[:, 0]
     stream = make_stream(
         f"{topic}/modes",
         schemas.MODE_PROBABILITIES,
         _track_stamps(scans, tracked),
-        metadata=named(dict.fromkeys(stage.model.modes or (), "linear")),
+        metadata=named(dict.fromkeys(bound_model.model.modes or (), "linear")),
         probability=_filled(tracked.probability, ends),
     )
     yield Ragged(stream, _bounds(ends))

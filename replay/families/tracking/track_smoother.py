@@ -24,7 +24,7 @@ def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
             f"estimator {name}: tracks with sensor errors cannot be smoothed; remove smoothed or the "
             "sensor errors"
         )
-    if targets.stage.modes or not targets.stage.motion.linear:
+    if targets.bound_model.modes or not targets.bound_model.motion.linear:
         raise BadInput(
             f"estimator {name}: smoothed tracks require a model with one linear motion; remove "
             "smoothed, or use another model, or one of its modes"
@@ -33,13 +33,13 @@ def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
 
 def smoothed(tracks: Ragged, targets: Targets) -> Ragged:
     """Smooth the states in a stream of tracks."""
-    stream, size = tracks.stream, targets.stage.model.size
+    stream, size = tracks.stream, targets.bound_model.model.size
     run = run_of_rows(tracks.offsets)
     _, track = np.unique(
         np.stack([run, stream["track_id"].astype(np.int64)]), axis=1, return_inverse=True
     )
     mean, covariance = smooth_tracks(
-        targets.stage,
+        targets.bound_model,
         targets.parameters,
         track.ravel(),
         stream.publish_time_ns,

@@ -48,8 +48,8 @@ from fuselog.replay.families.tracking.tracker_run import (
     finish,
     start,
 )
+from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.inference.model.parameters import number_fields
-from fuselog.replay.inference.model.stage import stage_of
 
 # Defaults of the two associations that estimate existence; they associate as jpda does.
 EXISTING: dict[str, dict[str, float]] = {
@@ -325,7 +325,7 @@ def settings_of(
     of_errors |= {
         f"{name}_s": each for name, each in zip(errors.names, errors.correlation_s, strict=True)
     }
-    size = targets.stage.model.size
+    size = targets.bound_model.model.size
     for values, places in zip(by_sensor, errors.places, strict=True):
         values |= {name: place if place < 0 else size + place for name, place in places.items()}
         values |= of_errors
@@ -339,18 +339,18 @@ def settings_of(
 
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: TrackerSettings) -> Tracker:
     """Build the tracker that the parameters describe."""
-    stage, shared = targets.stage, settings.errors.shared
-    stage = stage_of(*stage, names=settings.names)
-    sensors = tuple(measuring(stage.model, kind, settings.names) for kind in KINDS)
+    bound_model, shared = targets.bound_model, settings.errors.shared
+    bound_model = bound_model_of(*bound_model, names=settings.names)
+    sensors = tuple(measuring(bound_model.model, kind, settings.names) for kind in KINDS)
     association = "jpda" if parameters.association in EXISTING else parameters.association
     assert parameters.management is not None
     return Tracker(
-        stage._replace(sensors=sensors),
+        bound_model._replace(sensors=sensors),
         KINDS,
         association,
         parameters.management,
         settings.names,
-        (stage.model.size - len(settings.errors.names), shared),
+        (bound_model.model.size - len(settings.errors.names), shared),
     )
 
 

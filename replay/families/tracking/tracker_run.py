@@ -54,7 +54,7 @@ class TrackerSetup(NamedTuple):
     def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
         """Make the output streams of some scans; see `track_outputs`."""
         return track_outputs(
-            self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
+            self.name, self.found, self.tracker.bound_model, scans, tracked, repeated=repeated
         )
 
 

@@ -382,13 +382,13 @@ def outputs_of(
     yield failures_by_run(f"/estimates/{setup.name}", failures, runs)
     if setup.fixes == "known":
         at_run, at_frame, which = np.nonzero(frames.skipped)
-        mend = "its fixes have no covariance; give --set sigma_fix_m=..."
+        remedy = "its fixes have no covariance; give --set sigma_fix_m=..."
         stream = reason_stream(
             f"/estimates/{setup.name}/skipped",
             schemas.SKIPPED,
             frames.time_ns[at_run, at_frame],
             which,
-            [f"topic /vehicle{number}/fix: {mend}" for number in setup.numbers],
+            [f"topic /vehicle{number}/fix: {remedy}" for number in setup.numbers],
         )
         yield Ragged(stream, np.searchsorted(at_run, np.arange(runs + 1)))
 

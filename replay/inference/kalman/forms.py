@@ -21,7 +21,7 @@ from fuselog.replay.inference.kalman.steps import (
 )
 from fuselog.replay.inference.kalman.update import kalman_update, linear_sensor
 from fuselog.replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 
 class Parts(NamedTuple):
@@ -35,49 +35,55 @@ class Parts(NamedTuple):
     """
 
     form: Form
-    linear_motion: Callable[[Stage], Predict]
-    sampled_motion: Callable[[Stage, int], Predict]
-    linear_update: Callable[[Stage, int], Update]
-    sampled_update: Callable[[Stage, int, int], Update]
-    gap_motion: Callable[[Stage], Predict]
+    linear_motion: Callable[[BoundModel], Predict]
+    sampled_motion: Callable[[BoundModel, int], Predict]
+    linear_update: Callable[[BoundModel, int], Update]
+    sampled_update: Callable[[BoundModel, int, int], Update]
+    gap_motion: Callable[[BoundModel], Predict]
 
 
-def _linear_update(stage: Stage, number: int) -> Update:
-    return kalman_update(stage, number, linear_sensor(stage, number))
+def _linear_update(bound_model: BoundModel, number: int) -> Update:
+    return kalman_update(bound_model, number, linear_sensor(bound_model, number))
 
 
-def _sampled_update(stage: Stage, number: int, samples: int) -> Update:
-    return kalman_update(stage, number, sampled_sensor(stage, number, samples))
+def _sampled_update(bound_model: BoundModel, number: int, samples: int) -> Update:
+    return kalman_update(bound_model, number, sampled_sensor(bound_model, number, samples))
 
 
 PLAIN = Parts(COVARIANCES, linear_motion, sampled_motion, _linear_update, _sampled_update, keeping)
 
 
-def extended(stage: Stage, parts: Parts = PLAIN) -> Steps:
+def extended(bound_model: BoundModel, parts: Parts = PLAIN) -> Steps:
     """Make the steps of an extended Kalman filter."""
-    updates = tuple(parts.linear_update(stage, number) for number in range(len(stage.sensors)))
+    updates = tuple(
+        parts.linear_update(bound_model, number) for number in range(len(bound_model.sensors))
+    )
     return gaussian_filter(
-        stage, parts.linear_motion(stage), updates, form=parts.form, gap_motion=parts.gap_motion
+        bound_model,
+        parts.linear_motion(bound_model),
+        updates,
+        form=parts.form,
+        gap_motion=parts.gap_motion,
     )
 
 
-def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
+def sampled(bound_model: BoundModel, parts: Parts = PLAIN) -> Steps:
     """Make the steps of a filter by regression at samples; linear functions are applied exactly."""
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     dimensions: list[int] = []
     shapes: list[tuple[int, tuple[str, ...]]] = []
     if motion.linear:
-        predict = parts.linear_motion(stage)
+        predict = parts.linear_motion(bound_model)
     else:
-        predict = parts.sampled_motion(stage, 0)
+        predict = parts.sampled_motion(bound_model, 0)
         dimensions.append(model.tangent + motion.noises)
         shapes.append((motion.noises, model.kinds))
     updates = []
-    for number, sensor in enumerate(stage.sensors):
+    for number, sensor in enumerate(bound_model.sensors):
         if sensor.linear:
-            updates.append(parts.linear_update(stage, number))
+            updates.append(parts.linear_update(bound_model, number))
         else:
-            updates.append(parts.sampled_update(stage, number, len(shapes)))
+            updates.append(parts.sampled_update(bound_model, number, len(shapes)))
             dimensions.append(model.tangent + sensor.noises)
             shapes.append((sensor.noises, tuple(sensor.measured.values())))
 
@@ -86,7 +92,7 @@ def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
             sample_memory(each, model.kinds, noises, outputs)
             for each, (noises, outputs) in zip(sets, shapes, strict=True)
         )
-        return workspace(stage, tuple(made))
+        return workspace(bound_model, tuple(made))
 
     of_form = parts.form, parts.gap_motion
-    return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions), *of_form)
+    return gaussian_filter(bound_model, predict, tuple(updates), memory, tuple(dimensions), *of_form)

@@ -28,14 +28,14 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 )
 from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import correcting, relinearising, sloping
-from fuselog.replay.inference.model.stage import Stage
 
 ITERATIONS = 50
 SETTLED = 1e-12  # largest component of the last step
 
 
-def iterated_update(stage: Stage, number: int) -> Update:
+def iterated_update(bound_model: BoundModel, number: int) -> Update:
     """Make the update that relinearises at every iterate: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds, the Jacobian is H at x (+) d times the right
@@ -46,11 +46,14 @@ def iterated_update(stage: Stage, number: int) -> Update:
         stage: the bound model, with the sensors of the log.
         number: number of the sensor among these.
     """
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
     read_state, read_reference = tuple_of(n), message_layout(sensor).reference
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
+    write_innovation, correct = (
+        writing_innovation(bound_model, number),
+        correcting(model.kinds, model.correct),
+    )
     find_slope = sloping(model.kinds, model.correct)
     step_to, chain = relinearising(model)
 

@@ -37,10 +37,10 @@ from fuselog.replay.inference.kalman.update import (
     sensor_derivative,
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel, traced_sensor
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
 from fuselog.replay.inference.model.settings import trial_parameters
-from fuselog.replay.inference.model.stage import Stage, traced_sensor
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.sampling import parse_sampling
 from fuselog.replay.inference.sampling.names import Sampling, Unscented
@@ -135,7 +135,7 @@ class Method:
 
     summary: str
     parameters: type[MethodParameters]
-    steps: Callable[[Stage], Steps]
+    steps: Callable[[BoundModel], Steps]
     sampling: Callable[[CombinedParameters], Sampling] | None = None
     lacks: Callable[[Model], str] = lambda _: ""
     variant: str | None = None
@@ -145,28 +145,28 @@ class Method:
     is_random: bool = False
 
 
-def _iterated(stage: Stage) -> Steps:
-    updates = (iterated_update(stage, number) for number in range(len(stage.sensors)))
-    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
+def _iterated(bound_model: BoundModel) -> Steps:
+    updates = (iterated_update(bound_model, number) for number in range(len(bound_model.sensors)))
+    return gaussian_filter(bound_model, linear_motion(bound_model), tuple(updates))
 
 
-def _analytic(stage: Stage) -> Steps:
-    motion = stage.motion
-    predict = linear_motion(stage)
+def _analytic(bound_model: BoundModel) -> Steps:
+    motion = bound_model.motion
+    predict = linear_motion(bound_model)
     if not motion.linear:
-        predict = _exact_motion(stage)
+        predict = _exact_motion(bound_model)
     updates = tuple(
         kalman_update(
-            stage,
+            bound_model,
             number,
-            linear_sensor(stage, number) if sensor.linear else _exact_sensor(stage, number),
+            linear_sensor(bound_model, number) if sensor.linear else _exact_sensor(bound_model, number),
         )
-        for number, sensor in enumerate(stage.sensors)
+        for number, sensor in enumerate(bound_model.sensors)
     )
-    return gaussian_filter(stage, predict, updates)
+    return gaussian_filter(bound_model, predict, updates)
 
 
-def no_steps(stage: Stage) -> Steps:
+def no_steps(bound_model: BoundModel) -> Steps:
     """Raise AssertionError, as a placeholder for methods whose steps `Method.made_for` selects."""
     raise AssertionError("the method was not made for its parameters")
 
@@ -175,8 +175,8 @@ def _square_root(parameters: SquareRootParameters) -> Method:
     return _SQUARE_ROOTS[parameters.filter]
 
 
-def _exact_motion(stage: Stage) -> Predict:
-    model, motion = stage.model, stage.motion
+def _exact_motion(bound_model: BoundModel) -> Predict:
+    model, motion = bound_model.model, bound_model.motion
     moments, add_noise = motion.moments, motion_noise(model, motion)
     assert moments is not None
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
@@ -191,8 +191,8 @@ def _exact_motion(stage: Stage) -> Predict:
     return predict
 
 
-def _exact_sensor(stage: Stage, number: int) -> Innovate:
-    sensor = stage.sensors[number]
+def _exact_sensor(bound_model: BoundModel, number: int) -> Innovate:
+    sensor = bound_model.sensors[number]
     moments, read_reference = sensor.moments, message_layout(sensor).reference
     assert moments is not None
     subtract = residual_of(sensor)

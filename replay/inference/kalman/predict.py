@@ -12,9 +12,9 @@ from fuselog.replay.inference.linear_algebra.sparse import (
     propagating_covariance,
 )
 from fuselog.replay.inference.linear_algebra.tuples import AddNoise, adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.functions import MotionNoise
 from fuselog.replay.inference.model.model import Model, Motion
-from fuselog.replay.inference.model.stage import Stage
 
 
 class LineariseMotion(Protocol):
@@ -45,14 +45,14 @@ class AddMotionNoise(Protocol):
     ) -> None: ...
 
 
-def linear_motion(stage: Stage) -> Predict:
+def linear_motion(bound_model: BoundModel) -> Predict:
     """Make the prediction by the Jacobian at the mean, which is exact if the motion is linear.
 
     Returns:
         `predict(mean, covariance, interval, work)`, which replaces the mean (n,) by f(x, u) and the
         covariance (t, t) by F P F' + Q, in place.
     """
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     n, read_control = model.size, tuple_of(model.controls)
     read_state, fill = tuple_of(n), filling(n)
     linearise = motion_derivative(model, motion, by_state=True)

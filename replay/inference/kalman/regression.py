@@ -43,9 +43,9 @@ from fuselog.replay.inference.linear_algebra.moments import (
     weighted_mean_of,
 )
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
 from fuselog.replay.inference.model.model import Motion, Sensor
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.sampling.sets import SampleSets
 
 MEANS = 30  # maximum number of iterations of an intrinsic mean
@@ -304,7 +304,7 @@ def no_variances(*_: object) -> Numbers:
     return ()
 
 
-def sampled_motion(stage: Stage, number: int) -> Predict:
+def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters through the derivative at the mean, noise of the motion through samples.
@@ -313,7 +313,7 @@ def sampled_motion(stage: Stage, number: int) -> Predict:
         stage: the bound model.
         number: index of the samples in the workspace.
     """
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     entering = motion.noise if motion.noises else None
     moved = moved_with_noise(motion)
     regress = regression(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
@@ -357,7 +357,7 @@ def moved_with_noise(motion: Motion) -> Sampled:
     return without
 
 
-def sampled_sensor(stage: Stage, number: int, samples: int) -> Innovate:
+def sampled_sensor(bound_model: BoundModel, number: int, samples: int) -> Innovate:
     """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`.
 
     Args:
@@ -365,7 +365,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Innovate:
         number: number of the sensor among these.
         samples: index of its samples in the workspace.
     """
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
     read_reference, subtract = message_layout(sensor).reference, residual_of(sensor)

@@ -54,9 +54,9 @@ from fuselog.replay.inference.linear_algebra.gaussian import fill_identity, whit
 from fuselog.replay.inference.linear_algebra.inflation import inflation
 from fuselog.replay.inference.linear_algebra.linearization import Linearise
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import correcting, sloping
 from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
-from fuselog.replay.inference.model.stage import Stage
 
 Into = tuple[Floats, Floats]  # rows, and the weights of their columns
 Given = tuple[AnyArgument, ...]  # the arguments of a motion or a sensor after the state
@@ -126,10 +126,12 @@ def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> b
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
 
 
-def _predicting(stage: Stage, spread: Spread, add_noise: AddMotionNoise, samples: int = -1) -> Predict:
+def _predicting(
+    bound_model: BoundModel, spread: Spread, add_noise: AddMotionNoise, samples: int = -1
+) -> Predict:
     """Make the prediction by a `spread` that uses derivatives, or the given samples."""
-    t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
-    read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
+    t, read_control = bound_model.model.tangent, tuple_of(bound_model.model.controls)
+    read_state, fill = tuple_of(bound_model.model.size), filling(bound_model.model.size)
 
     def predict(mean: Floats, factor: Floats, interval: Interval, work: Workspace) -> bool:
         control, duration_s, parameters, event = interval
@@ -149,14 +151,18 @@ def _predicting(stage: Stage, spread: Spread, add_noise: AddMotionNoise, samples
     return predict
 
 
-def _linear_motion(stage: Stage) -> Predict:
-    linearise = motion_derivative(stage.model, stage.motion, by_state=True)
-    return _predicting(stage, _linear(linearise, "transition"), motion_noise(stage.model, stage.motion))
+def _linear_motion(bound_model: BoundModel) -> Predict:
+    linearise = motion_derivative(bound_model.model, bound_model.motion, by_state=True)
+    return _predicting(
+        bound_model,
+        _linear(linearise, "transition"),
+        motion_noise(bound_model.model, bound_model.motion),
+    )
 
 
-def _gap_motion(stage: Stage) -> Predict:
-    gap_noise, add = stage.motion.gap_noise, adding_noise(stage.model.tangent)
-    fill = filling(stage.model.size)
+def _gap_motion(bound_model: BoundModel) -> Predict:
+    gap_noise, add = bound_model.motion.gap_noise, adding_noise(bound_model.model.tangent)
+    fill = filling(bound_model.model.size)
     assert gap_noise is not None
 
     def stand(
@@ -170,12 +176,12 @@ def _gap_motion(stage: Stage) -> Predict:
     ) -> None:
         add(noise, gap_noise(state, duration_s, parameters))
 
-    return _predicting(stage, _linear(stand, "transition"), add_noise)
+    return _predicting(bound_model, _linear(stand, "transition"), add_noise)
 
 
-def _sampled_motion(stage: Stage, samples: int) -> Predict:
+def _sampled_motion(bound_model: BoundModel, samples: int) -> Predict:
     """Make the sampled prediction; noise of the control enters through the derivative at the mean."""
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     linearise: Linearise = nothing
     if motion.control_noise:
         linearise = motion_derivative(model, motion, by_state=False)
@@ -195,22 +201,22 @@ def _sampled_motion(stage: Stage, samples: int) -> Predict:
         spread_samples(state, factor, given, index, work, into)
 
     add_noise: AddMotionNoise = nothing if motion.noises else motion_noise(model, motion)
-    return _predicting(stage, spread, add_noise, samples)
+    return _predicting(bound_model, spread, add_noise, samples)
 
 
 def _updating(
-    stage: Stage, number: int, spread: Spread, add_noise: MeasurementNoise, samples: int = -1
+    bound_model: BoundModel, number: int, spread: Spread, add_noise: MeasurementNoise, samples: int = -1
 ) -> Update:
     """Make the update by sensor `number`; see `fuselog.replay.inference.kalman.update.kalman_update`.
 
     A missing component is replaced by independent noise whose value is as predicted.
     """
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     t, m, read_reference = model.tangent, len(sensor.measured), message_layout(sensor).reference
     read_state, to_covariance = tuple_of(model.size), FACTORS.to_covariance
     subtract = residual_of(sensor)
     write_innovation, find_slope = (
-        writing_innovation(stage, number),
+        writing_innovation(bound_model, number),
         sloping(model.kinds, model.correct, FACTORS),
     )
     correct = correcting(model.kinds, model.correct, form=FACTORS)
@@ -264,24 +270,24 @@ def _updating(
     return update
 
 
-def _linear_update(stage: Stage, number: int) -> Update:
-    sensor = stage.sensors[number]
-    spread = _linear(sensor_derivative(stage.model, sensor), "rows")
-    return _updating(stage, number, spread, sensor_noise(sensor))
+def _linear_update(bound_model: BoundModel, number: int) -> Update:
+    sensor = bound_model.sensors[number]
+    spread = _linear(sensor_derivative(bound_model.model, sensor), "rows")
+    return _updating(bound_model, number, spread, sensor_noise(sensor))
 
 
-def _sampled_update(stage: Stage, number: int, samples: int) -> Update:
-    sensor = stage.sensors[number]
+def _sampled_update(bound_model: BoundModel, number: int, samples: int) -> Update:
+    sensor = bound_model.sensors[number]
     kinds, noises = tuple(sensor.measured.values()), sensor.noises
     variances: OfParameters = (sensor.noise if noises else None) or no_variances
 
     def variances_of(state: Numbers, given: Given) -> Numbers:
         return variances(given[1])
 
-    sample = sampling(measured_with_noise(sensor), stage.model.kinds, noises, kinds)
+    sample = sampling(measured_with_noise(sensor), bound_model.model.kinds, noises, kinds)
     spread = _sampled(sample, variances_of, "predicted", len(kinds), samples)
     add_noise: MeasurementNoise = nothing if noises else sensor_noise(sensor)
-    return _updating(stage, number, spread, add_noise, samples)
+    return _updating(bound_model, number, spread, add_noise, samples)
 
 
 FACTORED = Parts(FACTORS, _linear_motion, _sampled_motion, _linear_update, _sampled_update, _gap_motion)

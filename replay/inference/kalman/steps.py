@@ -18,7 +18,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 FAILURES = (
     "the covariance is no longer positive definite",
@@ -227,7 +227,7 @@ class Workspace(NamedTuple):
     samples: tuple[Samples, ...]
 
 
-def workspace(stage: Stage, samples: tuple[Samples, ...] = ()) -> Workspace:
+def workspace(bound_model: BoundModel, samples: tuple[Samples, ...] = ()) -> Workspace:
     """Allocate the workspace of a bound model.
 
     Args:
@@ -235,9 +235,9 @@ def workspace(stage: Stage, samples: tuple[Samples, ...] = ()) -> Workspace:
             a sensor.
         samples: memories of `regression`, motion first, one for each of `Steps.sampled`.
     """
-    model, t = stage.model, stage.model.tangent
-    m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    noises = max([stage.motion.noises, *(sensor.noises for sensor in stage.sensors)])
+    model, t = bound_model.model, bound_model.model.tangent
+    m = max((len(sensor.measured) for sensor in bound_model.sensors), default=0)
+    noises = max([bound_model.motion.noises, *(sensor.noises for sensor in bound_model.sensors)])
     return Workspace(
         state=np.empty(model.size),
         transition=np.empty((t, t)),
@@ -252,20 +252,20 @@ def workspace(stage: Stage, samples: tuple[Samples, ...] = ()) -> Workspace:
         step=np.empty(t),
         turned=np.empty(t),
         slope=np.zeros(t),
-        innovations=tuple(no_innovation(t, len(sensor.measured)) for sensor in stage.sensors)
+        innovations=tuple(no_innovation(t, len(sensor.measured)) for sensor in bound_model.sensors)
         or (no_innovation(t, 0),),
         samples=samples or ((np.empty(0),),),
     )
 
 
 def gaussian_filter(
-    stage: Stage,
+    bound_model: BoundModel,
     predict: Predict,
     updates: tuple[Update, ...],
     memory: MakeMemory | None = None,
     sampled: tuple[int, ...] = (),
     form: Form = COVARIANCES,
-    gap_motion: Callable[[Stage], Predict] | None = None,
+    gap_motion: Callable[[BoundModel], Predict] | None = None,
 ) -> Steps:
     """Make the steps of a filter whose belief is one Gaussian.
 
@@ -283,9 +283,9 @@ def gaussian_filter(
     Returns:
         The steps; they continue after gaps of the control if the motion has a `gap_noise`.
     """
-    has_gaps, to_covariance = stage.motion.gap_noise is not None, form.to_covariance
+    has_gaps, to_covariance = bound_model.motion.gap_noise is not None, form.to_covariance
     if has_gaps:
-        predict = _predicting_gap((gap_motion or keeping)(stage), predict)
+        predict = _predicting_gap((gap_motion or keeping)(bound_model), predict)
 
     def predict_run(run: int, belief: Gaussian, interval: Interval, work: CoreMemory) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
@@ -299,7 +299,7 @@ def gaussian_filter(
         to_covariance(covariance)
 
     return Steps(
-        memory or (lambda _: workspace(stage)),
+        memory or (lambda _: workspace(bound_model)),
         predict_run,
         tuple(_of_run(update) for update in updates),
         estimate,
@@ -320,9 +320,9 @@ def _predicting_gap(predict_gap: Predict, predict_driven: Predict) -> Predict:
     return predict
 
 
-def keeping(stage: Stage) -> Predict:
+def keeping(bound_model: BoundModel) -> Predict:
     """Make the prediction in a gap of the control, which keeps the mean and adds the gap noise."""
-    model, gap_noise = stage.model, stage.motion.gap_noise
+    model, gap_noise = bound_model.model, bound_model.motion.gap_noise
     assert gap_noise is not None
     read_state, add = tuple_of(model.size), adding_noise(model.tangent)
 

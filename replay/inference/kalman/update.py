@@ -31,9 +31,9 @@ from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative, known_entries
 from fuselog.replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
 from fuselog.replay.inference.linear_algebra.tuples import ReadTuple, adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import correcting, sloping
 from fuselog.replay.inference.model.model import Model, Sensor
-from fuselog.replay.inference.model.stage import Stage
 
 
 class MessageLayout(NamedTuple):
@@ -162,7 +162,7 @@ def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
     return derivative(sensor.measure, inputs, kinds, "predicted")
 
 
-def linear_sensor(stage: Stage, number: int) -> Innovate:
+def linear_sensor(bound_model: BoundModel, number: int) -> Innovate:
     """Make the computation of the innovation by the derivative at the mean.
 
     Args:
@@ -173,9 +173,9 @@ def linear_sensor(stage: Stage, number: int) -> Innovate:
         `innovate(mean, covariance, measurement, work)`, which fills the sensor's innovation in
         `work.innovations`.
     """
-    sensor = stage.sensors[number]
-    read_state, read_reference = tuple_of(stage.model.size), message_layout(sensor).reference
-    linearise = sensor_derivative(stage.model, sensor)
+    sensor = bound_model.sensors[number]
+    read_state, read_reference = tuple_of(bound_model.model.size), message_layout(sensor).reference
+    linearise = sensor_derivative(bound_model.model, sensor)
     pattern = pattern_of(known_entries(linearise, "rows"), len(sensor.measured))
     compare = linear_innovation(sensor, number, pattern)
 
@@ -254,10 +254,10 @@ def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
     return components
 
 
-def writing_innovation(stage: Stage, number: int) -> WriteInnovation:
+def writing_innovation(bound_model: BoundModel, number: int) -> WriteInnovation:
     """Make `write_innovation(innovation, record)`, which writes to the slots of sensor `number`."""
-    components = list(innovation_components(stage.sensors))
-    places = tuple(components.index(name) for name in stage.sensors[number].measured)
+    components = list(innovation_components(bound_model.sensors))
+    places = tuple(components.index(name) for name in bound_model.sensors[number].measured)
 
     def write_innovation(innovation: Innovation, record: InnovationRecord) -> None:
         for i in range(len(places)):
@@ -283,7 +283,7 @@ def is_unmeasured(data: Floats, components: int) -> bool:
     return measured == 0
 
 
-def kalman_update(stage: Stage, number: int, innovate: Innovate) -> Update:
+def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> Update:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
     The gain K is not computed explicitly. With S = L L' and W = C L^-T, K v is W L^-1 v, see
@@ -304,9 +304,9 @@ def kalman_update(stage: Stage, number: int, innovate: Innovate) -> Update:
         covariance (t, t). It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
     model, m, write_innovation = (
-        stage.model,
-        len(stage.sensors[number].measured),
-        writing_innovation(stage, number),
+        bound_model.model,
+        len(bound_model.sensors[number].measured),
+        writing_innovation(bound_model, number),
     )
     find_slope = sloping(model.kinds, model.correct)
     correct = correcting(model.kinds, model.correct)

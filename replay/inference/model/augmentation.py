@@ -21,6 +21,7 @@ from fuselog.replay.engine.arrays import AnyArgument, Floats, Numbers, Settings
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.priors import gaussians
 from fuselog.replay.engine.streams.results import gaussian_stream
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import correcting_more
 from fuselog.replay.inference.model.functions import ModelFunction, MotionNoise
 from fuselog.replay.inference.model.gauss_markov import (
@@ -40,7 +41,6 @@ from fuselog.replay.inference.model.point_errors import (
     with_point_errors,
 )
 from fuselog.replay.inference.model.settings import TracedParameters
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
@@ -140,7 +140,7 @@ def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
     return with_point_errors(model, errors) if errors else model
 
 
-def augmented_stage(stage: Stage, added: Added) -> Stage:
+def augmented_model(bound_model: BoundModel, added: Added) -> BoundModel:
     """Add parameters and errors to the state of a bound model.
 
     Args:
@@ -149,16 +149,22 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
     """
     names, errors = added.parameters, added.errors
     if names:
-        model, sensors = stage.model, stage.sensors
-        motions = [_augmented_motion(model, each, names) for each in (stage.motion, *stage.modes)]
+        model, sensors = bound_model.model, bound_model.sensors
+        motions = [
+            _augmented_motion(model, each, names) for each in (bound_model.motion, *bound_model.modes)
+        ]
         sensors = tuple(_augmented_sensor(model, each, names) for each in sensors)
-        stage = Stage(_augmented(model, names), motions[0], sensors, tuple(motions[1:]))
+        bound_model = BoundModel(_augmented(model, names), motions[0], sensors, tuple(motions[1:]))
     if errors:
-        model, sensors = stage.model, stage.sensors
-        motions = [motion_with_errors(model, each, errors) for each in (stage.motion, *stage.modes)]
+        model, sensors = bound_model.model, bound_model.sensors
+        motions = [
+            motion_with_errors(model, each, errors) for each in (bound_model.motion, *bound_model.modes)
+        ]
         sensors = tuple(sensor_with_errors(model, each, errors) for each in sensors)
-        stage = Stage(with_point_errors(model, errors), motions[0], sensors, tuple(motions[1:]))
-    return stage
+        bound_model = BoundModel(
+            with_point_errors(model, errors), motions[0], sensors, tuple(motions[1:])
+        )
+    return bound_model
 
 
 def with_gauss_markov(settings: Floats, added: Added) -> Floats:
@@ -173,7 +179,7 @@ def with_gauss_markov(settings: Floats, added: Added) -> Floats:
 
 
 def begin(
-    label: str, topic: str, stage: Stage, added: Added, settings: Floats
+    label: str, topic: str, bound_model: BoundModel, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
     """Make the function that extends the log's prior on `topic` to the augmented state.
 
@@ -186,7 +192,7 @@ def begin(
 
     Raises BadInput if a parameter to be estimated has no value.
     """
-    fields = number_fields(stage.model.parameters)
+    fields = number_fields(bound_model.model.parameters)
     means = np.array(
         [settings[0, fields.index(name)] if name in fields else 0.0 for name in added.names]
     )

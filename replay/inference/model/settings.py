@@ -11,9 +11,9 @@ from fuselog.recorders.log.planes import ORIGIN
 from fuselog.replay.engine.arrays import Floats, Settings
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters, number_fields, settings_type
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import (
     check_correction,
     check_motion,
@@ -61,7 +61,9 @@ class TracedParameters:
         return np.float64(1.0 if value is None else value)
 
 
-def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:
+def settings_of(
+    label: str, bound_model: BoundModel, found: Found, parameters: ModelParameters
+) -> Floats:
     """Collect the numbers (1 + sensors, fields) of motion and sensors from parameters and channels.
 
     A number that is not given is taken from the channels of the control, the prior and the sensors; a
@@ -76,14 +78,14 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     Raises BadInput if no channel states a number that is needed, if a channel states one that the
     parameter does not allow, or if the model does not match its declarations.
     """
-    model = stage.model
+    model = bound_model.model
     names = number_fields(model.parameters)
     given = {name: getattr(parameters, name) for name in names}
     everything = _stating(found)
-    assumed = assumed_of(label, stage, found, parameters)
+    assumed = assumed_of(label, bound_model, found, parameters)
     given |= {name: number for name, number in assumed.items() if given[name] is None}
-    given |= _of_origin(stage, found, parameters)
-    needed = _needed(f"estimator {label}", stage, tuple(given.items()))
+    given |= _of_origin(bound_model, found, parameters)
+    needed = _needed(f"estimator {label}", bound_model, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
     settings = np.array(
         [
@@ -112,15 +114,15 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
         missing = list(dict.fromkeys(name for _, name in lacking))
         usual = model.start.parameters if model.start is not None else {}
         better = ", or with better values if you know them" if usual else ""
-        mend = " ".join(
+        remedy = " ".join(
             f"--set {model.key_of(name)}={usual.get(model.kind_of(name), '...')}" for name in missing
         )
         asked = ", ".join(map(model.kind_of, missing))
         raise BadInput(
             f"topic {[*own[row], *everything][0].name} does not state {asked}; give "
-            f"{'it' if len(missing) == 1 else 'them'} with {mend}{better}"
+            f"{'it' if len(missing) == 1 else 'them'} with {remedy}{better}"
         )
-    if stage.modes:
+    if bound_model.modes:
         switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
     return settings
 
@@ -158,9 +160,9 @@ def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, .
     )
 
 
-def _of_origin(stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
+def _of_origin(bound_model: BoundModel, found: Found, parameters: ModelParameters) -> dict[str, float]:
     """Return numbers of the plane's origin; typical values until the first fix is known."""
-    start = stage.model.start
+    start = bound_model.model.start
     usual = start.parameters if start is not None else {}
     return {
         name: usual.get(name, 0.0) if found.origin is None else float(found.origin[ORIGIN.index(name)])
@@ -204,7 +206,9 @@ def _stating(found: Found) -> list[Topic]:
     return [*fallbacks, *control, found.prior, *sensors]
 
 
-def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
+def assumed_of(
+    label: str, bound_model: BoundModel, found: Found, parameters: ModelParameters
+) -> dict[str, float]:
     """Return the parameters that are assumed because a log without a prior does not state them.
 
     Args:
@@ -213,13 +217,13 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
         found: its topics.
         parameters: parameters given by the user.
     """
-    start = stage.model.start
+    start = bound_model.model.start
     if found.has_prior or start is None:
         return {}
-    names = number_fields(stage.model.parameters)
+    names = number_fields(bound_model.model.parameters)
     given = {name: getattr(parameters, name) for name in names}
-    read = set().union(*_needed(f"estimator {label}", stage, tuple(given.items())))
-    stating, model = _stating(found), stage.model
+    read = set().union(*_needed(f"estimator {label}", bound_model, tuple(given.items())))
+    stating, model = _stating(found), bound_model.model
     usual = {name: start.parameters.get(model.kind_of(name)) for name in names}
     return {
         name: number
@@ -234,18 +238,18 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
 
 @lru_cache(maxsize=64)
 def _needed(
-    where: str, stage: Stage, given: tuple[tuple[str, float | None], ...]
+    where: str, bound_model: BoundModel, given: tuple[tuple[str, float | None], ...]
 ) -> tuple[set[str], ...]:
     """Return the parameters that motion and sensors read; raise BadInput if declarations are wrong."""
-    model, values = stage.model, dict(given)
+    model, values = bound_model.model, dict(given)
     check_state(where, model)
     check_correction(where, model)
-    motion, *sensors = traced = [TracedParameters(values) for _ in range(1 + len(stage.sensors))]
-    for each in stage.modes or (stage.motion,):
+    motion, *sensors = traced = [TracedParameters(values) for _ in range(1 + len(bound_model.sensors))]
+    for each in bound_model.modes or (bound_model.motion,):
         check_motion(where, model, each, motion)
-    if stage.modes:
+    if bound_model.modes:
         check_switching(where, model, motion)
-    for sensor, parameters in zip(stage.sensors, sensors, strict=True):
+    for sensor, parameters in zip(bound_model.sensors, sensors, strict=True):
         check_sensor(where, model, sensor, parameters)
     return tuple(each.read for each in traced)
 
@@ -257,6 +261,6 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))
     if sensor.noise is not None:
         sensor.noise(parameters)
-    mend = "".join(f"; give --set {model.key_of(name)}=..." for name in sorted(parameters.read))
+    remedy = "".join(f"; give --set {model.key_of(name)}=..." for name in sorted(parameters.read))
     what = sensor.covariance if isinstance(sensor.covariance, str) else "its covariance"
-    return f"topic {topic}: {what} is missing{mend}"
+    return f"topic {topic}: {what} is missing{remedy}"

@@ -41,8 +41,8 @@ from fuselog.replay.inference.kalman.steps import (
 )
 from fuselog.replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 from fuselog.replay.inference.linear_algebra.manifold import boxplus
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.modes.mixing import MixtureMemory, likeliest_of, mixing, mixture_memory
 from fuselog.replay.inference.modes.mixture import MixtureFilter, Mixtures, UpdateMixture, mixture_update
 from fuselog.replay.inference.run.filtering import FilterState
@@ -102,7 +102,7 @@ class GaussianSumMemory(NamedTuple):
     factor: Floats
 
 
-def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
+def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> Steps:
     """Make the steps of a Gaussian sum with at most `members` filters.
 
     Args:
@@ -110,8 +110,8 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         inner: steps of the filter of one member.
         members: largest number of members.
     """
-    t = stage.model.tangent
-    to_common_tangent, mix = mixing(stage.model.kinds, inner.form)
+    t = bound_model.model.tangent
+    to_common_tangent, mix = mixing(bound_model.model.kinds, inner.form)
     to_covariance = inner.form.to_covariance
     predict_member = inner.predict
 
@@ -204,11 +204,12 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Samples, ...]) -> GaussianSumMemory:
-        mixture = mixture_memory(stage, members)
+        mixture = mixture_memory(bound_model, members)
         return GaussianSumMemory((inner.memory(sets),), mixture, np.empty((t, t)))
 
     updates = (
-        of_run(mixture_update(stage, number, update)) for number, update in enumerate(inner.updates)
+        of_run(mixture_update(bound_model, number, update))
+        for number, update in enumerate(inner.updates)
     )
     return inner._replace(memory=memory, predict=predict, updates=tuple(updates), estimate=estimate)
 
@@ -291,7 +292,7 @@ class GaussianSumFilter(MixtureFilter):
         for run in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))).tolist():
             prior = covariance[run].copy()
             self.form.to_covariance(prior)
-            weights, means, narrow = split(self.stage.model.kinds, mean[run], prior, members)
+            weights, means, narrow = split(self.bound_model.model.kinds, mean[run], prior, members)
             member = np.flatnonzero(weights)
             count = len(member)
             belief.mean[run, :count], belief.covariance[run] = means[member], self.form.start(narrow)
@@ -312,8 +313,8 @@ def _gaussian_sum(name: str, variant: str, members: int) -> Method:
     """Make the method that uses `members` filters of this name."""
     inner = filter_with(name, variant)
 
-    def steps(stage: Stage) -> Steps:
-        return gaussian_sum_steps(stage, inner.steps(stage), members)
+    def steps(bound_model: BoundModel) -> Steps:
+        return gaussian_sum_steps(bound_model, inner.steps(bound_model), members)
 
     lacks = partial(_lacks, inner=inner)
     return replace(GAUSSIAN_SUM, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)

@@ -41,10 +41,10 @@ from fuselog.replay.inference.kalman.steps import (
     UpdateRun,
 )
 from fuselog.replay.inference.linear_algebra.tuples import filling
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import reading_settings
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import switching_of
 from fuselog.replay.inference.modes.mixing import (
     InteractingMemory,
@@ -90,14 +90,14 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
 # Steps
 
 
-def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
+def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Steps:
     """Make the steps of an interacting multiple model filter whose modes have these filters.
 
     Args:
         stage: the bound model with all its modes and the sensors of the log.
         filters: steps of every mode's filter, in the order of the modes.
     """
-    model, switching = stage.model, stage.model.switching
+    model, switching = bound_model.model, bound_model.model.switching
     assert switching is not None
     modes = len(filters)
     form = filters[0].form
@@ -139,7 +139,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             transition=np.empty((modes, modes)),
             weights=np.empty((modes, modes)),
             predicted=np.empty(modes),
-            mixture=mixture_memory(stage, modes),
+            mixture=mixture_memory(bound_model, modes),
         )
 
     def of_run(update: UpdateMixture) -> UpdateRun:
@@ -157,7 +157,8 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         return update_run
 
     updates = tuple(
-        of_run(mixture_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
+        of_run(mixture_update(bound_model, number, update))
+        for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
     resumes_after_gap = all(each.resumes_after_gap for each in filters)
@@ -173,12 +174,12 @@ class InteractingFilter(MixtureFilter):
     @property
     def names(self) -> Sequence[str]:
         """Names of the modes."""
-        return tuple(self.stage.model.modes or ())
+        return tuple(self.bound_model.model.modes or ())
 
     @cached_property
     def chain(self) -> tuple[Floats, Floats]:
         """The rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
-        model = self.stage.model
+        model = self.bound_model.model
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
@@ -214,7 +215,7 @@ class InteractingFilter(MixtureFilter):
 
     def smoothed(self, modes: Ragged) -> Ragged:
         """Return the probabilities of all modes given all data."""
-        (rates, _), count = self.chain, len(self.stage.modes)
+        (rates, _), count = self.chain, len(self.bound_model.modes)
         time_ns, probability = modes.stream.publish_time_ns, modes["probability"].copy()
         arguments = (modes.offsets, time_ns, rates, probability)
         smoothing_over_runs(count)(modes.runs, *arguments, scratch=partial(smoothing_memory, count))
@@ -237,9 +238,9 @@ def _interacting(name: str, variant: str) -> Method:
     """Make the method that uses this filter for every mode."""
     inner = filter_with(name, variant)
 
-    def steps(stage: Stage) -> Steps:
-        stages = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
-        return interacting_steps(stage, [inner.steps(each) for each in stages])
+    def steps(bound_model: BoundModel) -> Steps:
+        bound_models = (bound_model._replace(motion=motion, modes=()) for motion in bound_model.modes)
+        return interacting_steps(bound_model, [inner.steps(each) for each in bound_models])
 
     lacks = partial(_lacks, inner=inner)
     return replace(INTERACTING, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)

@@ -17,7 +17,7 @@ from fuselog.replay.inference.linear_algebra.manifold import (
     tangent_size,
 )
 from fuselog.replay.inference.linear_algebra.tuples import total
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 TINY = 1e-280  # smaller probabilities lose digits
 LONGEST, TERMS = (
@@ -46,10 +46,14 @@ class MixtureMemory(NamedTuple):
     open_gate: Floats
 
 
-def mixture_memory(stage: Stage, count: int) -> MixtureMemory:
+def mixture_memory(bound_model: BoundModel, count: int) -> MixtureMemory:
     """Allocate memory for mixtures of `count` Gaussians."""
-    n, t, m = stage.model.size, stage.model.tangent, len(innovation_components(stage.sensors))
-    most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    n, t, m = (
+        bound_model.model.size,
+        bound_model.model.tangent,
+        len(innovation_components(bound_model.sensors)),
+    )
+    most = max((len(sensor.measured) for sensor in bound_model.sensors), default=0)
     records = InnovationRecord(np.empty((count, m)), np.empty((count, m, m)), np.empty((count, 3)))
     away, carried = np.empty((count, t)), np.empty((count, t, t))
     return MixtureMemory(np.empty(n), away, carried, np.empty(t), records, np.full(most + 1, np.inf))

@@ -22,7 +22,7 @@ from fuselog.replay.inference.kalman.steps import (
 from fuselog.replay.inference.kalman.update import innovation_components, writing_innovation
 from fuselog.replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
 from fuselog.replay.inference.linear_algebra.tuples import range_of
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.modes.mixing import MixtureMemory
 from fuselog.replay.inference.run.filtering import Filter
 from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
@@ -105,7 +105,7 @@ def predicting(filters: Sequence[Steps]) -> PredictModes:
     return predict
 
 
-def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateMixture:
+def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun) -> UpdateMixture:
     """Make the update of several Gaussians, and of the probabilities of their modes, by one sensor.
 
     It is called as `update(gaussians, (probability, log_probability), ...)` and works in place; see
@@ -119,10 +119,13 @@ def mixture_update(stage: Stage, number: int, update_mode: UpdateRun) -> UpdateM
         number: number of the sensor among these.
         update_mode: update of one Gaussian by this sensor; see `Steps.updates`.
     """
-    components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
+    components, measured = (
+        list(innovation_components(bound_model.sensors)),
+        bound_model.sensors[number].measured,
+    )
     places = tuple(components.index(name) for name in measured)
     angular = tuple(kind == "angle" for kind in measured.values())
-    m, write_innovation = len(measured), writing_innovation(stage, number)
+    m, write_innovation = len(measured), writing_innovation(bound_model, number)
 
     def blend(probability: Floats, memory: MixtureWork, record: InnovationRecord) -> float:
         """Record the innovation of the mixture of all modes, and return its NIS."""

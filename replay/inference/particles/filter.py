@@ -24,9 +24,9 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
 from fuselog.replay.inference.linear_algebra.manifold import boxplus
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model, Sensor
 from fuselog.replay.inference.model.settings import trial_parameters
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.particles.particles import (
     Cloud,
@@ -74,7 +74,9 @@ class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
         return self
 
 
-def particle_steps(stage: Stage, particles: int, resample_below: float, *, progressive: bool) -> Steps:
+def particle_steps(
+    bound_model: BoundModel, particles: int, resample_below: float, *, progressive: bool
+) -> Steps:
     """Make the steps of a bootstrap filter.
 
     Args:
@@ -83,7 +85,7 @@ def particle_steps(stage: Stage, particles: int, resample_below: float, *, progr
         resample_below: fraction of effective particles below which they are resampled.
         progressive: see `ParticleParameters`.
     """
-    model, motion, sensors = stage.model, stage.motion, stage.sensors
+    model, motion, sensors = bound_model.model, bound_model.motion, bound_model.sensors
     n, t = model.size, model.tangent
     by_control = model.controls if motion.control_noise else 0
     noises = by_control + (motion.noises or (t if motion.noise else 0))
@@ -103,13 +105,15 @@ def particle_steps(stage: Stage, particles: int, resample_below: float, *, progr
             likelihood=np.empty(particles),
             sensors=tuple(_sensor_memory(each, particles) for each in sensors)
             or (_sensor_memory(None, particles),),
-            work=workspace(stage),
+            work=workspace(bound_model),
             kernel=kernel_of(particles if progressive else 0, n, t),
         )
 
-    updates = tuple(weighing(stage, number, progressive=progressive) for number in range(len(sensors)))
+    updates = tuple(
+        weighing(bound_model, number, progressive=progressive) for number in range(len(sensors))
+    )
     renew = renewing(model) if progressive else resampling
-    return Steps(memory, moving(stage, by_control, renew), updates, summing_up(model))
+    return Steps(memory, moving(bound_model, by_control, renew), updates, summing_up(model))
 
 
 def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
@@ -135,7 +139,7 @@ class ParticleFilter(Filter):
         state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
-        t = self.stage.model.tangent
+        t = self.bound_model.model.tangent
         cloud = Cloud(
             prior,
             np.zeros((runs, particles, n)),
@@ -215,7 +219,7 @@ class ParticleFilter(Filter):
             cloud.key[run] = run_key(self.parameters.seed, map(np.asarray, first))
             cloud.counter[run] = 1
             if carried.failure[run] == ALL_WELL:
-                cloud.counter[run] = draw(self.stage.model, cloud, run)
+                cloud.counter[run] = draw(self.bound_model.model, cloud, run)
         return state._replace(carried=carried._replace(belief=cloud))
 
     def no_results(
@@ -224,13 +228,13 @@ class ParticleFilter(Filter):
         """Make arrays of estimates, with particles if requested, and of innovations to fill."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
-        states = np.empty((rows, particles, self.stage.model.size))
+        states = np.empty((rows, particles, self.bound_model.model.size))
         weight = np.empty((rows, particles))
         return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
     def output_streams(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
         """Make the streams of estimates, of the effective number and, if requested, of particles."""
-        model, (rows, particles) = self.stage.model, clouds.weight.shape
+        model, (rows, particles) = self.bound_model.model, clouds.weight.shape
         stem = f"/estimates/{self.name}"
         effective = make_stream(
             f"{stem}/effective",
@@ -277,8 +281,8 @@ def draw(model: Model, cloud: Cloud, run: int) -> int:
 
 @lru_cache(maxsize=64)
 def _of_so_many(particles: int, resample_below: float, progressive: bool) -> Method:
-    def steps(stage: Stage) -> Steps:
-        return particle_steps(stage, particles, resample_below, progressive=progressive)
+    def steps(bound_model: BoundModel) -> Steps:
+        return particle_steps(bound_model, particles, resample_below, progressive=progressive)
 
     return Method(**{**vars(BOOTSTRAP), "steps": steps, "made_for": None})
 

@@ -28,8 +28,8 @@ from fuselog.replay.inference.linear_algebra.moments import (
     weighted_mean_of,
 )
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.sampling.resampling import choose_systematically
 
 
@@ -177,7 +177,7 @@ class SpreadParticles(Protocol):
     ) -> bool: ...
 
 
-def moving(stage: Stage, by_control: int, renew: Renew) -> PredictRun:
+def moving(bound_model: BoundModel, by_control: int, renew: Renew) -> PredictRun:
     """Make the prediction, in which every particle moves with its own noise after any resampling.
 
     Args:
@@ -185,11 +185,11 @@ def moving(stage: Stage, by_control: int, renew: Renew) -> PredictRun:
         by_control: number of a particle's draws, at the start, that are errors of the control.
         renew: `renew(run, cloud, memory)` resamples and returns whether it succeeded.
     """
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     read_state, fill, add = tuple_of(model.size), filling(model.size), boxplus(model.kinds)
-    drive, move = _driving(stage), _moved(stage, by_control)
+    drive, move = _driving(bound_model), _moved(bound_model, by_control)
     is_additive = motion.noise is not None and not motion.noises
-    spread = _additive_noise(stage, by_control) if is_additive else _no_noise
+    spread = _additive_noise(bound_model, by_control) if is_additive else _no_noise
     scatter: Boxplus = add if is_additive else nothing
 
     def predict(run: int, cloud: Cloud, interval: Interval, memory: ParticleMemory) -> bool:
@@ -273,9 +273,9 @@ def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
     return power * best + np.log(mean) if best > -np.inf else np.nan
 
 
-def _driving(stage: Stage) -> Drive:
+def _driving(bound_model: BoundModel) -> Drive:
     """Make `drive(interval, drawn, memory)`, which returns a particle's control as a tuple."""
-    controls, variances = stage.model.controls, stage.motion.control_noise
+    controls, variances = bound_model.model.controls, bound_model.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
 
@@ -293,9 +293,13 @@ def _driving(stage: Stage) -> Drive:
     return with_error
 
 
-def _moved(stage: Stage, first: int) -> MoveParticle:
+def _moved(bound_model: BoundModel, first: int) -> MoveParticle:
     """Make `moved(state, driven, drawn, interval, memory)`, which returns a state after the motion."""
-    move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
+    move, variances, noises = (
+        bound_model.motion.move,
+        bound_model.motion.noise,
+        bound_model.motion.noises,
+    )
     if not noises:
 
         def without(
@@ -323,17 +327,17 @@ def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: Parti
     return True
 
 
-def _additive_noise(stage: Stage, first: int) -> SpreadParticles:
+def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
     """Make `spread(states, offsets, interval, memory)`, which draws the additive noise.
 
     The draws are tangent vectors at the states before they move. The noise is factored only if it
     differs from that of the previous particle. The function returns False if a covariance is not
     positive semidefinite.
     """
-    t, noise = stage.model.tangent, stage.motion.noise
+    t, noise = bound_model.model.tangent, bound_model.motion.noise
     assert noise is not None
-    read_state = tuple_of(stage.model.size)
-    add_noise = adding_noise(t, stage.motion.noise_block)
+    read_state = tuple_of(bound_model.model.size)
+    add_noise = adding_noise(t, bound_model.motion.noise_block)
     read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
     def factored(lower: Floats, variances: Numbers) -> bool:

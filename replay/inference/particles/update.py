@@ -32,7 +32,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 from fuselog.replay.inference.linear_algebra.inflation import inflation
 from fuselog.replay.inference.linear_algebra.linearization import Input, derivative
 from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory, reweigh
 from fuselog.replay.inference.particles.progressive import Likelihood, Look, Take, taking_in_parts
 
@@ -45,7 +45,7 @@ class CompareParticles(Protocol):
     ) -> None: ...
 
 
-def weighing(stage: Stage, number: int, *, progressive: bool) -> UpdateRun:
+def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> UpdateRun:
     """Make the update by sensor `number`, which weights particles by the likelihood of the measurement.
 
     The recorded innovation, its NIS and the gate use the first two moments of the cloud; the
@@ -57,13 +57,13 @@ def weighing(stage: Stage, number: int, *, progressive: bool) -> UpdateRun:
         number: number of the sensor among these.
         progressive: whether a measurement may be processed in parts.
     """
-    sensor = stage.sensors[number]
-    m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
-    compare, likelihood = _comparing(stage, number), _likelihood(stage, number)
+    sensor = bound_model.sensors[number]
+    m, write_innovation = len(sensor.measured), writing_innovation(bound_model, number)
+    compare, likelihood = _comparing(bound_model, number), _likelihood(bound_model, number)
     take = _at_once(likelihood)
     if progressive:
         look = _looking(compare, number) if sensor.log_likelihood is None else _as_before
-        take = taking_in_parts(stage.model, look, likelihood)
+        take = taking_in_parts(bound_model.model, look, likelihood)
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
 
     def update(
@@ -139,9 +139,9 @@ def _as_before(
     return kept
 
 
-def _comparing(stage: Stage, number: int) -> CompareParticles:
+def _comparing(bound_model: BoundModel, number: int) -> CompareParticles:
     """Make `compare(states, data, parameters, memory)`, which fills a sensor's differences and noise."""
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     measure, fill = sensor.measure, filling(len(sensor.measured))
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
     add_noise, subtract = sensor_noise(sensor), residual_of(sensor)
@@ -258,16 +258,16 @@ def factor_kept(own: SensorMemory, size: int) -> None:
         own.determinant[number] = 2.0 * np.log(determinant)
 
 
-def _likelihood(stage: Stage, number: int) -> Likelihood:
+def _likelihood(bound_model: BoundModel, number: int) -> Likelihood:
     """Make `likelihood(states, i, data, parameters, own, size)`: log p of a measurement at particle i.
 
     This is the model's own likelihood, or that of Gaussian noise; NaN if the particle does not predict
     the measurement.
     """
-    sensor = stage.sensors[number]
+    sensor = bound_model.sensors[number]
     if sensor.log_likelihood is None:
         return gaussian_likelihood
-    stated, read_state = sensor.log_likelihood, tuple_of(stage.model.size)
+    stated, read_state = sensor.log_likelihood, tuple_of(bound_model.model.size)
     _, read_measured, read_reference, _ = message_layout(sensor)
 
     def likelihood(

@@ -16,10 +16,10 @@ from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane
 from fuselog.replay.engine.streams.measurements import MeasuredVectors, read_fixes, read_vectors, unknown
 from fuselog.replay.inference.kalman.update import message_layout
 from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Control, Map, Sensor
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import complaint_of, reading_settings
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 from fuselog.replay.inference.run.timing import last_of_stamps, select_events, share_stamps, where_wanted
 
@@ -72,18 +72,18 @@ class Context(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def data_columns(stage: Stage) -> tuple[int, int]:
+def data_columns(bound_model: BoundModel) -> tuple[int, int]:
     """Return the number of columns of an event's data, and the first column of the control."""
     width, control = (
-        max((message_layout(sensor).width for sensor in stage.sensors), default=0),
-        stage.model.control,
+        max((message_layout(sensor).width for sensor in bound_model.sensors), default=0),
+        bound_model.model.control,
     )
     start = width if control is not None and control.interpolated else 0
-    return max(width, start + stage.model.controls), start
+    return max(width, start + bound_model.model.controls), start
 
 
 def events_of(
-    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+    bound_model: BoundModel, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
     """Return the result of `filter_events`, which may be known from an earlier replay of the block.
 
@@ -94,16 +94,16 @@ def events_of(
     read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
     origins = None if context.origins is None else context.origins.tobytes()
     noise = [
-        own_variances(stage, number, settings).tobytes()
-        for number, sensor in enumerate(stage.sensors)
+        own_variances(bound_model, number, settings).tobytes()
+        for number, sensor in enumerate(bound_model.sensors)
         if sensor.covariance
     ]
-    key = stage, drives, *read, *context.points.values(), origins, *noise
-    return block.once(key, lambda: filter_events(stage, found, block, context, settings))
+    key = bound_model, drives, *read, *context.points.values(), origins, *noise
+    return block.once(key, lambda: filter_events(bound_model, found, block, context, settings))
 
 
 def filter_events(
-    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+    bound_model: BoundModel, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
     """Convert a block's messages to events of the recursion.
 
@@ -117,8 +117,8 @@ def filter_events(
     Returns:
         The events, and which messages (n,) of the block are skipped because they lack a covariance.
     """
-    merged, control = block.events, stage.model.control
-    width, start = data_columns(stage)
+    merged, control = block.events, bound_model.model.control
+    width, start = data_columns(bound_model)
     uses: list[tuple[str, Table]] = []
     sampled: list[int] = []  # columns of samples, which do not hold until the next one
     if control is not None and found.control is not None:
@@ -134,7 +134,7 @@ def filter_events(
                 sampled += [columns[component] for component in each.components]
     for number, (_, topic) in enumerate(found.sensors):
         ragged = block.streams[topic.name]
-        uses.append((topic.name, sensor_table(stage, number, ragged, context, settings)))
+        uses.append((topic.name, sensor_table(bound_model, number, ragged, context, settings)))
     tables = dict(reversed(uses))  # the first use of every topic
     data, source, target, without_covariance = (
         column[0] if len(column) == 1 else np.concatenate(column).take(merged.source, axis=0)
@@ -154,7 +154,7 @@ def filter_events(
         events = events._replace(wants_estimate=last_of_stamps(events))
     if sampled and not events.arrival.shape[1]:
         events = share_stamps(events, sampled)
-    return events._replace(wants_estimate=where_wanted(stage, events)), without_covariance
+    return events._replace(wants_estimate=where_wanted(bound_model, events)), without_covariance
 
 
 class Table(NamedTuple):
@@ -212,7 +212,9 @@ def control_numbers(control: Control, ragged: Ragged) -> Floats:
     return _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
 
 
-def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
+def sensor_table(
+    bound_model: BoundModel, number: int, ragged: Ragged, context: Context, settings: Floats
+) -> Table:
     """Read the messages of a sensor: measurement, reference and covariance; see `update.message_layout`.
 
     Messages without a covariance, or with only NaN, are marked as not used.
@@ -226,7 +228,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
 
     Raises BadInput if a field has another width than the model declares.
     """
-    sensor, (width, _) = stage.sensors[number], data_columns(stage)
+    sensor, (width, _) = bound_model.sensors[number], data_columns(bound_model)
     m = len(sensor.measured)
     if ragged.stream.schema.full_name == GEODETIC:
         assert context.origins is not None
@@ -236,7 +238,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     without_covariance = np.zeros(len(stream), bool)
     if sensor.covariance:
         value, spread, without_covariance = with_covariance(sensor, ragged)
-        variances = own_variances(stage, number, settings)
+        variances = own_variances(bound_model, number, settings)
         if np.isfinite(variances).all():
             spread[without_covariance], without_covariance = (
                 np.diag(variances),
@@ -269,7 +271,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
-def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
+def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:
     """Compute the variances that a sensor assigns to messages without a covariance; NaN if it has none.
 
     Args:
@@ -277,8 +279,8 @@ def own_variances(stage: Stage, number: int, settings: Floats) -> Floats:
         number: number of the sensor among these.
         settings: (1 + sensors, fields); see `settings_of`.
     """
-    sensor = stage.sensors[number]
-    parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
+    sensor = bound_model.sensors[number]
+    parameters = reading_settings(number_fields(bound_model.model.parameters))(settings, number + 1)
     return np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
 
 
@@ -357,7 +359,7 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 
 
 def passed_over(
-    name: str, stage: Stage, found: Found, block: Block, without_covariance: Booleans
+    name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
     """Report messages that were skipped because they lack a covariance; empty if no topic can.
 
@@ -368,14 +370,14 @@ def passed_over(
         block: messages of these topics.
         without_covariance: whether each message (n,) lacks its covariance.
     """
-    control = stage.model.control
+    control = bound_model.model.control
     drops = control is not None and control.interpolated
-    drops |= any(sensor.covariance for sensor in stage.sensors)
+    drops |= any(sensor.covariance for sensor in bound_model.sensors)
     if not drops and not without_covariance.any():
         return []
     sensors = {topic.name: sensor for sensor, topic in found.sensors}
     reasons = [
-        complaint_of(stage.model, sensors[topic], topic)
+        complaint_of(bound_model.model, sensors[topic], topic)
         if topic in sensors
         else f"topic {topic}: the control is not finite"
         for topic in block.streams

@@ -32,13 +32,13 @@ from fuselog.replay.inference.kalman.steps import (
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.linear_algebra.covariances import Form
 from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.bound_model import BoundModel, title_of
 from fuselog.replay.inference.model.parameters import CombinedParameters, number_fields
 from fuselog.replay.inference.model.settings import (
     origin_parameters,
     placed_settings,
     reading_settings,
 )
-from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.events import (
     Context,
     data_columns,
@@ -102,21 +102,23 @@ class FilterState(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _steps(stage: Stage, method: Method) -> Steps:
-    return method.steps(stage)
+def _steps(bound_model: BoundModel, method: Method) -> Steps:
+    return method.steps(bound_model)
 
 
 @lru_cache(maxsize=64)
-def _compiled(stage: Stage, method: Method) -> tuple[OverRuns, Steps]:
+def _compiled(bound_model: BoundModel, method: Method) -> tuple[OverRuns, Steps]:
     """Make the loop over the runs, which is compiled when first called, and its steps."""
-    steps = _steps(stage, method)
-    names = number_fields(stage.model.parameters)
-    loop = recursion(stage, steps, reading_settings(names))
-    title = title_of(stage.model, method.summary)
+    steps = _steps(bound_model, method)
+    names = number_fields(bound_model.model.parameters)
+    loop = recursion(bound_model, steps, reading_settings(names))
+    title = title_of(bound_model.model, method.summary)
     return compile_over_runs(loop, title=title), steps
 
 
-def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) -> tuple[Sampler, ...]:
+def samplers_of(
+    bound_model: BoundModel, method: Method, parameters: CombinedParameters
+) -> tuple[Sampler, ...]:
     """Make a sampler for each sampled function.
 
     Args:
@@ -129,7 +131,7 @@ def samplers_of(stage: Stage, method: Method, parameters: CombinedParameters) ->
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)
-    return tuple(sampling.at(dimension) for dimension in _steps(stage, method).sampled)
+    return tuple(sampling.at(dimension) for dimension in _steps(bound_model, method).sampled)
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class Filter:
 
     name: str
     found: Found
-    stage: Stage
+    bound_model: BoundModel
     method: Method
     parameters: CombinedParameters
     settings: Floats
@@ -157,27 +159,27 @@ class Filter:
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
         """List the topics needed before the start: the prior, if the log has one, and the maps."""
-        maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
+        maps = (each.topic for sensor in self.bound_model.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """Make the state at every run's prior; runs with an invalid prior do not start."""
-        model = self.stage.model
+        model = self.bound_model.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
-        accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
+        accepted_ns = np.repeat(time_ns[:, None], len(self.bound_model.sensors), axis=1)
         belief = Gaussian(mean, self.form.start(covariance))
         carried = RecursionState(belief, control, time_ns, accepted_ns, started)
-        maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
+        maps = {each.topic: each for sensor in self.bound_model.sensors for each in sensor.maps}
         points = {
             topic: static[topic].findings.once(asked, partial(points_of, static[topic], asked))
             for topic, asked in maps.items()
         }
         waiting = None
         if model.control is not None and model.control.interpolated:  # control from the start on
-            runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
+            runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.bound_model)
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
         context = Context(points, self.origins(static, len(mean)))
         return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
@@ -185,7 +187,7 @@ class Filter:
     @cached_property
     def steps(self) -> Steps:
         """Steps of its loop."""
-        return _steps(self.stage, self.method)
+        return _steps(self.bound_model, self.method)
 
     @property
     def form(self) -> Form:
@@ -200,16 +202,16 @@ class Filter:
 
     def settings_of_runs(self, context: Context, runs: int) -> Floats:
         """Repeat the settings for each run (runs, 1 + sensors, fields); see `placed_settings`."""
-        names, of = number_fields(self.stage.model.parameters), (self.found, self.parameters)
+        names, of = number_fields(self.bound_model.model.parameters), (self.found, self.parameters)
         settings = self.settings if self.each_run is None else self.each_run
         return placed_settings(settings, names, *of, context.origins, runs)
 
     def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
         events, without_covariance = events_of(
-            self.stage, self.found, block, state.context, self.settings
+            self.bound_model, self.found, block, state.context, self.settings
         )
-        skipped = passed_over(self.name, self.stage, self.found, block, without_covariance)
+        skipped = passed_over(self.name, self.bound_model, self.found, block, without_covariance)
         state, events = self.ready(state, events, is_end=False)
         after, made = self.follow(state, events)
         return after, [*made, *self.gaps(events), *skipped]
@@ -223,22 +225,22 @@ class Filter:
             if state.unsettled is not None:
                 events = join_events(state.unsettled, events)
             delays = self.delays_ns
-            events, unsettled = compensate_delays(self.stage, events, delays, is_end=is_end)
+            events, unsettled = compensate_delays(self.bound_model, events, delays, is_end=is_end)
         if self.parameters.every_s is not None:
             every_ns = round(self.parameters.every_s * 1e9)
             events, next_output = add_output_times(events, state.carried.time_ns, next_output, every_ns)
         if state.waiting is not None:
             events = join_events(state.waiting, events)
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         if control is not None and control.interpolated:
             events, waiting = interpolate_control(events, len(control.components), self.gap_ns)
-            events = fill_control(self.stage, events)
+            events = fill_control(self.bound_model, events)
         after = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
         return after, events
 
     def gaps(self, events: FilterEvents) -> list[Ragged]:
         """Report the gaps of the control after which the filter continues."""
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         if control is None or not control.gap or not self.steps.resumes_after_gap:
             return []
         return [not_driven(self.name, control, self.found, events)]
@@ -257,45 +259,47 @@ class Filter:
             made += self.gaps(events)
         if state.waiting is None:
             return state, made
-        tail = fill_control(self.stage, hold_control(state.waiting, self.initial, self.gap_ns))
+        tail = fill_control(self.bound_model, hold_control(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
 
     @property
     def gap_ns(self) -> float:
         """Longest time without messages of an interpolated control."""
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         if control is None or not control.gap:
             return np.inf
-        names = number_fields(self.stage.model.parameters)
+        names = number_fields(self.bound_model.model.parameters)
         return 1e9 * float(self.settings[0, names.index(control.gap)])
 
     @cached_property
     def delays_ns(self) -> Integers:
         """Delays of messages; see `delays_of`."""
-        return delays_of(self.stage, self.settings)
+        return delays_of(self.bound_model, self.settings)
 
     @property
     def initial(self) -> tuple[float, ...]:
         """Control before its first message."""
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     @cached_property
     def beside_settings(self) -> Hashable:
         """All that defines the filter except settings that only the loop over the runs reads."""
-        names = {*number_fields(self.stage.model.parameters)} - {"gate_probability"} | {"of_topics"}
+        names = {*number_fields(self.bound_model.model.parameters)} - {"gate_probability"} | {
+            "of_topics"
+        }
         return (
             self.name,
-            self.stage,
+            self.bound_model,
             self.method,
             repr({name: value for name, value in self.parameters if name not in names}),
             origin_parameters(self.found, self.parameters),
             self.delays_ns.tobytes(),
             self.gap_ns,
             *(
-                own_variances(self.stage, number, self.settings).tobytes()
-                for number, sensor in enumerate(self.stage.sensors)
+                own_variances(self.bound_model, number, self.settings).tobytes()
+                for number, sensor in enumerate(self.bound_model.sensors)
                 if sensor.covariance
             ),
         )
@@ -303,7 +307,7 @@ class Filter:
     @property
     def why_in_sequence(self) -> str:
         """Reason why the filter needs its messages in order; empty if it can reprocess late ones."""
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         if self.parameters.every_s is not None:
             return "it does not support estimates between messages (every_s, --every)"
         if control is not None and control.interpolated:
@@ -324,9 +328,9 @@ class Filter:
         self, state: FilterState, events: FilterEvents
     ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
         """Filter events; return the state after them, estimates, their offsets, and other outputs."""
-        sensors = self.stage.sensors
+        sensors = self.bound_model.sensors
         with done_once():
-            loop, _ = _compiled(self.stage, self.method)
+            loop, _ = _compiled(self.bound_model, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(events.wants_estimate, events.offsets)
@@ -381,7 +385,7 @@ class Filter:
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[EstimatesToFill, InnovationRows]:
         """Make arrays of estimates and innovations to fill; see `recursion.no_results`."""
-        return no_results(due, recorded, self.stage.model, innovation_size)
+        return no_results(due, recorded, self.bound_model.model, innovation_size)
 
     @cached_property
     def gates(self) -> Floats:
@@ -389,9 +393,9 @@ class Filter:
 
         The last row is that of an open gate.
         """
-        largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
+        largest = max((len(sensor.measured) for sensor in self.bound_model.sensors), default=0)
         bounds = _nis_bounds(self.parameters.gate_probability, largest)
-        gates = np.repeat(bounds[None], len(self.stage.sensors) + 1, axis=0)
+        gates = np.repeat(bounds[None], len(self.bound_model.sensors) + 1, axis=0)
         gates[-1] = np.inf
         return gates
 
@@ -406,7 +410,7 @@ class Filter:
 
     def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
         """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
-        model, (_, time_ns, mean, covariance) = self.stage.model, estimates
+        model, (_, time_ns, mean, covariance) = self.bound_model.model, estimates
         columns = {
             "sensor_time_ns": time_ns,
             "mean": wrapped(mean, model.state),
@@ -419,12 +423,12 @@ class Filter:
     @cached_property
     def state_metadata(self) -> Mapping[str, str]:
         """Metadata of the channel of the states."""
-        return {**named(self.stage.model.state), "truth": self.truth, **in_frame(self.found.frame)}
+        return {**named(self.bound_model.model.state), "truth": self.truth, **in_frame(self.found.frame)}
 
     @cached_property
     def measured(self) -> Mapping[str, str]:
         """Names and kinds of the components of all innovations."""
-        return innovation_components(self.stage.sensors)
+        return innovation_components(self.bound_model.sensors)
 
     def innovations(self, innovations: InnovationRows, offsets: Integers) -> Ragged:
         """Make the stream of innovations, for a filter with sensors; see `states`."""

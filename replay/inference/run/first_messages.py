@@ -11,7 +11,7 @@ from fuselog.replay.engine.streams.blocks import Ragged, ragged_rows, run_of_row
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.vectors.components import Components
 from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.start import Start
 
 WIDER = 30.0  # times a message's standard deviation: such a prior has a thousandth of its weight
@@ -56,7 +56,7 @@ def unknown(state: Components, start: Start | None) -> tuple[Floats, Floats]:
     return mean, np.array([sigmas.get(name, np.nan) for name in names])
 
 
-def state_by_message(stage: Stage, number: int, data: Floats) -> tuple[Floats, Floats]:
+def state_by_message(bound_model: BoundModel, number: int, data: Floats) -> tuple[Floats, Floats]:
     """Compute the mean (n,) and the much larger sigmas (t,) of a state that one message measures.
 
     Args:
@@ -64,7 +64,7 @@ def state_by_message(stage: Stage, number: int, data: Floats) -> tuple[Floats, F
         number: number of the sensor.
         data: measurement and noise of the message, as a row of `sensor_table`.
     """
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     mean, sigma = unknown(model.state, model.start)
     components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
     size = len(sensor.measured)

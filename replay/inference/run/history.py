@@ -7,7 +7,7 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Booleans, Columns, Floats, Integers
 from fuselog.replay.inference.kalman.update import innovation_components
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.run.events import data_columns
 from fuselog.replay.inference.run.recursion import (
     NOTHING,
@@ -93,7 +93,7 @@ class History(NamedTuple):
         )
 
 
-def no_history(stage: Stage, carried: RecursionState) -> History:
+def no_history(bound_model: BoundModel, carried: RecursionState) -> History:
     """Make a history that contains only the priors.
 
     Args:
@@ -102,8 +102,8 @@ def no_history(stage: Stage, carried: RecursionState) -> History:
     """
     runs, innovation_size, (width, _) = (
         len(carried.time_ns),
-        len(innovation_components(stage.sensors)),
-        data_columns(stage),
+        len(innovation_components(bound_model.sensors)),
+        data_columns(bound_model),
     )
     kept = KeptMessages(
         np.full(runs, BEFORE_ALL_NS),

@@ -21,10 +21,10 @@ from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, merge_ev
 from fuselog.replay.engine.streams.geodetic import in_plane, origins_of
 from fuselog.replay.engine.streams.results import gaussian_stream, named
 from fuselog.replay.inference.model.binding import Found, measures_state
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Sensor
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import complaint_of, reading_settings
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.broad_start import Reference, broad_priors
 from fuselog.replay.inference.run.events import Context, data_columns, filter_events, sensor_table
 from fuselog.replay.inference.run.first_messages import (
@@ -60,7 +60,7 @@ class Initializer:
 
     name: str
     found: Found
-    stage: Stage
+    bound_model: BoundModel
     settings: Floats
     assumed: Mapping[str, float]
 
@@ -71,14 +71,14 @@ class Initializer:
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        is_free = not self.found.has_prior and not self.stage.model.finds_start and self._measuring
+        is_free = not self.found.has_prior and not self.bound_model.model.finds_start and self._measuring
         return (
             Initialization(topics, self.find, self.find_broad if is_free else None) if topics else None
         )
 
     @property
     def _prior_check(self) -> Callable[[Mapping[str, Stream], Settings], list[str]] | None:
-        start = self.stage.model.start
+        start = self.bound_model.model.start
         return start.check_prior if start is not None else None
 
     @cached_property
@@ -87,7 +87,7 @@ class Initializer:
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
-            if measures_state(self.stage.model, sensor)
+            if measures_state(self.bound_model.model, sensor)
         ]
 
     @property
@@ -95,7 +95,7 @@ class Initializer:
         """The topics whose first message determines the start."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.fallbacks)]
-        if self.stage.model.finds_start:
+        if self.bound_model.model.finds_start:
             return [*drives, *(topic for _, topic in self.found.sensors)]
         needs_drives = self._aligns or not self._measuring
         return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
@@ -103,7 +103,7 @@ class Initializer:
     @property
     def _aligns(self) -> bool:
         """Whether fixes must determine the whole state, and can."""
-        model = self.stage.model
+        model = self.bound_model.model
         kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
         can_align = bool(model.start and model.start.align)
         return can_align and len(kinds) == 1 and max(kinds.values()) < model.size
@@ -162,14 +162,16 @@ class Initializer:
             for count in (HEAD, None):
                 whole = first[topic.name]
                 ragged = whole if count is None else heads_of_runs(whole, count)
-                table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
+                table = sensor_table(
+                    self.bound_model, number, ragged, Context({}, origins), self.settings
+                )
                 _when, has_message, rows = first_of_runs(ragged, clock, table.source >= 0)
                 if (has_message | (np.diff(whole.offsets) == 0)).all():
                     break
             for run in np.flatnonzero(has_message):
-                state = state_by_message(self.stage, number, table.data[rows[run]])
+                state = state_by_message(self.bound_model, number, table.data[rows[run]])
                 references[run].append((sensor.measured, *state))
-        priors = broad_priors(self.stage.model, self.found.prior.name, times_ns, references)
+        priors = broad_priors(self.bound_model.model, self.found.prior.name, times_ns, references)
         has_one = np.ones(runs, np.bool_)
         return [Initialized({**begun, prior.topic: of_runs(prior, has_one)}, []) for prior in priors]
 
@@ -181,7 +183,7 @@ class Initializer:
         origins: Floats | None,
     ) -> tuple[Ragged, list["Fact"]]:
         """Make the priors of all runs, and the facts to report about them."""
-        model, runs = self.stage.model, run_count(first)
+        model, runs = self.bound_model.model, run_count(first)
         mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
@@ -213,7 +215,7 @@ class Initializer:
         """Report which components the fixes did not determine, for runs that start without alignment."""
         _, sensor, _ = self._measuring[0]
         measured = sensor.measured
-        names = ", ".join(name for name in self.stage.model.state if name not in measured)
+        names = ", ".join(name for name in self.bound_model.model.state if name not in measured)
         text = (
             f"{names}: unknown at the start, since the path between the first fixes does not determine "
             "it with these noise densities; state the densities of your sensors, or give a prior"
@@ -222,7 +224,7 @@ class Initializer:
 
     def _assumption(self, name: str, number: float) -> str:
         """Describe an assumed parameter, with its meaning if the model gives one."""
-        meaning = meanings(self.stage.model.parameters).get(name, "")
+        meaning = meanings(self.bound_model.model.parameters).get(name, "")
         sentence = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{sentence} ({meaning.rstrip('.')})" if meaning else sentence
 
@@ -253,7 +255,7 @@ class Initializer:
         begun: "Begun",
     ) -> list["Fact"]:
         """Start all runs at the states that the model finds; raise BadInput if it finds none."""
-        model = self.stage.model
+        model = self.bound_model.model
         assert model.start is not None
         assert model.start.find is not None
         given, parameters = self._given(first, static, origins)
@@ -277,7 +279,7 @@ class Initializer:
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Settings]:
         """Return first messages and maps, by the model's names of their topics, and the parameters."""
-        model, control = self.stage.model, self.found.control
+        model, control = self.bound_model.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
             given[model.control.topic] = first[control.name]
@@ -315,11 +317,13 @@ class Initializer:
         chosen = np.full(len(begun.time_ns), -1)
         for number, _, topic in self._measuring:
             ragged = first[topic.name]
-            table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
+            table = sensor_table(self.bound_model, number, ragged, Context({}, origins), self.settings)
             found_ns, has_one, rows = first_of_runs(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
-                begun.mean[run], sigma = state_by_message(self.stage, number, table.data[rows[run]])
+                begun.mean[run], sigma = state_by_message(
+                    self.bound_model, number, table.data[rows[run]]
+                )
                 begun.covariance[run] = sigma**2 * np.eye(len(sigma))
         if (chosen < 0).all():
             raise BadInput(
@@ -345,19 +349,19 @@ class Initializer:
         numbers = [number for number, _, _ in self._measuring[:1]]
         sensors = tuple(self.found.sensors[number] for number in numbers)
         found = self.found._replace(sensors=sensors)
-        stage = self.stage._replace(sensors=tuple(sensor for sensor, _ in sensors))
+        bound_model = self.bound_model._replace(sensors=tuple(sensor for sensor, _ in sensors))
         settings = self.settings[[0, *(1 + number for number in numbers)]]
         others = {topic.name for _, _, topic in self._measuring[1:]}
         names = [topic.name for topic in self._starting if topic.name not in others]
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
-        events, _ = filter_events(stage, found, block, Context({}, origins), settings)
-        delays_ns = delays_of(stage, settings)
+        events, _ = filter_events(bound_model, found, block, Context({}, origins), settings)
+        delays_ns = delays_of(bound_model, settings)
         if delays_ns.any():
-            events, _ = compensate_delays(stage, events, delays_ns, is_end=True)
+            events, _ = compensate_delays(bound_model, events, delays_ns, is_end=True)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
-            solved = self._align(events, run, stage)
+            solved = self._align(events, run, bound_model)
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
@@ -367,9 +371,11 @@ class Initializer:
             is_aligned,
         )
 
-    def _align(self, events: FilterEvents, run: int, stage: Stage) -> tuple[int, Floats, Floats] | None:
+    def _align(
+        self, events: FilterEvents, run: int, bound_model: BoundModel
+    ) -> tuple[int, Floats, Floats] | None:
         """Align a run: return stamp, mean and covariance at one of its first fixes, or None."""
-        model = stage.model
+        model = bound_model.model
         assert model.start is not None
         assert model.start.align is not None
         parameters = self._parameters()
@@ -378,7 +384,7 @@ class Initializer:
         places: list[Floats] = []
         spreads: list[Floats] = []
         begin, end = events.offsets[run : run + 2]
-        _, first = data_columns(stage)
+        _, first = data_columns(bound_model)
         before_ns, first_ns = 0, None
         for event in range(begin, end):
             time_ns, source = int(events.time_ns[event]), events.source[event]
@@ -390,7 +396,7 @@ class Initializer:
                 own = data[first : first + len(control)]
                 control = np.where(np.isnan(own), control, own)
             elif source >= 0:
-                size = len(stage.sensors[source].measured)
+                size = len(bound_model.sensors[source].measured)
                 lower = np.zeros((size, size))
                 lower[np.tril_indices(size)] = data[size : size + size * (size + 1) // 2]
                 first_ns = time_ns if first_ns is None else first_ns
@@ -405,7 +411,7 @@ class Initializer:
 
     def _parameters(self) -> Settings:
         """Return the parameters; parameters of topics are those of the first topic of each sensor."""
-        model = self.stage.model
+        model = self.bound_model.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
         for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):
             for field, (owner, name) in model.owned.items():
@@ -415,7 +421,8 @@ class Initializer:
 
     def _complaints(self) -> str:
         complaints = [
-            complaint_of(self.stage.model, sensor, topic.name) for _, sensor, topic in self._measuring
+            complaint_of(self.bound_model.model, sensor, topic.name)
+            for _, sensor, topic in self._measuring
         ]
         return "; ".join(complaints)
 

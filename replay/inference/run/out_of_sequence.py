@@ -21,10 +21,10 @@ from fuselog.replay.engine.streams.results import ALL_WELL, failures_of
 from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.kalman.steps import FAILURES, CoreMemory, EstimateRun, Steps
 from fuselog.replay.inference.kalman.update import innovation_components
+from fuselog.replay.inference.model.bound_model import BoundModel, title_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import reading_settings
-from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.events import filter_events, passed_over
 from fuselog.replay.inference.run.history import (
     History,
@@ -74,11 +74,13 @@ class LateState(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[OverRuns, Steps]:
-    steps = method.steps(stage)
-    reads = reading_settings(number_fields(stage.model.parameters))
-    loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
-    title = f"{title_of(stage.model, method.summary)}, which reprocesses late messages"
+def _compiled(bound_model: BoundModel, method: Method, structure: Structure) -> tuple[OverRuns, Steps]:
+    steps = method.steps(bound_model)
+    reads = reading_settings(number_fields(bound_model.model.parameters))
+    loop = reprocessing(
+        bound_model.model, processing(bound_model, steps, reads), steps.estimate, structure
+    )
+    title = f"{title_of(bound_model.model, method.summary)}, which reprocesses late messages"
     return compile_over_runs(loop, title=title), steps
 
 
@@ -235,13 +237,13 @@ class OutOfSequenceFilter:
     def start(self, static: Mapping[str, Ragged]) -> AnyFilterState:
         """Make the state at every run's prior."""
         state = self.inner.start(static)
-        return state._replace(kept=no_history(self.inner.stage, state.carried))
+        return state._replace(kept=no_history(self.inner.bound_model, state.carried))
 
     def run(self, state: AnyFilterState, block: Block) -> tuple[AnyFilterState, list[Ragged]]:
         """Filter a block with its messages in order of arrival."""
-        inner, sensors = self.inner, self.inner.stage.sensors
+        inner, sensors = self.inner, self.inner.bound_model.sensors
         events, without_covariance = filter_events(
-            inner.stage, inner.found, block, state.context, inner.settings
+            inner.bound_model, inner.found, block, state.context, inner.settings
         )
         carried, before = copied(state.carried), state.kept
         history = before.with_room(2 * (most_within(before, events, self.window_ns) + 3))
@@ -253,7 +255,7 @@ class OutOfSequenceFilter:
         recorded = ragged_rows(events.source >= 0, events.offsets) + history.offsets
         estimates, innovations = inner.no_results(due, recorded, len(innovation_components(sensors)))
         repeated = np.zeros(len(wants_estimate), np.int64)
-        loop, steps = _compiled(inner.stage, inner.method, structure_of(history.kept))
+        loop, steps = _compiled(inner.bound_model, inner.method, structure_of(history.kept))
         sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
@@ -270,7 +272,7 @@ class OutOfSequenceFilter:
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        skipped = passed_over(inner.name, inner.stage, inner.found, block, without_covariance)
+        skipped = passed_over(inner.name, inner.bound_model, inner.found, block, without_covariance)
         made += [rewound(inner.name, events, repeated), *skipped]
         return state._replace(carried=carried, kept=history), made
 
@@ -279,7 +281,7 @@ class OutOfSequenceFilter:
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
-        if not self.inner.stage.sensors:
+        if not self.inner.bound_model.sensors:
             return []
         kept = history.kept
         columns: Columns = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers

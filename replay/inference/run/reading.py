@@ -10,18 +10,18 @@ from fuselog.replay.engine.replaying.estimator import Reading
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
 from fuselog.replay.inference.model.binding import Found
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.functions import ModelFunction, OfParameters
 from fuselog.replay.inference.model.model import Control, Sensor
 from fuselog.replay.inference.model.parameters import number_fields, settings_type
 from fuselog.replay.inference.model.settings import TracedParameters, reading_settings
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
 
 STEP = 1e-3  # change of parameters and controls by which their effects are compared
 
 
-def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
+def reading_of(bound_model: BoundModel, found: Found, settings: Floats) -> Reading:
     """Describe what an estimator reads.
 
     Args:
@@ -29,7 +29,7 @@ def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
         found: its topics.
         settings: (1 + sensors, fields), numbers of motion and sensors.
     """
-    model = stage.model
+    model = bound_model.model
     drives: dict[str, Control] = {}
     if model.control is not None and found.control is not None:
         drives[found.control.name] = model.control
@@ -53,20 +53,20 @@ def reading_of(stage: Stage, found: Found, settings: Floats) -> Reading:
             read = np.where([name in replaced for name in control.components], 0.0, read)
         return read
 
-    biases, factors = _own_errors(stage, found)
+    biases, factors = _own_errors(bound_model, found)
     key = model.key_of
     return Reading(
         tuple(drives),
         kinds,
         {topic: tuple(name for each in own for name in each.measured) for topic, own in sensors.items()},
         numbers,
-        {key(name): topic for name, topic in _noises(stage, found).items()},
-        {key(name): each for name, each in _augmentable(stage, found).items()},
+        {key(name): topic for name, topic in _noises(bound_model, found).items()},
+        {key(name): each for name, each in _augmentable(bound_model, found).items()},
         {place: key(name) for place, name in biases.items()},
         {place: key(name) for place, name in factors.items()},
         {topic.name: key(sensor.delay) for sensor, topic in found.sensors if sensor.delay},
-        {key(name): sigma for name, sigma in _calibration(stage, found).items()},
-        partial(_control_noise, stage, found, settings),
+        {key(name): sigma for name, sigma in _calibration(bound_model, found).items()},
+        partial(_control_noise, bound_model, found, settings),
     )
 
 
@@ -82,13 +82,13 @@ def _measured(sensor: Sensor, stream: Stream) -> Floats:
     )
 
 
-def _noises(stage: Stage, found: Found) -> dict[str, str]:
+def _noises(bound_model: BoundModel, found: Found) -> dict[str, str]:
     """Return the parameters that are standard deviations, with the topics of their sensors or ""."""
-    model = stage.model
+    model = bound_model.model
     names = number_fields(model.parameters)
     state = trial_state(model.kinds)
     of_motion: list[OfParameters] = []
-    for motion in stage.modes or (stage.motion,):
+    for motion in bound_model.modes or (bound_model.motion,):
         given = (noise for noise in (motion.noise, motion.gap_noise) if noise is not None)
         of_motion += [partial(noise, state, 1.0) for noise in given]
         if motion.control_noise is not None:
@@ -115,26 +115,26 @@ def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
     return found
 
 
-def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
+def _augmentable(bound_model: BoundModel, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Return the parameters that can be estimated, with their kinds and the topics that read them."""
-    readers = _readers(stage, found)
+    readers = _readers(bound_model, found)
     by_name = {
         name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
-        for name, kind in stage.model.augmentable.items()
+        for name, kind in bound_model.model.augmentable.items()
     }
     return {name: (kind, topics) for name, (kind, topics) in by_name.items() if topics}
 
 
-def _calibration(stage: Stage, found: Found) -> dict[str, float]:
+def _calibration(bound_model: BoundModel, found: Found) -> dict[str, float]:
     """Return the calibration parameters that are read here, with their useful standard deviations."""
-    used = set().union(*(read for _, read in _readers(stage, found)))
+    used = set().union(*(read for _, read in _readers(bound_model, found)))
     used |= {sensor.delay for sensor, _ in found.sensors}
-    return {name: sigma for name, sigma in stage.model.calibration.items() if name in used}
+    return {name: sigma for name, sigma in bound_model.model.calibration.items() if name in used}
 
 
-def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
+def _readers(bound_model: BoundModel, found: Found) -> list[tuple[str, set[str]]]:
     """List the parameters that the motion (under "") and each sensor (under its topic) read."""
-    model = stage.model
+    model = bound_model.model
     names = number_fields(model.parameters)
     state, control = trial_state(model.kinds), (0.0,) * model.controls
     readers: list[tuple[str, set[str]]] = []
@@ -145,7 +145,7 @@ def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
             function(*arguments, traced)
         readers.append((topic, traced.read))
 
-    for motion in stage.modes or (stage.motion,):
+    for motion in bound_model.modes or (bound_model.motion,):
         entering = ((0.0,) * motion.noises,) if motion.noises else ()
         note("", motion.move, state, control, *entering, 1.0)
     for sensor, topic in found.sensors:
@@ -155,25 +155,25 @@ def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
 
 
 def _own_errors(
-    stage: Stage, found: Found
+    bound_model: BoundModel, found: Found
 ) -> tuple[dict[tuple[str, int], str], dict[tuple[str, int], str]]:
     """Find parameters that act as biases or factors of controls, or as biases of measurements."""
-    model = stage.model
+    model = bound_model.model
     kind = settings_type(number_fields(model.parameters))
     ones = kind(*(1.0,) * len(kind._fields))
     state = trial_state(model.kinds)
     biases: dict[tuple[str, int], str] = {}
     factors: dict[tuple[str, int], str] = {}
     control: Floats = 1.7 + np.arange(model.controls, dtype=np.float64)
-    entering = ((0.0,) * stage.motion.noises,) if stage.motion.noises else ()
+    entering = ((0.0,) * bound_model.motion.noises,) if bound_model.motion.noises else ()
 
     def moved(driven: Floats, parameters: Settings) -> Floats:
-        return np.array(stage.motion.move(state, tuple(driven), *entering, 0.5, parameters), float)
+        return np.array(bound_model.motion.move(state, tuple(driven), *entering, 0.5, parameters), float)
 
     with np.errstate(all="ignore"):
         for name in model.augmentable:
             more = ones._replace(**{name: 1.0 + STEP})
-            for place, of_topic in enumerate(_driving(stage, found)):
+            for place, of_topic in enumerate(_driving(bound_model, found)):
                 unit: Floats = STEP * np.eye(model.controls)[place]
                 by_parameter = moved(control, more)
                 if np.array_equal(by_parameter, moved(control, ones)):
@@ -203,19 +203,21 @@ def _own_errors(
 
 
 def _control_noise(
-    stage: Stage, found: Found, settings: Floats, step_s: float
+    bound_model: BoundModel, found: Found, settings: Floats, step_s: float
 ) -> dict[tuple[str, int], float]:
     """Return the variances of the control's components, for messages that hold for `step_s`."""
-    variances = stage.motion.control_noise
+    variances = bound_model.motion.control_noise
     if variances is None:
         return {}
-    parameters = reading_settings(number_fields(stage.model.parameters))(settings, 0)
-    return dict(zip(_driving(stage, found), map(float, variances(step_s, parameters)), strict=True))
+    parameters = reading_settings(number_fields(bound_model.model.parameters))(settings, 0)
+    return dict(
+        zip(_driving(bound_model, found), map(float, variances(step_s, parameters)), strict=True)
+    )
 
 
-def _driving(stage: Stage, found: Found) -> list[tuple[str, int]]:
+def _driving(bound_model: BoundModel, found: Found) -> list[tuple[str, int]]:
     """List the topic, and the index in its messages, of each component of the control."""
-    control = stage.model.control
+    control = bound_model.model.control
     if control is None or found.control is None:
         return []
     replacing = {

@@ -35,9 +35,9 @@ from fuselog.replay.inference.kalman.steps import (
     Steps,
 )
 from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.settings import ReadSettings
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.loops import Follow, over_events
 
 CONTROL = -1  # source of an event; sensors count from zero, and NOTHING is only a time
@@ -246,7 +246,7 @@ class WriteEstimate(Protocol):
     ) -> int: ...
 
 
-def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> ProcessEvent:
+def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> ProcessEvent:
     """Make the function that processes one event of a run; see `recursion`.
 
     Args:
@@ -259,10 +259,10 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
     """
     predict = steps.predict
     updates = steps.updates
-    interpolated = stage.model.control is not None and stage.model.control.interpolated
-    has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
+    interpolated = bound_model.model.control is not None and bound_model.model.control.interpolated
+    has_gaps = bound_model.model.control is not None and bool(bound_model.model.control.gap)
     resumes_after_gap = steps.resumes_after_gap
-    controls = stage.model.controls
+    controls = bound_model.model.controls
 
     def drive(run: int, data: Floats, carried: RecursionState) -> None:
         """Set the control to that of an event; an interpolated control is at the end of its data."""
@@ -339,7 +339,7 @@ def processing(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Process
     return process
 
 
-def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
+def recursion(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> Follow:
     """Make the loop over events, for `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     Args:
@@ -367,7 +367,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: ReadSettings) -> Follow:
             return write(run, run, time_ns, carried.belief, results.estimates, memory)
         return ALL_WELL
 
-    return over_events(processing(stage, steps, settings_of), record)
+    return over_events(processing(bound_model, steps, settings_of), record)
 
 
 def writing_estimates(estimate: EstimateRun) -> WriteEstimate:

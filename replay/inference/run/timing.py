@@ -7,17 +7,17 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Booleans, Columns, Floats, Integers
 from fuselog.replay.engine.streams.blocks import last_of_equals, ragged_rows, run_of_rows
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.parameters import number_fields
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 
 EARLY = 1000  # output times: a prior that is older than this is taken to be from another time
 
 
-def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
+def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
     """Return which events (n,) request an estimate: those of the control alone may not."""
-    control = stage.model.control
-    if control is None or control.estimates or not stage.sensors:
+    control = bound_model.model.control
+    if control is None or control.estimates or not bound_model.sensors:
         return events.wants_estimate
     return at_stamps_of(events.wants_estimate, events.source != CONTROL)
 
@@ -35,7 +35,7 @@ def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
     return is_last & has_one[stamp]
 
 
-def delays_of(stage: Stage, settings: Floats) -> Integers:
+def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
     """Compute the delays of stamps after the measurement, in ns, by source of an event.
 
     Args:
@@ -45,15 +45,15 @@ def delays_of(stage: Stage, settings: Floats) -> Integers:
     Returns:
         (sensors + 2,) delays of the sensors, then 0 for NOTHING, then that of the CONTROL.
     """
-    names, control = number_fields(stage.model.parameters), stage.model.control
-    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
+    names, control = number_fields(bound_model.model.parameters), bound_model.model.control
+    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(bound_model.sensors)]
     asked += [(0, ""), (0, control.delay if control else "")]
     delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
     return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
 
 
 def compensate_delays(
-    stage: Stage, events: FilterEvents, delays_ns: Integers, *, is_end: bool
+    bound_model: BoundModel, events: FilterEvents, delays_ns: Integers, *, is_end: bool
 ) -> tuple[FilterEvents, FilterEvents]:
     """Move events to the times of measurement, in order; return them and the events that must wait.
 
@@ -76,7 +76,7 @@ def compensate_delays(
     columns: Columns = (column.take(order, axis=0) for column in measured[1:])
     measured = FilterEvents(measured.offsets, *columns)
     measured = measured._replace(wants_estimate=last_of_stamps(measured))
-    return measured._replace(wants_estimate=where_wanted(stage, measured)), waiting
+    return measured._replace(wants_estimate=where_wanted(bound_model, measured)), waiting
 
 
 def last_of_stamps(events: FilterEvents) -> Booleans:
@@ -186,10 +186,10 @@ def interpolate_control(
     return select_events(events._replace(data=data), ready), select_events(again, waiting)
 
 
-def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
+def fill_control(bound_model: BoundModel, events: FilterEvents) -> FilterEvents:
     """Copy the interpolated control to the events of sensors that read it."""
     data = events.data.copy()
-    for number, sensor in enumerate(stage.sensors):
+    for number, sensor in enumerate(bound_model.sensors):
         if sensor.control is not None:
             rows, controls = events.source == number, len(sensor.control.components)
             begin = len(sensor.measured) + sensor.control_start

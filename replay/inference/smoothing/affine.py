@@ -44,7 +44,7 @@ from fuselog.replay.inference.linear_algebra.manifold import (
     is_flat,
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.smoothing.backward_pass import (
     Chain,
     ForwardMemory,
@@ -106,11 +106,13 @@ class Trajectory(NamedTuple):
     column: Floats
 
 
-def affine_steps(stage: Stage) -> Steps:
+def affine_steps(bound_model: BoundModel) -> Steps:
     """Make the steps of the affine filter about a `Trajectory`, which is the only set of `memory`."""
-    sensors = tuple(affine_sensor(stage, number) for number in range(len(stage.sensors)))
-    steps = gaussian_filter(stage, affine_motion(stage), sensors, partial(workspace, stage))
-    chained = smoothing_steps(stage, steps)
+    sensors = tuple(affine_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
+    steps = gaussian_filter(
+        bound_model, affine_motion(bound_model), sensors, partial(workspace, bound_model)
+    )
+    chained = smoothing_steps(bound_model, steps)
     advance, hold = chained.predict, damped
 
     def predict(run: int, belief: Chain, interval: Interval, memory: ForwardMemory) -> bool:
@@ -141,9 +143,9 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
             scalar_update(mean, covariance, column, variance, -mean[component])
 
 
-def affine_motion(stage: Stage) -> Predict:
+def affine_motion(bound_model: BoundModel) -> Predict:
     """Make the prediction of the tangent vector from one stamp to the next."""
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
@@ -305,9 +307,9 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
     return size
 
 
-def affine_sensor(stage: Stage, number: int) -> Update:
+def affine_sensor(bound_model: BoundModel, number: int) -> Update:
     """Make the update of the tangent vector by sensor `number`, one component after the other."""
-    model, sensor = stage.model, stage.sensors[number]
+    model, sensor = bound_model.model, bound_model.sensors[number]
     read_state, read_reference = tuple_of(model.size), message_layout(sensor).reference
     linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
     noise_enters = sensor.noises > 0

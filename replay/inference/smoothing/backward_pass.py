@@ -36,9 +36,9 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     propagate_covariance,
 )
 from fuselog.replay.inference.linear_algebra.manifold import tangent_size
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import Kinds, comparing, correcting, sloping
 from fuselog.replay.inference.model.model import Correction
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import EstimateRows
 
 FOREVER_NS = np.iinfo(np.int64).max
@@ -97,14 +97,14 @@ class ForwardMemory(NamedTuple):
     product: Floats
 
 
-def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
+def smoothing_steps(bound_model: BoundModel, steps: Steps) -> Steps:
     """Make the steps of a filter that stores nodes; its `predict` must fill `Workspace.product`.
 
     Args:
         stage: the bound model.
         steps: steps of the forward filter.
     """
-    model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
+    model, t, predict_filter = bound_model.model, bound_model.model.tangent, steps.predict
     retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
     find_slope = sloping(model.kinds, model.correct, steps.form)
 

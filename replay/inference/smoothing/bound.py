@@ -150,7 +150,7 @@ class BoundFilter(Filter):
 
     def truths(self, truth: Ragged, time_ns: Integers, offsets: Integers) -> Floats:
         """Return the true states (n, components) at stamps of the runs; NaN if unknown."""
-        components = self.stage.model.state
+        components = self.bound_model.model.state
         columns = match_components(truth.stream.metadata, components, f"topic {self.truth}")
         found = np.full((len(time_ns), len(components)), np.nan)
         for run in range(truth.runs):
@@ -207,7 +207,7 @@ class BoundFilter(Filter):
 
     def smoothed(self, pieces: Sequence[tuple[Nodes, Integers]]) -> Ragged:
         """Return the smoothed estimates at all nodes, run by run."""
-        runs, t = len(pieces[0][1]) - 1, self.stage.model.tangent
+        runs, t = len(pieces[0][1]) - 1, self.bound_model.model.tangent
         parts = [
             [column[rows[run] : rows[run + 1]] for column in nodes[1:6]]
             for run in range(runs)
@@ -246,12 +246,12 @@ class BoundFilter(Filter):
 
     def step_stream(self, nodes: Nodes, offsets: Integers) -> Ragged:
         """Make the stream of the steps to nodes."""
-        t = self.stage.model.tangent
+        t = self.bound_model.model.tangent
         stream = make_stream(
             f"/estimates/{self.name}/step",
             schemas.BOUND_STEP,
             nodes.time_ns,
-            metadata={**named(self.stage.model.state), "bound": self.parameters.of},
+            metadata={**named(self.bound_model.model.state), "bound": self.parameters.of},
             transition=nodes.transition.reshape(-1, t * t),
             noise=nodes.noise.reshape(-1, t * t),
             information=nodes.information.reshape(-1, t * t),

@@ -31,7 +31,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     whiten,
 )
 from fuselog.replay.inference.linear_algebra.tuples import tuple_of
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 
 class TrueTrajectory(NamedTuple):
@@ -72,9 +72,9 @@ class BoundMemory(NamedTuple):
     work: Workspace
 
 
-def bound_steps(stage: Stage) -> Steps:
+def bound_steps(bound_model: BoundModel) -> Steps:
     """Make the steps of an extended Kalman filter that linearises at the true states."""
-    model, motion = stage.model, stage.motion
+    model, motion = bound_model.model, bound_model.motion
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise = motion_noise(model, motion)
@@ -101,17 +101,17 @@ def bound_steps(stage: Stage) -> Steps:
         trajectory.noise[run], trajectory.information[run] = 0.0, 0.0
 
     def memory(sets: tuple[Samples, ...]) -> BoundMemory:
-        sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
-        return BoundMemory(sets[0], tuple(np.empty((m, m)) for m in sizes), workspace(stage))
+        sizes = [len(sensor.measured) for sensor in bound_model.sensors] or [0]
+        return BoundMemory(sets[0], tuple(np.empty((m, m)) for m in sizes), workspace(bound_model))
 
-    updates = tuple(bound_update(stage, number) for number in range(len(stage.sensors)))
+    updates = tuple(bound_update(bound_model, number) for number in range(len(bound_model.sensors)))
     return Steps(memory, predict, updates, estimate)
 
 
-def bound_update(stage: Stage, number: int) -> UpdateRun:
+def bound_update(bound_model: BoundModel, number: int) -> UpdateRun:
     """Make the update by sensor `number` with a zero innovation, which does not move the state."""
-    innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
-    m = len(stage.sensors[number].measured)
+    innovate, add_noise = linear_sensor(bound_model, number), sensor_noise(bound_model.sensors[number])
+    m = len(bound_model.sensors[number].measured)
 
     def update(
         run: int,

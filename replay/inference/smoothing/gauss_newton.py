@@ -24,9 +24,9 @@ from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.inference.kalman.steps import Gaussian, Steps
 from fuselog.replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
+from fuselog.replay.inference.model.bound_model import BoundModel, title_of
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.model.settings import ReadSettings, reading_settings
-from fuselog.replay.inference.model.stage import Stage, title_of
 from fuselog.replay.inference.run.recursion import (
     InnovationRows,
     RecursionState,
@@ -92,18 +92,18 @@ class Ended(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def searching(stage: Stage) -> tuple[OverRuns, Steps]:
+def searching(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
     """Make the search, which is compiled when first called, and the steps that allocate its memory."""
-    steps = affine_steps(stage)
-    settings_of = reading_settings(number_fields(stage.model.parameters))
-    title = title_of(stage.model, "iterated smoother")
-    return compile_over_runs(search(stage, steps, settings_of), title=title), steps
+    steps = affine_steps(bound_model)
+    settings_of = reading_settings(number_fields(bound_model.model.parameters))
+    title = title_of(bound_model.model, "iterated smoother")
+    return compile_over_runs(search(bound_model, steps, settings_of), title=title), steps
 
 
-def search(stage: Stage, steps: Steps, settings_of: ReadSettings) -> RunOnce:
+def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> RunOnce:
     """Make the search for one run's trajectory, for `compile_over_runs`."""
-    kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
-    follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
+    kinds, n, t = bound_model.model.kinds, bound_model.model.size, bound_model.model.tangent
+    follow, go_back = recursion(bound_model, steps, settings_of), backward_pass(("linear",) * t)
     add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
     flat, hold = is_flat(kinds), damped
 

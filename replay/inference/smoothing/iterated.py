@@ -19,7 +19,7 @@ from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged, copied, ragged_rows, run_of_rows
 from fuselog.replay.inference.kalman.methods import FILTERS, Method
 from fuselog.replay.inference.kalman.steps import CoreMemory, Gaussian, Steps
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.run.events import data_columns
 from fuselog.replay.inference.run.filtering import FilterState
 from fuselog.replay.inference.run.recursion import (
@@ -153,10 +153,10 @@ class IteratedSmoother(Smoother):
 
     def _first(self, state: FilterState) -> list[FilterEvents]:
         """Return the prior's time as an event, unless an interpolated control already has one."""
-        control = self.stage.model.control
+        control = self.bound_model.model.control
         if control is not None and control.interpolated:
             return []
-        runs, (width, _) = np.arange(len(state.next_output) + 1), data_columns(self.stage)
+        runs, (width, _) = np.arange(len(state.next_output) + 1), data_columns(self.bound_model)
         return [output_times(runs, state.carried.time_ns.copy(), width, wants_estimate=False)]
 
     def _accepted(
@@ -167,7 +167,7 @@ class IteratedSmoother(Smoother):
             return events
         source = events.source.copy()
         output_streams = np.zeros(len(source), bool)
-        for number, sensor in enumerate(self.stage.sensors):
+        for number, sensor in enumerate(self.bound_model.sensors):
             measured = events.data[:, : len(sensor.measured)]
             output_streams |= (source == number) & np.isfinite(measured).any(axis=1)
         [innovations] = [each for each in made if each.stream.topic.endswith("/innovation")]
@@ -180,11 +180,11 @@ class IteratedSmoother(Smoother):
 
     def _search(self, state: FilterState, way: Way, scale: Floats) -> Ended:
         """Search for the trajectories of all runs from the states of `way`, which are replaced."""
-        stage, asked = self.stage, self.parameters
+        bound_model, asked = self.bound_model, self.parameters
         events, nodes, offsets, kept = way.events, way.nodes, way.offsets, way.states
-        loop, steps = searching(stage)
-        t, runs, count = stage.model.tangent, len(offsets) - 1, len(kept.mean)
-        _, innovations = no_results(np.zeros(1, int), np.arange(runs + 1), stage.model, 0)
+        loop, steps = searching(bound_model)
+        t, runs, count = bound_model.model.tangent, len(offsets) - 1, len(kept.mean)
+        _, innovations = no_results(np.zeros(1, int), np.arange(runs + 1), bound_model.model, 0)
         belief = state.carried.belief
         prior = Gaussian(belief.mean, belief.covariance)
         plan = Plan(
@@ -236,7 +236,7 @@ class IteratedSmoother(Smoother):
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
         cost = ended.output_streams[one, np.maximum(passes - 1, 0), 0]
-        t = self.stage.model.tangent
+        t = self.bound_model.model.tangent
         stated = {"start": asked.start, "damping": f"{asked.damping:g}", "loss": asked.loss}
         stated |= {} if asked.loss == "square" else {"loss_scale": f"{asked.loss_scale:g}"}
         solution = make_stream(
@@ -268,9 +268,9 @@ class IteratedSmoother(Smoother):
 # Method
 
 
-def _solved_at_the_end(stage: Stage) -> Steps:
+def _solved_at_the_end(bound_model: BoundModel) -> Steps:
     """Make the steps that compute the start, those of the extended smoother."""
-    return smoothing_steps(stage, FILTERS["ekf"].steps(stage))
+    return smoothing_steps(bound_model, FILTERS["ekf"].steps(bound_model))
 
 
 ITERATED = Method(

@@ -29,8 +29,8 @@ from fuselog.replay.inference.kalman.methods import (
 )
 from fuselog.replay.inference.kalman.steps import Steps
 from fuselog.replay.inference.linear_algebra.manifold import is_flat
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.filtering import Filter, FilterState
 from fuselog.replay.inference.run.recursion import EstimateRows, FilterEvents, InnovationRows
 from fuselog.replay.inference.smoothing.backward_pass import (
@@ -184,7 +184,7 @@ class Smoother(Filter):
 
         The nodes and the window are changed; the window then begins at row stop[run].
         """
-        model = self.stage.model
+        model = self.bound_model.model
         if not is_flat(model.kinds):
             return self.gone_back([piece], stop)
         offsets = np.append(0, np.cumsum(stop - piece.offsets[:-1]))
@@ -195,7 +195,7 @@ class Smoother(Filter):
         return smoothed, offsets
 
     def _no_window(self, runs: int) -> Window:
-        t = self.stage.model.tangent
+        t = self.bound_model.model.tangent
         gain, rest = (np.empty((runs, t, t)) for _ in range(2))
         turned, through = (np.zeros(runs, np.int64) for _ in range(2))
         return Window(turned, through, gain, np.empty((runs, t)), rest)
@@ -207,7 +207,7 @@ class Smoother(Filter):
 
         Run r owns offsets[r]:offsets[r + 1].
         """
-        model, runs = self.stage.model, len(pieces[0].offsets) - 1 if pieces else 0
+        model, runs = self.bound_model.model, len(pieces[0].offsets) - 1 if pieces else 0
         counts = [(piece.offsets[1:] if stop is None else stop) - piece.offsets[:-1] for piece in pieces]
         offsets = np.append(0, np.cumsum(sum(counts, np.zeros(runs, np.int64))))
         n, t = model.size, model.tangent
@@ -257,8 +257,8 @@ def _smoother_of(name: str, variant: str) -> Method:
     """Make the method that smooths the estimates of a filter."""
     inner = filter_with(name, variant)
 
-    def steps(stage: Stage) -> Steps:
-        return smoothing_steps(stage, inner.steps(stage))
+    def steps(bound_model: BoundModel) -> Steps:
+        return smoothing_steps(bound_model, inner.steps(bound_model))
 
     def lacks(model: Model) -> str:
         motions = (model.modes or {"": model.motion}).values()

@@ -176,8 +176,11 @@ def innovation(sums: Sums) -> dict[str, float]:
 def _log_likelihoods(innovations: Innovations) -> Sums:
     """Sum log-likelihoods; NaN if that of an accepted measurement is not stated."""
     stated = innovations.log_likelihood
-    let_in = np.array([np.nan]) if stated is None else stated[innovations.accepted]
-    return {"log_likelihood": float(let_in.sum()), "runs": set(np.unique(innovations.run).tolist())}
+    accepted_likelihood = np.array([np.nan]) if stated is None else stated[innovations.accepted]
+    return {
+        "log_likelihood": float(accepted_likelihood.sum()),
+        "runs": set(np.unique(innovations.run).tolist()),
+    }
 
 
 def likelihood(sums: Sums) -> dict[str, float]:

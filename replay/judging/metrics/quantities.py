@@ -77,10 +77,10 @@ class InnovationSums:
     def add(self, innovations: Innovations) -> None:
         """Add a block."""
         stated, accepted = innovations.log_likelihood, innovations.accepted
-        let_in = np.where(accepted, np.nan if stated is None else stated, 0.0)
+        accepted_likelihood = np.where(accepted, np.nan if stated is None else stated, 0.0)
         degrees = innovations.degrees
         columns = np.column_stack(
-            [accepted, degrees, degrees * accepted, innovations.squared, let_in]
+            [accepted, degrees, degrees * accepted, innovations.squared, accepted_likelihood]
         ).astype(float)
         self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
 

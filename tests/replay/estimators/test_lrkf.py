@@ -19,7 +19,7 @@ from fuselog.replay.inference.all_methods import METHODS
 from fuselog.replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
 from fuselog.replay.inference.kalman.steps import Gaussian, Interval, Measurement
 from fuselog.replay.inference.linear_algebra.gaussian import no_innovation
-from fuselog.replay.inference.model.stage import stage_of
+from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.inference.sampling import Samples, parse_sampling
 from fuselog.replay.inference.sampling.sets import SampleSets
 
@@ -94,7 +94,7 @@ POINT = SimpleNamespace(size_drift_m2=1e-4, position_drift_m2=1e-3, point_varian
 
 def predicted(method, mean, covariance, *samples):
     """One step of the reactor, uncompiled."""
-    steps = METHODS[method].steps(stage_of(REACTOR, REACTOR.motion, REACTOR.sensors))
+    steps = METHODS[method].steps(bound_model_of(REACTOR, REACTOR.motion, REACTOR.sensors))
     belief = Gaussian(mean[None].copy(), covariance[None].copy())
     memory = steps.memory(tuple(as_sets(each) for each in samples))
     assert steps.predict(0, belief, Interval(np.empty(0), 1.0, STEP, 0), memory)
@@ -137,10 +137,10 @@ def innovated_exactly(mean, covariance, measured):
 
 def innovated(mean, covariance, measured, samples):
     """The same by samples of the target and of the noise."""
-    stage = stage_of(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
-    work = METHODS["lrkf"].steps(stage).memory((as_sets(samples),))
+    bound_model = bound_model_of(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
+    work = METHODS["lrkf"].steps(bound_model).memory((as_sets(samples),))
     given = Measurement(measured, POINT, np.empty(0), 0)
-    assert sampled_sensor(stage, 0, 0)(mean, covariance, given, work)
+    assert sampled_sensor(bound_model, 0, 0)(mean, covariance, given, work)
     return work.innovations[0]
 
 

@@ -193,7 +193,7 @@ def test_particles_say_that_a_parameter_is_constant() -> None:
         "still robot1: bias_range_m, forward_scale ",
         "one robot1: forward_scale ",
     ]
-    assert all("give estimate_drift, or use a Gaussian filter" in mend for _, _, mend in said)
+    assert all("give estimate_drift, or use a Gaussian filter" in remedy for _, _, remedy in said)
 
 
 @pytest.mark.usefixtures("uncompiled")

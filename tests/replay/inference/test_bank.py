@@ -15,9 +15,9 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.engine.vectors.tangent import difference
 from fuselog.replay.inference.all_methods import modelled
 from fuselog.replay.inference.kalman.steps import InnovationRecord, Measurement, Steps, workspace
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.modes.gaussian_sum import (
     AGREED,
     GaussianSumBelief,
@@ -190,9 +190,9 @@ def test_members_agree_by_the_squared_distance_of_their_means(share: float):
         np.array([3]),
     )
     sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, {"z": "linear"}, move)
-    stage = Stage(ROLLER, ROLLER.motion, (sensor,))
-    inner = Steps(lambda _: workspace(stage), move, (said_nothing,), move)
-    steps = gaussian_sum_steps(stage, inner, 9)
+    bound_model = BoundModel(ROLLER, ROLLER.motion, (sensor,))
+    inner = Steps(lambda _: workspace(bound_model), move, (said_nothing,), move)
+    steps = gaussian_sum_steps(bound_model, inner, 9)
     record = InnovationRecord(np.empty(1), np.empty((1, 1)), np.empty(3))
     nothing = Measurement(np.empty(1), None, np.empty(2), 0)
     assert steps.updates[0](0, belief, nothing, steps.memory(()), record) == ALL_WELL

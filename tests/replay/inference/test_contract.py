@@ -19,10 +19,10 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.inference import estimators
 from fuselog.replay.inference.all_methods import METHODS
 from fuselog.replay.inference.model.binding import _common
+from fuselog.replay.inference.model.bound_model import BoundModel, bound_model_of
 from fuselog.replay.inference.model.model import Control, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.settings import reading_settings
-from fuselog.replay.inference.model.stage import Stage, stage_of
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -290,9 +290,9 @@ def test_models_are_traced_once_for_all_that_have_the_same_sensors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Logs may have a thousand robots."""
-    traced: list[Stage] = []
+    traced: list[BoundModel] = []
     monkeypatch.setattr(
-        estimators, "stage_of", lambda *parts: traced.append(stage_of(*parts)) or traced[-1]
+        estimators, "stage_of", lambda *parts: traced.append(bound_model_of(*parts)) or traced[-1]
     )
     recording, run = record_run("landmarks", {"duration_s": 0.1, "robots": 3}, 0)
     filters = bind("ekf", [memory_source(recording, run)], {"kind": "ekf"})

@@ -19,8 +19,8 @@ def test_what_is_at_the_bound_is_let_in(
     squared = outputs(SCALAR, method, [log], gate_probability=1.0)["innovation"]
     nis = squared["normalised_innovation_squared"]
     assert nis.argmax() == LAST
-    for bound, let_in in ((nis[LAST], 1), (np.nextafter(nis[LAST], 0.0), 0)):
+    for bound, accepted_likelihood in ((nis[LAST], 1), (np.nextafter(nis[LAST], 0.0), 0)):
         monkeypatch.setattr(filtering, "_nis_bounds", lambda *_, at=bound: np.array([np.inf, at]))
         found = outputs(SCALAR, method, [log], gate_probability=0.9)["innovation"]
         assert found["normalised_innovation_squared"][LAST] == nis[LAST]
-        assert found["accepted"].tolist() == [1, 1, 1, 1, let_in]
+        assert found["accepted"].tolist() == [1, 1, 1, 1, accepted_likelihood]

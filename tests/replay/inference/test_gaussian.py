@@ -29,9 +29,9 @@ from fuselog.replay.inference.kalman.update import kalman_update
 from fuselog.replay.inference.linear_algebra.gaussian import cholesky
 from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus, recentring
 from fuselog.replay.inference.linear_algebra.sparse import pattern_of, propagating_covariance
+from fuselog.replay.inference.model.bound_model import BoundModel, bound_model_of
 from fuselog.replay.inference.model.model import Control, Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
-from fuselog.replay.inference.model.stage import Stage, stage_of
 from fuselog.replay.inference.run.recursion import fault_of
 from fuselog.replay.inference.sampling.samplers import unscented
 from fuselog.replay.inference.sampling.sets import SampleSets
@@ -106,7 +106,7 @@ def correct(
     """The Kalman update by an innovation v with covariance S and cross-covariance C."""
     sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, all_linear("z", len(v)), nothing)
     motion = Motion(nothing)
-    stage = Stage(
+    bound_model = BoundModel(
         Model("", all_linear("x", len(mean)), ModelParameters, (sensor,), motion), motion, (sensor,)
     )
 
@@ -116,9 +116,11 @@ def correct(
         return True
 
     record = empty_record(len(v))
-    update = kalman_update(stage, 0, innovate)
+    update = kalman_update(bound_model, 0, innovate)
     plain = noise_of(np.empty(0), np.empty(0))  # no robust update
-    return update(mean, covariance, Measurement(v, plain, gate, 0), workspace(stage), record), record
+    return update(
+        mean, covariance, Measurement(v, plain, gate, 0), workspace(bound_model), record
+    ), record
 
 
 @given(st.integers(1, 5), st.integers(1, 4), seeds)
@@ -198,7 +200,7 @@ class Linear(NamedTuple):
     control: Floats
     look: Floats
 
-    def stage(self) -> Any:
+    def bound_model(self) -> Any:
         """As component-first functions."""
         states, controls, components = len(self.transition), self.control.shape[1], len(self.look)
 
@@ -224,7 +226,7 @@ class Linear(NamedTuple):
         state = all_linear("x", states)
         model = Model("", state, ModelParameters, (sensor,), motion, control=control)
         own = (*names("density", controls), *names("variance", components))
-        return stage_of(model, motion, (sensor,), names=own)
+        return bound_model_of(model, motion, (sensor,), names=own)
 
 
 def one_set(dimension: int, kappa: float) -> SampleSets:
@@ -247,7 +249,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
         0.1 * generator.normal(size=(components, states)),
     )
     linear.look[-1] *= 0.01  # the samples of an angle stay within half a turn
-    steps = METHODS[method].steps(linear.stage())
+    steps = METHODS[method].steps(linear.bound_model())
     work = steps.memory((one_set(states, kappa),) * len(steps.sampled))
     x, p = generator.normal(size=states), positive_definite(generator, states)
     u, density = generator.normal(size=controls), generator.uniform(size=controls)
@@ -275,7 +277,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
 
 
 def test_sampling_says_where_the_covariance_is_none():
-    steps = METHODS["ukf"].steps(Linear(np.eye(2), np.eye(2), np.eye(2)).stage())
+    steps = METHODS["ukf"].steps(Linear(np.eye(2), np.eye(2), np.eye(2)).bound_model())
     work = steps.memory((one_set(2, 0.0),) * 2)
     one = np.ones(2)
     noise, belief = noise_of(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])

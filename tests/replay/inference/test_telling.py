@@ -9,7 +9,7 @@ import pytest
 
 import fuselog as fl
 from fuselog.replay.inference.all_methods import METHODS
-from fuselog.replay.inference.model.stage import title_of
+from fuselog.replay.inference.model.bound_model import title_of
 from fuselog.replay.inference.run import filtering
 from tests.replay.inference.vehicle_a import VEHICLE_A
 

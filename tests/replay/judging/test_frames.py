@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fuselog.pipeline.logs.foxglove import WORLD, companions
+from fuselog.pipeline.logs.foxglove import WORLD, mirrors
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, schemas
 from fuselog.recorders.log.planes import FRAME, frame_of
@@ -53,7 +53,7 @@ def test_every_position_of_every_scenario_is_in_a_frame_that_is_linked_to_the_tr
             assert of_detected(source, stream, 4.0 * sigma_m) > 0.8, stream.topic
     framed, linked = set(), {WORLD}
     for stream in streams:
-        for made in companions(stream):
+        for made in mirrors(stream):
             parts = [*getattr(made.message, "entities", ()), *getattr(made.message, "transforms", ())]
             for part in parts or [made.message]:
                 is_link = hasattr(part, "parent_frame_id")

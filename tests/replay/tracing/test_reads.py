@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fuselog.replay.inference.estimators import registered_models
-from fuselog.replay.inference.model.stage import stage_of
+from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.tracing import functions
 from fuselog.replay.tracing.functions import TracedFunction, traced
 
@@ -209,9 +209,9 @@ def test_models_are_traced_once(monkeypatch: pytest.MonkeyPatch):
 def _traces(model: Any, monkeypatch: pytest.MonkeyPatch) -> int:
     """How often functions of a model are called when it is bound again."""
     parts = model, model.motion, model.all_sensors, tuple((model.modes or {}).values())
-    first, calls = stage_of(*parts), []
+    first, calls = bound_model_of(*parts), []
     with monkeypatch.context() as patched:
         own = functions.trace
         patched.setattr(functions, "trace", lambda *given: calls.append(given) or own(*given))
-        assert stage_of(*parts) == first
+        assert bound_model_of(*parts) == first
     return len(calls)

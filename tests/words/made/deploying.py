@@ -61,7 +61,7 @@ def unreplayed() -> Iterator[str]:
     ):
         sensors = [SimpleNamespace(**{**plain, **sensor})]
         filtering = SimpleNamespace(
-            stage=SimpleNamespace(model=SimpleNamespace(control=control), sensors=sensors),
+            bound_model=SimpleNamespace(model=SimpleNamespace(control=control), sensors=sensors),
             found=SimpleNamespace(fallbacks=fallbacks, geodetic=geodetic),
         )
         made: Any = SimpleNamespace(filtering=filtering, is_interpolated=interpolated)

@@ -63,8 +63,8 @@ def _both_ways(each: Hypothesis) -> Iterator[str]:
     for at in dict.fromkeys(values):
         near = np.array(at)
         low, high = (tuple(end) if each.size > 1 else float(end) for end in (0.9 * near, 1.1 * near))
-        mend = each.mend(at)
-        advice = "no advice" if mend is None else TRYING.words(mend)
+        remedy = each.remedy(at)
+        advice = "no advice" if remedy is None else TRYING.words(remedy)
         told = "" if each.size > 1 else f" [{each.reported(at):.4g}]"
         yield f"{each.name}{told}: {each.words(at, low, high)}; try {advice}"
 

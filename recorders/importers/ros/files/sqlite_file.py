@@ -40,7 +40,7 @@ class SqliteFile:
             raise BadInput(f"{path}: cannot be read ({error.strerror})") from None
         except sqlite3.Error as error:
             raise BadInput(
-                f"{path}: cannot be read as a sqlite3 bag of ROS 2 ({error}){self._mend(error)}"
+                f"{path}: cannot be read as a sqlite3 bag of ROS 2 ({error}){self._remedy(error)}"
             ) from None
         self._by_id = {
             number: each._replace(messages=counts.pop(number, 0)) for number, each in self._by_id.items()
@@ -73,7 +73,7 @@ class SqliteFile:
         except sqlite3.DatabaseError:
             return Counter(row[0] for row in self._rows(database, "NULL"))
 
-    def _mend(self, error: sqlite3.Error) -> str:
+    def _remedy(self, error: sqlite3.Error) -> str:
         """Name a command that may recover more of a damaged file."""
         # Python's own errors, for example on a text that is not UTF-8, have no code
         if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_CORRUPT:
@@ -119,7 +119,7 @@ class SqliteFile:
             behind = (
                 "all messages are" if row is None else f"all messages after the one at time {row[1]} are"
             )
-            self._losses["damage"] = f"is damaged ({error}); {behind} lost{self._mend(error)}"
+            self._losses["damage"] = f"is damaged ({error}); {behind} lost{self._remedy(error)}"
 
 
 def _whole_pages(path: Path, scratch: Path) -> Path:

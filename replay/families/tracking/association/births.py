@@ -50,8 +50,8 @@ def births_of(kinds: Sequence[ScanSensor]) -> Births:
 
 def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     """Make `end_tracks(run, tracks, p)`, which removes tracks that have ended."""
-    names = list(tracker.stage.model.state)
-    x, y = place_of(tracker.stage.model)
+    names = list(tracker.bound_model.model.state)
+    x, y = place_of(tracker.bound_model.model)
     has_velocity = "vx_mps" in names and "vy_mps" in names
     velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
     _, _, is_over = MANAGEMENTS[tracker.management]
@@ -87,7 +87,7 @@ BeginTracks = Callable[[int, int, int, Scans, Tracks, Newborn, Settings, ScanMem
 
 def beginning(tracker: Tracker) -> BeginTracks:
     """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`, which begins tracks."""
-    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    model, kinds, modes = tracker.bound_model.model, tracker.kinds, tracker.sizes[0]
     (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
     begins, birth_number, birth = births_of(kinds)
     correlate: Callable[[int, Floats, Floats, Floats, Settings, Workspace], None] = nothing

@@ -13,7 +13,7 @@ from fuselog.replay.families.tracking.association.scans import Scans, take_scans
 from fuselog.replay.families.tracking.association.tracker import believing, moving
 from fuselog.replay.families.tracking.association.tracks import NEVER, Tracks
 from fuselog.replay.inference.linear_algebra.gaussian import copy_gaussian
-from fuselog.replay.inference.model.stage import Stage
+from fuselog.replay.inference.model.bound_model import BoundModel
 
 
 @varying(2)
@@ -84,10 +84,10 @@ def writing_pairs(
 
 
 def writing_tracks(
-    stage: Stage,
+    bound_model: BoundModel,
 ) -> Callable[[int, int, Tracks, TrackOutputs, ScanMemory], None]:
     """Make `write_tracks(run, scan, tracks, outputs, memory)`, which writes confirmed tracks."""
-    belief_of, estimate = believing(stage), moving(stage).estimate
+    belief_of, estimate = believing(bound_model), moving(bound_model).estimate
 
     def write_tracks(
         run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory

@@ -33,10 +33,10 @@ from fuselog.replay.inference.kalman.steps import CoreMemory, Workspace, workspa
 from fuselog.replay.inference.kalman.update import sensor_derivative
 from fuselog.replay.inference.linear_algebra.gaussian import Innovation, kalman_step, whiten, wrap
 from fuselog.replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from fuselog.replay.inference.model.bound_model import BoundModel, traced_sensor
 from fuselog.replay.inference.model.corrections import correcting, sloping
 from fuselog.replay.inference.model.functions import OfParameters
 from fuselog.replay.inference.model.model import Model, Sensor
-from fuselog.replay.inference.model.stage import Stage, traced_sensor
 
 
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
@@ -89,12 +89,14 @@ class ScanMemory(NamedTuple):
     shift: Floats
 
 
-def memory_of(stage: Stage, motion: CoreMemory, shared: int, places: int, detections: int) -> ScanMemory:
+def memory_of(
+    bound_model: BoundModel, motion: CoreMemory, shared: int, places: int, detections: int
+) -> ScanMemory:
     """Make memory for the given numbers of shared errors, tracks, and detections in a scan."""
-    modes, size = max(1, len(stage.modes)), stage.model.tangent
+    modes, size = max(1, len(bound_model.modes)), bound_model.model.tangent
     return ScanMemory(
         motion=motion,
-        step=workspace(stage),
+        step=workspace(bound_model),
         pool=pool_of(shared, size, places),
         place=np.empty((detections, 2)),
         group=np.empty(detections, np.int64),

@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 
 from fuselog.replay.engine.arrays import Floats, Integers, Settings
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.functions import ModelFunction
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.run.recursion import EstimateRows
 from fuselog.replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
@@ -25,7 +25,7 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 
 
 def smooth_tracks(
-    stage: Stage,
+    bound_model: BoundModel,
     parameters: Settings,
     track: Integers,
     time_ns: Integers,
@@ -47,8 +47,8 @@ def smooth_tracks(
     order = np.argsort(track, kind="stable")
     numbers, first = np.unique(track[order], return_index=True)
     offsets = np.append(first, len(track))
-    nodes = _nodes(stage, parameters, offsets, time_ns[order], mean[order], covariance[order])
-    runs, n = len(numbers), stage.model.size
+    nodes = _nodes(bound_model, parameters, offsets, time_ns[order], mean[order], covariance[order])
+    runs, n = len(numbers), bound_model.model.size
     smoothed = EstimateRows(
         offsets[1:].copy(),
         np.empty_like(nodes.time_ns),
@@ -56,14 +56,14 @@ def smooth_tracks(
         np.empty(covariance.shape),
     )
     later, filled = no_later(runs, n, n), Smoothed(offsets[1:], offsets[:-1], FOREVER_NS, smoothed)
-    go_back, memory = backward_pass_over_runs(stage.model.kinds), partial(back_memory, n, n)
+    go_back, memory = backward_pass_over_runs(bound_model.model.kinds), partial(back_memory, n, n)
     go_back(runs, Piece(nodes, offsets), later, filled, scratch=memory)
     back = np.argsort(order)
     return smoothed.mean[back], smoothed.covariance[back]
 
 
 def _nodes(
-    stage: Stage,
+    bound_model: BoundModel,
     parameters: Settings,
     offsets: Integers,
     time_ns: Integers,
@@ -77,7 +77,7 @@ def _nodes(
     duration_s = np.diff(time_ns, prepend=time_ns[:1]) * 1e-9
     duration_s[offsets[:-1]] = 0.0
     before, spread = np.roll(mean, 1, axis=0), np.roll(covariance, 1, axis=0)
-    transition, noise = _motion(stage, parameters, before, duration_s)
+    transition, noise = _motion(bound_model, parameters, before, duration_s)
     cross = spread @ transition.transpose(0, 2, 1)
     predicted = transition @ cross + noise
     gain = np.asarray(np.linalg.solve(predicted, cross.transpose(0, 2, 1)), float).transpose(0, 2, 1)
@@ -94,17 +94,17 @@ def _nodes(
 
 
 def _motion(
-    stage: Stage, parameters: Settings, mean: Floats, duration_s: Floats
+    bound_model: BoundModel, parameters: Settings, mean: Floats, duration_s: Floats
 ) -> tuple[Floats, Floats]:
     """Compute the matrices (n, size, size) of a linear motion over each duration, and of its noise."""
-    size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
-    assert stage.motion.noise is not None
+    size, count, state = bound_model.model.size, len(duration_s), tuple(mean.T)
+    assert bound_model.motion.noise is not None
     transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))
     for column, unit in enumerate(np.eye(size)):
-        moved = stage.motion.move(tuple(unit), (), duration_s, parameters)
+        moved = bound_model.motion.move(tuple(unit), (), duration_s, parameters)
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
-    noise_of: ModelFunction = stage.motion.noise  # of many durations together
+    noise_of: ModelFunction = bound_model.motion.noise  # of many durations together
     lower = noise_of(state, duration_s, parameters)
     rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
     for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):

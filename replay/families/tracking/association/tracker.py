@@ -10,8 +10,8 @@ from fuselog.replay.families.tracking.association.tracks import Tracks
 from fuselog.replay.inference.kalman.predict import linear_motion
 from fuselog.replay.inference.kalman.steps import Belief, Gaussian, Steps, gaussian_filter
 from fuselog.replay.inference.linear_algebra.tuples import range_of
+from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
-from fuselog.replay.inference.model.stage import Stage
 from fuselog.replay.inference.modes.imm import interacting_steps
 from fuselog.replay.inference.modes.mixture import ModeBelief
 
@@ -28,7 +28,7 @@ class Tracker(NamedTuple):
             share, see `fuselog.replay.families.tracking.association.shared_bias`.
     """
 
-    stage: Stage
+    bound_model: BoundModel
     kinds: tuple[ScanSensor, ...]
     association: str
     management: str
@@ -38,7 +38,11 @@ class Tracker(NamedTuple):
     @property
     def sizes(self) -> tuple[int, int, int]:
         """Return the number of modes, the size of the state, and that of its tangent space."""
-        return max(1, len(self.stage.modes)), self.stage.model.size, self.stage.model.tangent
+        return (
+            max(1, len(self.bound_model.modes)),
+            self.bound_model.model.size,
+            self.bound_model.model.tangent,
+        )
 
 
 class Newborn(NamedTuple):
@@ -54,19 +58,21 @@ class Newborn(NamedTuple):
     mode: Floats
 
 
-def moving(stage: Stage) -> Steps:
+def moving(bound_model: BoundModel) -> Steps:
     """Make the prediction of tracks; tracks with several modes move as interacting multiple models."""
-    if not stage.modes:
-        return gaussian_filter(stage, linear_motion(stage), ())
-    alone = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
-    return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
+    if not bound_model.modes:
+        return gaussian_filter(bound_model, linear_motion(bound_model), ())
+    alone = (bound_model._replace(motion=motion, modes=()) for motion in bound_model.modes)
+    return interacting_steps(
+        bound_model, [gaussian_filter(each, linear_motion(each), ()) for each in alone]
+    )
 
 
 # (run, tracks) -> the tracks of a run as the filters' belief, first axis = place.
 BeliefOf = Callable[[int, Tracks], Belief]
 
 
-def believing(stage: Stage) -> BeliefOf:
+def believing(bound_model: BoundModel) -> BeliefOf:
     """Make `belief(run, tracks)`, which returns the tracks of a run as the filters' belief.
 
     The first axis of the belief is the place of the track.
@@ -80,7 +86,7 @@ def believing(stage: Stage) -> BeliefOf:
             tracks.mean[run], tracks.covariance[run], tracks.mode[run], tracks.log_mode[run]
         )
 
-    return of_modes if stage.modes else of_one
+    return of_modes if bound_model.modes else of_one
 
 
 Arguments = ParamSpec("Arguments")

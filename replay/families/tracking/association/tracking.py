@@ -63,10 +63,10 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
-    stage, associate = tracker.stage, ASSOCIATIONS[tracker.association]
+    bound_model, associate = tracker.bound_model, ASSOCIATIONS[tracker.association]
     advance, weigh, process = advancing(tracker), association_weights(tracker), processing(tracker)
     end_tracks, begin_tracks = ending(tracker), beginning(tracker)
-    write_pairs, write_tracks = writing_pairs(tracker.sizes[0]), writing_tracks(stage)
+    write_pairs, write_tracks = writing_pairs(tracker.sizes[0]), writing_tracks(bound_model)
 
     def take_scan(
         run: int,
@@ -112,7 +112,7 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
 
 def advancing(tracker: Tracker) -> Callable[[int, int, Tracks, Settings, ScanMemory], None]:
     """Make `advance(run, time_ns, tracks, p, memory)`, which predicts all tracks."""
-    belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
+    belief_of, predict = believing(tracker.bound_model), moving(tracker.bound_model).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
     def advance(run: int, time_ns: int, tracks: Tracks, p: Settings, memory: ScanMemory) -> None:
@@ -134,7 +134,7 @@ TakeDetections = Callable[[int, int, int, Scans, Tracks, Settings, ScanMemory], 
 
 def association_weights(tracker: Tracker) -> TakeDetections:
     """Make `weigh(run, scan, count, scans, tracks, p, memory)`, which computes the weights of pairs."""
-    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    model, kinds, modes = tracker.bound_model.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
     compare = choosing([comparing(kind) for kind in kinds])
     detection_of = choosing([kind.detection for kind in kinds])
@@ -196,7 +196,7 @@ def association_weights(tracker: Tracker) -> TakeDetections:
 
 def processing(tracker: Tracker) -> TakeDetections:
     """Make `process(run, scan, count, scans, tracks, p, memory)`, which updates the tracks."""
-    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    model, kinds, modes = tracker.bound_model.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
     begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
@@ -285,5 +285,5 @@ def track_scans(
 
 
 def _memory(tracker: Tracker, places: int, detections: int) -> ScanMemory:
-    motion = moving(tracker.stage).memory(())
-    return memory_of(tracker.stage, motion, tracker.shared[1], places, detections)
+    motion = moving(tracker.bound_model).memory(())
+    return memory_of(tracker.bound_model, motion, tracker.shared[1], places, detections)

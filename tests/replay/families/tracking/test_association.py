@@ -243,7 +243,7 @@ def test_a_second_track_of_a_target_ends(first_is_confirmed: bool, component: in
     """Where an older confirmed one is nearer in place and in velocity; at the limit none is."""
     limits = [10.0, 2.0, 10.0, 2.0]  # x_m, vx_mps, y_m, vy_mps
     model = SimpleNamespace(state=("x_m", "vx_mps", "y_m", "vy_mps"))
-    tracker = SimpleNamespace(stage=SimpleNamespace(model=model), management="existence")
+    tracker = SimpleNamespace(bound_model=SimpleNamespace(model=model), management="existence")
     p = SimpleNamespace(
         same_within_m=10.0, same_within_mps=2.0, ending_existence=0.1, silence_s=1, tentative_silence_s=1
     )
@@ -264,7 +264,7 @@ def test_a_second_track_of_a_target_ends(first_is_confirmed: bool, component: in
 def test_a_silent_track_ends_after_the_time_of_its_kind(management: str):
     """A confirmed one and a tentative one have times of their own, and are there to the end of them."""
     model = SimpleNamespace(state=("x_m", "y_m"))
-    tracker = SimpleNamespace(stage=SimpleNamespace(model=model), management=management)
+    tracker = SimpleNamespace(bound_model=SimpleNamespace(model=model), management=management)
     p = SimpleNamespace(
         silence_s=10.0,
         tentative_silence_s=6.0,

@@ -13,7 +13,7 @@ from fuselog.replay.tracing.functions import Argument, Shape, traced
 Part = TypeVar("Part")
 
 
-class Stage(NamedTuple):
+class BoundModel(NamedTuple):
     """A bound model: a model with its motion and the sensors that the log has.
 
     `modes` are the motions of all modes in order, for a method that uses all of them. Use `stage_of` to
@@ -26,13 +26,13 @@ class Stage(NamedTuple):
     modes: tuple[Motion, ...] = ()
 
 
-def stage_of(
+def bound_model_of(
     model: Model,
     motion: Motion,
     sensors: Sequence[Sensor] = (),
     modes: Sequence[Motion] = (),
     names: tuple[str, ...] | None = None,
-) -> Stage:
+) -> BoundModel:
     """Return a model with one of its motions, some of its sensors, and optionally all modes, traced.
 
     `names` are the parameters that functions may read, by default the model's own. Unchanged parts are
@@ -41,7 +41,7 @@ def stage_of(
     Raises BadInput if a function cannot be traced.
     """
     names = number_fields(model.parameters) if names is None else names
-    return Stage(
+    return BoundModel(
         traced_model(model, names),
         traced_motion(model, motion, names),
         tuple(traced_sensor(model, sensor, names) for sensor in sensors),

@@ -17,12 +17,12 @@ from fuselog.recorders.log.container.chunks import RECORD_HEAD, Span
 from fuselog.recorders.log.container.packing import INDEX_ENTRY, Chunk
 
 # The key in a channel's metadata that names the stream.
-COMPANION_OF = "companion_of"
+MIRROR_OF = "companion_of"
 # Opcode, length of the rest, channel, sequence number, log time, publish time.
 _HEAD = struct.Struct("<BQHIQQ")
 
 
-class Companion(NamedTuple):
+class Mirror(NamedTuple):
     """A message, its topic, the topic of the stream that it accompanies, and its two clocks."""
 
     topic: str
@@ -37,7 +37,7 @@ class Numbered(NamedTuple):
 
     channel_id: int
     sequence: int
-    companion: Companion
+    mirror: Mirror
 
 
 def descriptor_set(message: Message) -> bytes:
@@ -54,12 +54,12 @@ def descriptor_set(message: Message) -> bytes:
     return descriptor_pb2.FileDescriptorSet(file=files.values()).SerializeToString(deterministic=True)
 
 
-def chunks_of_companions(companions: Sequence[Numbered], chunk_bytes: int) -> Iterator[Chunk]:
+def chunks_of_mirrors(mirrors: Sequence[Numbered], chunk_bytes: int) -> Iterator[Chunk]:
     """Yield chunks of about `chunk_bytes`, in the order of log time; ties keep the order given."""
     rows: list[tuple[Numbered, bytes]] = []
     size = 0
-    for row in sorted(companions, key=lambda each: each.companion.log_time_ns):
-        data = row.companion.message.SerializeToString(deterministic=True)
+    for row in sorted(mirrors, key=lambda each: each.mirror.log_time_ns):
+        data = row.mirror.message.SerializeToString(deterministic=True)
         rows.append((row, data))
         size += _HEAD.size + len(data)
         if size >= chunk_bytes:
@@ -72,15 +72,15 @@ def chunks_of_companions(companions: Sequence[Numbered], chunk_bytes: int) -> It
 def _chunk(rows: Sequence[tuple[Numbered, bytes]]) -> Chunk:
     data = bytearray()
     entries: dict[int, list[tuple[int, int]]] = {}
-    for (channel_id, sequence, companion), message in rows:
-        clocks = companion.log_time_ns, companion.publish_time_ns
-        entries.setdefault(channel_id, []).append((companion.log_time_ns, len(data)))
+    for (channel_id, sequence, mirror), message in rows:
+        clocks = mirror.log_time_ns, mirror.publish_time_ns
+        entries.setdefault(channel_id, []).append((mirror.log_time_ns, len(data)))
         length = _HEAD.size - RECORD_HEAD.size + len(message)
         data += _HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, *clocks) + message
-    published = [row.companion.publish_time_ns for row, _ in rows]
+    published = [row.mirror.publish_time_ns for row, _ in rows]
     return Chunk(
         memoryview(data),
-        Span(rows[0][0].companion.log_time_ns, rows[-1][0].companion.log_time_ns),
+        Span(rows[0][0].mirror.log_time_ns, rows[-1][0].mirror.log_time_ns),
         Span(min(published), max(published)),
         {channel: np.array(each, INDEX_ENTRY).tobytes() for channel, each in entries.items()},
     )
