@@ -1,1 +1,1 @@
-"""Offers what `import fuselog` gives, on which the commands rest; begin with `replays` and `api`."""
+"""The Python interface behind `import fuselog` and the commands; begin with `replays` and `api`."""

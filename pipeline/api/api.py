@@ -98,7 +98,7 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
     given = list(streams)
     if not all(isinstance(each, Stream) for each in given):
         raise BadInput(
-            f"{path}: there is nothing to write; give streams, as make_stream makes them, or a recording"
+            f"{path}: these are no streams; give streams made with make_stream, or a recording"
         )
     write_log(path, given)
 

@@ -105,7 +105,7 @@ def _recorder(options: Mapping[str, Any]) -> Iterator[Entries]:
     elif name is None and options["scenario"] is not None:
         name, values, _ = load_scenario(options["scenario"])
     if name is None:
-        raise BadInput(f"--set NAME{ASKED}: name a scenario, one that fuselog scenarios lists")
+        raise BadInput(f"--set NAME{ASKED}: name a scenario; fuselog scenarios lists them")
     yield [_of_recorder(name, values)]
 
 
@@ -165,7 +165,7 @@ def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
     """Yield the parameters of an experiment, its study, its scenario or importer, and its estimators."""
     named, labels = options["experiment"], options["labels"]
     if not named:
-        raise BadInput(f"--set NAME{ASKED}: name an experiment, one that fuselog experiments lists")
+        raise BadInput(f"--set NAME{ASKED}: name an experiment; fuselog experiments lists them")
     logs = [Path(each) for each in named if each.endswith(".mcap")]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
     experiment = stated.with_settings({}, {})

@@ -120,7 +120,7 @@ def methods() -> dict[str, dict[str, str]]:
 def show_formulas(name: str | None, *, as_json: bool) -> None:
     """Print the formulas of a model; raises BadInput if none is named, or it is unknown."""
     if name is None:
-        raise BadInput("--formulas: give a model, as in fuselog models robot --formulas")
+        raise BadInput("--formulas needs a model, for example: fuselog models robot --formulas")
     if as_json:
         print_json({"name": name, "formulas": formulas_by_function(name)})
     else:
@@ -220,10 +220,10 @@ def _experiment(name: str, path: Path) -> Entry:
     if experiment.record:
         facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
     if experiment.import_:
-        facts["imports"] = f"{experiment.import_.source}; give its place with --data"
+        facts["imports"] = f"{experiment.import_.source}; give its path with --data"
     study: Study = load("studies", experiment.study, Study)
     if study.runs != Study.runs:
-        facts["--runs"] = study.runs or "none to set"
+        facts["--runs"] = study.runs or "not applicable"
     return Entry(name, experiment.title, facts, study.options, experiment.options, prefix="options.")
 
 

@@ -76,9 +76,11 @@ def judge_estimates(
     Raises BadInput if a log has no estimates or is from another run, or if there is nothing to judge.
     """
     if errors and out is None:
-        raise BadInput("--errors: errors are written into a result folder; give one with --out")
+        raise BadInput(
+            "--errors: individual errors are written into a result folder; give one with --out"
+        )
     if logs and len(logs) != len(estimates):
-        raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
+        raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one --log for each")
     opened = [_opened(path, recover=recover) for path in estimates]
     places = logs or [log_of_estimates(each.log) for each in opened]
     if out is not None:
@@ -103,8 +105,9 @@ def judge_estimates(
             )
         if not judge.has_numbers:
             raise BadInput(
-                f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
-                "give its log with --log"
+                f"{estimates[0]}: there is nothing to judge, neither estimates with truth nor "
+                f"innovations; "
+                "give the source log with --log"
             )
         coverage = recounted(opened, sources, estimators, judge.doubts)
         if folder is not None:
@@ -132,11 +135,9 @@ def _opened(path: Path, *, recover: bool) -> LogSource:
     try:
         log = open_log(path, recover=recover)
     except NotMcap as error:
-        raise BadInput(
-            f"{error}, or give with --truth the file that a trajectory is judged by"
-        ) from error
+        raise BadInput(f"{error}, or give the true trajectory with --truth") from error
     if not any(topic.startswith("/estimates/") for topic in log.topics):
-        raise BadInput(f"{path}: has no estimates; give a log that fuselog replay wrote")
+        raise BadInput(f"{path}: the log has no estimates; give a log that fuselog replay wrote")
     return LogSource(log)
 
 
@@ -151,14 +152,15 @@ def _compared(
         return ComparedLogs(estimates, {})
     if "time_offset_s" in comparison:
         raise BadInput(
-            "--time-offset: is for trajectory files, since all streams of a log have one clock; "
+            "--time-offset works only for trajectory files, because all streams of a log have one "
+            "clock; "
             "leave it out"
         )
     how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
     compared = compare_logs(estimates, sources, how)
     if not compared.compared:
         raise BadInput(
-            f"{estimates[0].name}: has no estimated positions with truth that could be aligned; leave "
+            f"{estimates[0].name}: there are no estimated positions with truth to align; leave "
             "out --align"
         )
     return compared

@@ -41,7 +41,9 @@ def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bo
     """Print the findings of a log; returns whether all of them are hints."""
     alterations, others = split_texts(settings)
     if others:
-        raise BadInput(f"--set {others[0]}: lint has settings of topics alone, such as /imu.delay_s=0.1")
+        raise BadInput(
+            f"--set {others[0]}: lint accepts only settings of topics, such as /imu.delay_s=0.1"
+        )
     log = open_log(path, recover=recover)
     found = lint(LogSource(log), set=alterations)
     if as_json:

@@ -50,14 +50,14 @@ def show_list(kind: str) -> None:
     in_families = kind in ("scenarios", "models", "estimators")
     rows = by_family(kind) if in_families else listed(kind).items()
     print_table([kind.removesuffix("s"), "what"], [*rows])
-    say(f"For all about one of them: fuselog {kind} NAME")
+    say(f"For details of one of them: fuselog {kind} NAME")
     if kind == "models":
         methods = [
             [name, " ".join(method for method, answer in answers.items() if answer == "yes")]
             for name, answers in listed("methods").items()
         ]
         print_table(["model", "methods that estimate it"], methods)
-        say("What a model lacks for another method: fuselog models NAME")
+        say("To see what a model lacks for another method: fuselog models NAME")
 
 
 def by_family(kind: str) -> Iterator[tuple[str, str]]:

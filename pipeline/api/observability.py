@@ -70,7 +70,7 @@ def observability(
             rows += _rows(sources, case, ragged)
     if not any(row["measurements"] for row in rows):
         raise BadInput(
-            f"{sources[0].name}: no sensor of the model measured anything in the span; give another span"
+            f"{sources[0].name}: no sensor of the model has measurements in this span; give another span"
         )
     return pd.DataFrame(rows)
 
@@ -111,7 +111,7 @@ def show_observability(
 ) -> None:
     """Print the table of `observability`."""
     if window_s is not None and window_s <= 0:
-        raise BadInput(f"--window {window_s:g}: give seconds above zero, such as 10")
+        raise BadInput(f"--window {window_s:g}: expected a positive number of seconds, such as 10")
     found = observability(
         [LogSource(open_log(path, recover=recover)) for path in logs],
         model,

@@ -111,7 +111,7 @@ def plan_replay(
     """
     for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
         if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
-            raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
+            raise BadInput(f"{name} is {value}; expected seconds, such as 0.5")
     from_ = [start_from] if isinstance(start_from, str | Path) else start_from
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
     alterations, given = split_settings(set or {})
@@ -160,7 +160,7 @@ def sources_of(
     """
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
-        raise BadInput("there are no logs to replay; give at least one")
+        raise BadInput("no logs to replay; give at least one")
     return alter_all(map(_source, found), alterations or {})
 
 
@@ -171,7 +171,7 @@ def _source(log: Log) -> LogSource | MemorySource:
         return memory_source(log, RunMetadata("recording", epoch_ns=log.epoch_ns, notes=dict(log.notes)))
     if isinstance(log, str | Path):
         return open(log)
-    raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
+    raise BadInput(f"cannot replay a {type(log).__name__}; give a path, a log or a recording")
 
 
 def settings_of(
@@ -183,10 +183,10 @@ def settings_of(
     chosen: dict[str, dict[str, Any]] = {}
     for each in listed:
         if isinstance(each, Model):
-            raise BadInput('an estimator is a model without a method; give modelled(model, "ekf")')
+            raise BadInput('a model without a method is not an estimator; give modelled(model, "ekf")')
         if not isinstance(each, str | Mapping | Estimator):
             raise BadInput(
-                f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
+                f'expected an estimator, got {type(each).__name__}; give a name, or {{"mine": it}}'
             )
         if isinstance(each, Mapping) and "kind" in each:
             raise BadInput(
@@ -204,11 +204,11 @@ def settings_of(
                 )
             if not isinstance(kind, str | Estimator):
                 raise BadInput(
-                    f"estimator {label} is {type(kind).__name__}; make an estimator of it with "
+                    f"estimator {label} is a {type(kind).__name__}; make an estimator from it with "
                     "recursive, batch or modelled"
                 )
     if not chosen:
-        raise BadInput("there are no estimators to replay; give at least one")
+        raise BadInput("no estimators to replay; give at least one")
     return chosen
 
 

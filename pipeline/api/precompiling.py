@@ -106,7 +106,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
         ]
         made = _all(pool.executor, _replayed, asked)
     served = {model for model, _ in scenarios}
-    why = "no scenario has a log for it: its first replay compiles"
+    why = "no scenario fits it: its first replay compiles"
     return [*made, *(Precompiled(*pair, "", 0.0, why) for pair in pairs if pair[0] not in served)]
 
 
@@ -149,11 +149,11 @@ def _working(models: dict[str, Model], methods: Iterable[str]) -> list[Pair]:
 
 def _check_cache() -> None:
     if is_uncompiled():
-        raise BadInput("nothing is compiled with FUSELOG_UNCOMPILED=1; leave it out")
+        raise BadInput("FUSELOG_UNCOMPILED=1 disables compilation; unset it")
     if not is_private(cache_folder() / "kernels"):
         raise BadInput(
-            f"the cache {cache_folder()} is not this user's alone, and keeps nothing; set FUSELOG_CACHE "
-            "to a folder of your own"
+            f"the cache {cache_folder()} is writable for other users, so nothing is stored; set "
+            "FUSELOG_CACHE to a folder of your own"
         )
 
 

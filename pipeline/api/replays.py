@@ -238,7 +238,7 @@ class Replay(Showing):
             raise BadInput("nothing to draw: no estimate has a truth")
         case = next(iter(charts)) if case is None else case
         if case not in charts:
-            raise BadInput(f"nothing with the name '{case}' was judged; {choices(case, charts)}")
+            raise BadInput(f"no case '{case}' was judged; {choices(case, charts)}")
         return draw(charts[case])
 
     def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:

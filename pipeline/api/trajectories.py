@@ -269,7 +269,7 @@ def compare_logs(
                 continue
             found = replace(found, name=f"{of_run.name}: topic {topic}")
             if comparison.align == "none" and (why := unlike(of_run.empty(topic), [source], origins)):
-                raise BadInput(f"{found.name}: cannot be compared as it is: {why}")
+                raise BadInput(f"{found.name}: cannot be compared without alignment: {why}")
             done = compare(found, true, comparison)
             compared.setdefault(split_topic(topic), []).append(done)
             alignments[topic] = done.alignment

@@ -1,1 +1,1 @@
-"""Checks estimators against stored replays, field by field; begin with `checking`."""
+"""Checks of estimators against stored replays, field by field; begin with `checking`."""

@@ -1,4 +1,4 @@
-"""Checks logs and results against a golden: what is replayed, and what is said of it."""
+"""Checks of logs and results against a golden: what is replayed, and what is reported."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
 
 
 def compared(golden: Golden, replayed: Replayed) -> Checked:
-    """Return a replay, or what else was made again, against a golden."""
+    """Compare a replay, or estimates made by other means, with a golden."""
     found = list(discrepancies(golden, replayed))
     fields = {("", "metrics"): len(golden["metrics"])} if golden["metrics"] else {}
     for name, run in golden["runs"].items():

@@ -98,7 +98,7 @@ def check_path(
 
 
 def _tolerance(text: str) -> tuple[str, Tolerance]:
-    """Read a pattern and how far apart what matches it may be, from PATTERN=RELATIVE."""
+    """Read a pattern and the largest relative difference of matching columns from PATTERN=RELATIVE."""
     pattern, _, value = text.rpartition("=")
     try:
         relative = float(value)

@@ -1,4 +1,4 @@
-"""Compares a replay with its golden: where they part, by how much, and what is the first to do so."""
+"""Comparison of a replay with its golden: where they differ, by how much, and where first."""
 
 import base64
 import math
@@ -53,7 +53,7 @@ class Discrepancy(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Return all of it in words."""
+        """Return a description of the discrepancy."""
         where = " ".join(filter(None, (self.run, self.topic, self.part)))
         detail = ""
         if self.row is not None:
@@ -178,7 +178,7 @@ def _column_distance(
 
 
 def _component(metadata: Mapping[str, str], place: tuple[int, ...], shape: tuple[int, ...]) -> str:
-    """Name an entry of a row; of a matrix by its row and its column."""
+    """Name an entry of a row; an entry of a matrix by its row and its column."""
     if not place:
         return ""
     names = metadata.get("components", "").split(",")
@@ -191,7 +191,7 @@ def _component(metadata: Mapping[str, str], place: tuple[int, ...], shape: tuple
 
 
 def _floats(values: Any) -> Floats:
-    """Make an array, in which a null is NaN."""
+    """Convert values to an array in which null is NaN."""
     return np.asarray(values, float)
 
 
@@ -203,21 +203,21 @@ def _size(before: Mapping[str, Floats], rows: int) -> Floats:
 
 
 def _difference(before: Floats, after: Floats) -> Floats:
-    """Subtract; what is infinite or missing in both is equal."""
+    """Subtract values; those that are infinite or missing in both are equal."""
     with np.errstate(invalid="ignore", over="ignore"):
         difference: Floats = after - before
     return np.where((before == after) | (np.isnan(before) & np.isnan(after)), 0.0, difference)
 
 
 def _relative(difference: Floats, size: ArrayLike) -> Floats:
-    """Divide differences by their size; NaN where a value is missing in one of the two."""
+    """Divide differences by their size; NaN if one of the values is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative: Floats = np.where(difference == 0.0, 0.0, np.abs(difference) / size)
     return relative
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """Say of the first discrepancy in time: itself, where it begins, the innovation there."""
+    """Describe the first discrepancy in time, where it begins, and the innovation there."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     sentences = [first.sentence]

@@ -35,7 +35,7 @@ Outputs = Mapping[str, Stream]
 
 
 class Tolerance(NamedTuple):
-    """States by how much a column may differ, relative to its size, and why."""
+    """The allowed difference of a column, relative to its size, and the reason for it."""
 
     relative: float
     reason: str = ""
@@ -47,7 +47,7 @@ Tolerances = Mapping[str, Tolerance]
 
 
 class Replayed(NamedTuple):
-    """Holds what is checked: a golden of now, and the output streams of each run that it is made of."""
+    """The golden of a new replay, and the output streams of each run that it is made of."""
 
     golden: Golden
     outputs: Mapping[str, Outputs]
@@ -122,12 +122,12 @@ def golden_of(
 
 
 def input_hash(source: LogSource | MemorySource) -> str:
-    """Hash a run with SHA-256: of a log its file, of a recording its columns."""
+    """Hash a run with SHA-256: the file of a log, or the columns of a recording."""
     return hash_files([source.log.path]) if isinstance(source, LogSource) else hash_streams([source])
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Tell whether an output is an estimate; usage and the note that nothing failed are not."""
+    """Test whether an output is an estimate; usage and the note that nothing failed are not."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 
@@ -156,7 +156,7 @@ def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]
 
 
 def kept_rows(count: int, most: int) -> NDArray[np.int64]:
-    """Choose so many of a stream's rows, evenly."""
+    """Choose at most `most` of a stream's rows, evenly spaced."""
     return np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
 
 

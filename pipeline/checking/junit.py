@@ -1,4 +1,4 @@
-"""Writes what a check found as JUnit's XML, for continuous integration: a test case for each topic."""
+"""The results of a check as JUnit XML, for continuous integration: one test case per topic."""
 
 from pathlib import Path
 from xml.etree import ElementTree

@@ -1,4 +1,4 @@
-"""Reads and writes goldens: packed JSON, of which the reader believes only what it has checked."""
+"""Reading and writing of goldens: packed JSON, whose content is validated when it is read."""
 
 import base64
 import json
@@ -46,13 +46,13 @@ Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
 class _Part(BaseModel):
-    """Refuses a part of a golden that has more names than its type."""
+    """A part of a golden, which may have no other names than its type."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class _Column(_Part):
-    """Holds some rows of a column, and over all rows how many are missing, their sums and squares."""
+    """Some rows of a column; over all rows, how many are missing, their sums and squares."""
 
     kept: Numbers
     missing: Numbers
@@ -70,7 +70,7 @@ class _Column(_Part):
 
 
 class _Stream(_Part):
-    """Holds what is kept of one topic: its stamps, and a checksum of every row."""
+    """The stored part of one topic: its stamps, and a checksum of every row."""
 
     rows: NonNegativeInt
     publish_times: str
@@ -91,7 +91,7 @@ class _Stream(_Part):
 
 
 class _Run(_Part):
-    """Holds what is kept of one run: which log it was, and its outputs by topic."""
+    """The stored part of one run: the hash of its log, and its outputs by topic."""
 
     input: str
     recorded: bool
@@ -99,7 +99,7 @@ class _Run(_Part):
 
 
 class _Tolerance(_Part):
-    """States by how much numbers may differ, and why."""
+    """The allowed difference of numbers, and the reason for it."""
 
     relative: NonNegativeFloat
     reason: str = ""
@@ -107,7 +107,7 @@ class _Tolerance(_Part):
 
 
 class _Settings(_Part):
-    """Holds what the runs were replayed with."""
+    """The settings with which the runs were replayed."""
 
     estimators: dict[str, dict[str, Any]] = {}
     late: str | None = None
@@ -116,7 +116,7 @@ class _Settings(_Part):
 
 
 class _Golden(_Part):
-    """Holds all that the file of a golden has."""
+    """The complete content of a golden file."""
 
     format: int
     arithmetic: str
@@ -139,7 +139,7 @@ def write(path: Path, golden: Golden) -> None:
 
 
 def read(path: Path) -> Golden:
-    """Read a golden; raises BadInput where it is missing, damaged or of another format."""
+    """Read a golden; raises BadInput if it is missing, damaged or of another format."""
     try:
         golden = parse_json(_unpacked(path).decode(), constants=True)
     except FileNotFoundError:
@@ -163,7 +163,7 @@ def read(path: Path) -> Golden:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Unpack the text; raises ValueError where it is more than a golden may have."""
+    """Unpack the text; raises ValueError if it is longer than a golden may be."""
     with path.open("rb") as file:
         packed = file.read(MOST_BYTES)
     unpacking = lzma.LZMADecompressor(memlimit=_UNPACKING_BYTES)

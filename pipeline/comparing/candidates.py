@@ -130,7 +130,7 @@ def measured(
 
 
 def _hash_of_truth(source: Source, estimates: Source) -> str:
-    """Hash what estimates are judged by, however it is cut into blocks."""
+    """Hash the truths of estimates, independent of their division into blocks."""
     named = {topic.metadata.get("truth", "") for topic in estimates.topics.values()}
     digests: list[str] = []
     for topic in sorted(named & source.topics.keys()):
@@ -159,7 +159,7 @@ def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[s
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an estimator's parameters, defaults included where this version knows it; None if unset."""
+    """Return an estimator's parameters, including defaults if known; None if unset."""
     try:
         return dict(configure(label, stated)[1].model_dump(mode="json"))
     except BadInput:
@@ -178,7 +178,7 @@ def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def name_of(path: Path) -> str:
-    """Return a path's name as a label, which holds neither dot nor slash."""
+    """Return a path's name as a label, without dots and slashes."""
     stem = path.resolve().name.removesuffix(".estimates.mcap").removesuffix(path.suffix)
     return re.sub(r"[^\w:=+-]+", "-", stem).strip("-") or "side"
 
@@ -307,7 +307,7 @@ def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -
 def _stored(
     rows: pd.DataFrame, times: pd.DataFrame, label: str, name: str, settings: Mapping[str, Any]
 ) -> Candidate:
-    """Make the candidate of a result's own tables."""
+    """Make a candidate from a result's own tables."""
     own = rows[rows["estimator"] == label].drop(columns=["estimator", "estimates"])
     components = [column for column in map(str, own) if column.startswith("rmse_")]
     sizes = {
@@ -367,7 +367,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
 
 
 def _row_that_differs(kept: Candidate, again: Candidate) -> str:
-    """Say where a replay does not give what a result has."""
+    """Describe the first row in which a replay differs from a result; empty if there is none."""
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
     if len(both) < len(kept.rows):

@@ -1,4 +1,4 @@
-"""Compares estimators: paired differences of every metric over the same runs, with a verdict each."""
+"""Comparison of estimators: paired differences of metrics over the same runs, with verdicts."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -78,7 +78,7 @@ class Differences:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Return a row per pair, metric and case."""
+        """Return a table with a row per pair, metric and case."""
         rows = []
         for each in self.paired:
             found = each.found.columns
@@ -133,7 +133,7 @@ class Differences:
         return "\n".join([*self.notes, *self.sentences])
 
     def charts(self) -> dict[str, Chart]:
-        """Return the differences over time, a chart for each pair and case."""
+        """Draw the differences over time, a chart for each pair and case."""
         if self.times.empty:
             return {}
         groups = self.times.groupby(["first", "second", "case"], sort=False)
@@ -196,20 +196,20 @@ class Differences:
 
     @cached_property
     def coverage(self) -> list[Row]:
-        """Return what became of every topic, by candidate."""
+        """Return how many messages of every topic were used, by candidate."""
         return [
             row for candidates in self.groups for candidate in candidates for row in candidate.coverage
         ]
 
     @property
     def drawable(self) -> list[str]:
-        """Return the runs of which all candidates of the first group have estimates."""
+        """Return the runs for which all candidates of the first group have estimates."""
         first, *others = self.groups[0]
         return [run for run in first.pairs if all(run in each.pairs for each in others)]
 
     @property
     def inputs(self) -> list[Path]:
-        """Return the files that went in."""
+        """Return the input files."""
         sources = [
             each for candidate in self.groups[0] for pair in candidate.pairs.values() for each in pair
         ]

@@ -1,4 +1,4 @@
-"""Groups the estimators of several candidates that can be compared, run by run."""
+"""Groups of estimators from several candidates that can be compared, run by run."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -87,7 +87,7 @@ def inputs_of(
 
 
 def named_in(estimators: Sequence[str | Mapping[str, Kind]]) -> list[str]:
-    """List the labels of estimators, as `replay` takes them."""
+    """List the labels of estimators in the form that `replay` accepts."""
     return [label for each in estimators for label in ([each] if isinstance(each, str) else each)]
 
 
@@ -187,7 +187,7 @@ def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterato
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Number the names where two are the same."""
+    """Append numbers to names that occur more than once."""
     return [
         f"{name}-{number}" if names.count(name) > 1 else name for number, name in enumerate(names, 1)
     ]
@@ -231,7 +231,7 @@ def _stated(value: Any) -> Any:
 
 
 def table_of_runs(groups: Sequence[Sequence[Candidate]]) -> pd.DataFrame:
-    """Return a row per candidate, case and run, with all its metrics."""
+    """Make a table with a row per candidate, case and run, with all its metrics."""
     keys = ["case", "run"]
     found = {each.name: each.rows for group in groups for each in group}
     tables = [

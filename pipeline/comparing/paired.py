@@ -1,4 +1,4 @@
-"""Judges a metric of two candidates; the verdict is withheld where stress moves it further."""
+"""Verdicts on metrics of two candidates, withheld if stress changes the metric by more."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Paired(NamedTuple):
 
     @property
     def is_withheld(self) -> bool:
-        """Tell whether changes that should not matter move the metric further than the difference."""
+        """Test whether irrelevant changes move the metric by more than the difference."""
         return self.found.verdict in DIFFER and abs(self.found.more.value) < self.stressed
 
     @property

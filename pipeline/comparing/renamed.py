@@ -11,7 +11,7 @@ from fuselog.replay.engine.streams.sources import Source
 
 @dataclass(frozen=True)
 class Renamed:
-    """Represents the estimates of one label under another name, as a source that is read when needed."""
+    """The estimates of one label under another name, as a source that is read on demand."""
 
     estimates: Source
     label: str

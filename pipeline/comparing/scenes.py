@@ -1,4 +1,4 @@
-"""Puts the estimates of several candidates side by side, and draws them from above."""
+"""The estimates of several candidates side by side, drawn from above."""
 
 from collections.abc import Sequence
 

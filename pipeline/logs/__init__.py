@@ -1,1 +1,1 @@
-"""Handles logs as files: information, editing, and export; begin with `information`."""
+"""Operations on log files: information, editing, and export; begin with `information`."""

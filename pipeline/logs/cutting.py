@@ -1,4 +1,4 @@
-"""Thins streams, and finds the priors of a cut log."""
+"""Thinning of streams, and the priors of a cut log."""
 
 import math
 from collections import Counter
@@ -32,7 +32,7 @@ def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
 
 
 def is_prior(log: Log, topic: str) -> bool:
-    """Tell whether a topic is a prior: a Gaussian estimate that no replay has written."""
+    """Test whether a topic is a prior: a Gaussian estimate that no replay has written."""
     schema = log.topics[topic].schema_name
     return schema == schemas.GAUSSIAN_ESTIMATE.full_name and not topic.startswith("/estimates/")
 

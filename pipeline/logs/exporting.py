@@ -37,7 +37,7 @@ FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]
 
 
 class Exported(NamedTuple):
-    """Holds the files that were written, by topic, and sentences on what is not in them."""
+    """The written files by topic, and sentences on what they do not contain."""
 
     files: dict[str, Path]
     notes: list[str]

@@ -1,4 +1,4 @@
-"""Finds the logs of folders, where a command takes them."""
+"""Search for logs in folders."""
 
 from pathlib import Path
 

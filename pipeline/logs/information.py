@@ -1,4 +1,4 @@
-"""Describes what a log and what the cache holds, for a person and for machines."""
+"""Descriptions of logs and of the cache, as text and as JSON."""
 
 import json
 import shlex
@@ -115,7 +115,7 @@ def _findings(log: Log) -> list[Finding]:
 
 
 class Fitting(NamedTuple):
-    """States whether a model fits a log: topics that it would use, methods, or what is missing."""
+    """How a model fits a log: the topics it would use, its methods, or what is missing."""
 
     topics: list[str]
     methods: list[str]
@@ -123,7 +123,7 @@ class Fitting(NamedTuple):
 
 
 def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
-    """Return how every registered model fits a log, by name."""
+    """Find how every registered model fits a log, by name."""
     return {name: _fitting(model, topics) for name, model in registered_models().items()}
 
 
@@ -195,7 +195,7 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
 
 
 def _some_topics(topics: Sequence[str]) -> str:
-    """Name topics, the first of many."""
+    """Name topics, or the first few of many."""
     more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
     return ", ".join(topics[:MOST_TOPICS]) + more
 

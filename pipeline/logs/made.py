@@ -1,4 +1,4 @@
-"""Describes what fuselog made and is no log: a timeline, a result folder."""
+"""Descriptions of timelines and result folders."""
 
 from collections import Counter
 from pathlib import Path

@@ -23,7 +23,7 @@ UNKNOWN = "unknown"
 
 
 class Changed(NamedTuple):
-    """Holds the log that was written, how many messages each topic has there, and what else to say."""
+    """The written log, its number of messages by topic, and further remarks."""
 
     path: Path
     messages: dict[str, int]

@@ -98,8 +98,9 @@ class Cell:
             return pickle.dumps(done)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise BadInput(
-                f"what a metric keeps cannot be sent to another process ({error}); keep numbers, arrays "
-                "and classes of a module"
+                f"the sums of a metric cannot be sent to another process ({error}); use numbers, "
+                f"arrays and "
+                "classes defined in a module"
             ) from error
 
 
@@ -197,7 +198,10 @@ def work_off(
     if len(waiting) < len(cells):
         done = len(cells) - len(waiting)
         _LOG.warning(
-            "%s: has %d of %d cells already; computing the others", checkpoints.folder, done, len(cells)
+            "%s: %d of %d cells are already done; computing the others",
+            checkpoints.folder,
+            done,
+            len(cells),
         )
     died: Counter[int] = Counter()
     following = 0
@@ -223,8 +227,9 @@ def work_off(
                     died[following] += 1
                     if died[following] >= ATTEMPTS:
                         raise BadInput(
-                            f"{checkpoints.folder}: what is kept there is changed by others, or by the "
-                            "disk; give another --out"
+                            f"{checkpoints.folder}: files there are being changed by another program "
+                            f"or a "
+                            "faulty disk; give another --out"
                         )
                     waiting.appendleft(following)
                     continue

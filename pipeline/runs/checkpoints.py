@@ -57,7 +57,7 @@ class Checkpoints:
             self._lock.acquire()
         except Timeout:
             raise BadInput(
-                f"{self.folder}: another fuselog command is working on it; wait for it, or give "
+                f"{self.folder}: another fuselog command is using this folder; wait for it, or give "
                 "another --out"
             ) from None
         except OSError as error:
@@ -65,7 +65,7 @@ class Checkpoints:
                 self._remove()
             raise BadInput(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         foreign = [each.name for each in self.folder.iterdir() if not _is_ours(each)]
-        what = f"holds {foreign[0]}, which fuselog did not write" if foreign else ""
+        what = f"contains {foreign[0]}, which fuselog did not write" if foreign else ""
         if not is_own(self.folder.stat()):
             what = "another user owns it, or others may write to it"
         if what:
@@ -105,7 +105,9 @@ class Checkpoints:
         for key in keys:
             left = self._left(key)
             if left is None:
-                raise BadInput(f"{self.place_of(key)}: was changed meanwhile; run the command again")
+                raise BadInput(
+                    f"{self.place_of(key)}: was changed during the run; run the command again"
+                )
             for name in map(Path, left.files):
                 path = self.place_of(key) / name
                 if name.is_relative_to(ERRORS):
@@ -128,7 +130,7 @@ class Checkpoints:
         if done and not is_done:
             self._lock.release()
             _LOG.warning(
-                "%s: keeps %d finished cells; the same command continues with the others",
+                "%s: %d finished cells are kept; run the same command again to compute the others",
                 self.folder,
                 done,
             )

@@ -396,7 +396,7 @@ def judge_logs(
     for source, topics in zip(estimates, held, strict=True):
         if topics != held[0]:
             raise BadInput(
-                f"{source.name}: has other estimates than {estimates[0].name}; judge it on its own"
+                f"{source.name}: has other estimates than {estimates[0].name}; judge it separately"
             )
     whole: Judge | None = None
     for now in parts_of(len(sources)):

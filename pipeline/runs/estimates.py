@@ -32,14 +32,10 @@ def log_of_estimates(estimates: Log) -> Path:
     if named is None and recorded_estimators(estimates):
         return estimates.path
     if named is None:
-        raise BadInput(
-            f"{estimates.path}: does not state the log that it was made from; give that with --log"
-        )
+        raise BadInput(f"{estimates.path}: does not state its source log; give it with --log")
     path = (estimates.path.parent / named).resolve()
     if not path.exists():
-        raise BadInput(
-            f"{estimates.path}: the log {path} that it was made from is missing; give it with --log"
-        )
+        raise BadInput(f"{estimates.path}: its source log {path} is missing; give it with --log")
     return path
 
 

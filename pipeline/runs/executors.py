@@ -203,7 +203,8 @@ def dask(scheduler: str) -> PoolFactory:
                 client = stack.enter_context(Client(address, timeout=10))
             except (OSError, ValueError) as error:
                 raise BadInput(
-                    f"--scheduler {scheduler}: no scheduler answers there ({error}); start one, or "
+                    f"--scheduler {scheduler}: no scheduler answers at this address ({error}); start "
+                    f"one, or "
                     "give another address"
                 ) from None
             _check_code(scheduler, client)
@@ -223,7 +224,7 @@ def _local_cluster(scheduler: str) -> Any:
 
     count = scheduler.removeprefix("local:")
     if not count.isdecimal() or int(count) < 1:
-        raise BadInput(f"--scheduler {scheduler}: give local:N with a number of workers N from 1 on")
+        raise BadInput(f"--scheduler {scheduler}: expected local:N with at least one worker")
     return LocalCluster(
         n_workers=int(count),
         threads_per_worker=1,
@@ -239,15 +240,16 @@ def _check_code(scheduler: str, client: Any) -> None:
         there = client.run(version_of_code)
     except ImportError as error:
         raise BadInput(
-            f"--scheduler {scheduler}: its workers lack fuselog ({error}); install it there"
+            f"--scheduler {scheduler}: fuselog is not installed on its workers ({error}); install it "
+            f"there"
         ) from error
     if not there:
-        raise BadInput(f"--scheduler {scheduler}: has no workers; start some")
+        raise BadInput(f"--scheduler {scheduler}: the scheduler has no workers; start some")
     for worker, found in there.items():
         if found != version_of_code():
             raise BadInput(
                 f"--scheduler {scheduler}: worker {worker} has another version of the code; install "
-                "the same there"
+                "the same version there"
             )
 
 

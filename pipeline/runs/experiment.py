@@ -94,8 +94,7 @@ class Experiment(Parameters):
             raise ValueError("give exactly one of [record], [import] and [logs]")
         if (self.import_ or self.logs) and (self.runs, self.seed) != (1, 0):
             raise ValueError(
-                "data that are imported or given as logs have no seed, and as many runs as there are; "
-                "leave out seed and runs"
+                "imported data and logs have no seed and a fixed number of runs; leave out seed and runs"
             )
         return self
 
@@ -111,7 +110,7 @@ class Experiment(Parameters):
     @model_validator(mode="after")
     def _has_the_recordings(self) -> Self:
         if self.recordings and not (self.import_ or self.logs):
-            raise ValueError("recordings are what is imported or given as logs; leave out [recordings]")
+            raise ValueError("[recordings] applies to imported data and logs; leave it out")
         return self
 
     @property
@@ -257,7 +256,7 @@ def read_experiment(name: str) -> Stated:
     """Read an experiment by its shipped name or TOML file, without settings."""
     known = shipped("experiments")
     if not name.endswith(".toml") and name not in known:
-        raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
+        raise BadInput(f"no experiment '{name}', and it is not a .toml file; {choices(name, known)}")
     path = known.get(name, Path(name))
     return Stated(path.stem, name, read_toml(path), path.parent, () if name in known else (path,))
 
@@ -265,7 +264,7 @@ def read_experiment(name: str) -> Stated:
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
     """Make the experiment that replays logs; raises BadInput if no estimator is named."""
     if not labels:
-        raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
+        raise BadInput(f"{logs[0]}: name the estimators to replay, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
     values = {
         "title": title,
@@ -284,9 +283,7 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
         found = [place] if place.is_file() else sorted(root.glob(str(place.relative_to(root))))
         logs = [str(each) for each in found if len(found) == 1 or not each.match("*.estimates.mcap")]
         if not logs:
-            raise BadInput(
-                f"{where}: no log has the name {place}; give files, or patterns such as *.mcap"
-            )
+            raise BadInput(f"{where}: no log matches {place}; give files, or patterns such as *.mcap")
         files |= dict.fromkeys(logs)
     return list(files)
 
@@ -322,8 +319,8 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
         else:
             known = sorted(names.union(entries, own, *own.values()))
             raise BadInput(
-                f"--set {key}: no such entry of the experiment, parameter of what it records, "
-                f"estimator or parameter of its estimators; {choices(key, known)}"
+                f"--set {key}: not an entry of the experiment, a parameter of what it records, an "
+                f"estimator, or a parameter of its estimators; {choices(key, known)}"
             )
         placed = merge(placed, place)
     return placed
@@ -351,7 +348,7 @@ def require_campaign(experiment: Experiment, remedy: str) -> None:
     study: Study = load("studies", experiment.study, Study)
     if not study.is_campaign:
         raise BadInput(
-            f"experiment '{experiment.title}': its study, {experiment.study}, replays all runs "
+            f"experiment '{experiment.title}': the study {experiment.study} replays all runs "
             f"together, in one process; {remedy}"
         )
 
@@ -369,7 +366,7 @@ def run_experiment(
 ) -> Result:
     """Run an experiment and write its folder, which appears only when complete; returns result.json."""
     if experiment.import_ and data is None:
-        raise BadInput(f"experiment {name} needs real data: give its folder with --data")
+        raise BadInput(f"experiment {name} needs real data; give the folder with --data")
     if data is not None and experiment.record:
         raise BadInput(f"experiment {name} imports nothing; leave out --data")
     if experiment.logs is not None:
@@ -378,7 +375,7 @@ def run_experiment(
             files = _found([place], Path(), f"experiment {name}, --data {data}")
             experiment = experiment.model_copy(update={"logs": Logs(files=files)})
         if not experiment.files:
-            raise BadInput(f"experiment {name} replays logs: name them in [logs], or with --data")
+            raise BadInput(f"experiment {name} replays logs; name them in [logs], or with --data")
         experiment = experiment.model_copy(update={"runs": len(experiment.files)})
     study: Study = load("studies", experiment.study, Study)
     if not study.runs and experiment.runs != 1:

@@ -45,9 +45,9 @@ def order_of(
     found = None if late is None else parse_late(late, arrival_order=arrival_order)
     if found is not None and origins:
         raise BadInput(
-            f"--late {late} --start-from {origins[0]}: a span in the order of arrival does not begin "
-            "at one "
-            "stamp, at which a state could be known; leave out one of the two"
+            f"--late {late} --start-from {origins[0]}: in order of arrival, a span does not begin at "
+            f"one "
+            "stamp with a known state; use only one of these options"
         )
     return "log_time" if arrival_order else "publish_time", found
 
@@ -69,7 +69,7 @@ def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: 
     if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
         first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
         raise BadInput(
-            f"{source.name}: has no messages in this span; the log goes from {first_s:g} to {last_s:g} s"
+            f"{source.name}: no messages in this span; the log extends from {first_s:g} to {last_s:g} s"
         )
     return replace(source, start_ns=start_ns, end_ns=end_ns)
 
@@ -93,10 +93,10 @@ def origins_of(
     Raises BadInput if the replay begins with the runs, or an estimates log is from another run.
     """
     if origins and sources[0].start_ns is None:
-        raise BadInput(f"--start-from {origins[0]}: needs a time; give --start too")
+        raise BadInput(f"--start-from {origins[0]}: also give the start time with --start")
     if sigmas and tuple(origins) != ("truth",):
         name, sigma = next(iter(sigmas.items()))
-        raise BadInput(f"--start-sigma {name}={sigma:g}: is for --start-from truth")
+        raise BadInput(f"--start-sigma {name}={sigma:g}: applies only to --start-from truth")
     if not origins:
         return []
     if tuple(origins) == ("truth",):
@@ -132,9 +132,9 @@ def start_from(
     label = bound.name.partition("/")[0]
     for topic in bound.priors.keys() - sources[0].topics.keys():
         raise BadInput(
-            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) that the "
-            "state could replace; leave out --start-from: it begins at the first measurements of the "
-            "span"
+            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) to replace; "
+            f"leave out "
+            "--start-from, and it begins at the first measurements of the span"
         )
     priors = {
         topic: gather(
@@ -183,7 +183,9 @@ def _true_state(
 ) -> Stream:
     topic = f"{prior.topic.rpartition('/')[0]}/truth"
     if topic not in source.topics:
-        raise BadInput(f"{source.name}: no topic {topic} to start from; give --start-from ESTIMATES")
+        raise BadInput(
+            f"{source.name}: there is no topic {topic} to start from; use --start-from ESTIMATES"
+        )
     truth = source.read([topic])[topic]
     where = f"{source.name}: topic {topic}, to start from"
     components = _components(prior, source.name)
@@ -197,8 +199,8 @@ def _true_state(
     mean = truth_at(timed, np.array([start_ns]), list(components.values()), gap_limit_s)
     if not np.isfinite(mean).all():
         raise BadInput(
-            f"{where}: is not known within {gap_limit_s:g} s of the start; give another --start, a "
-            "longer --gap-limit or --start-from ESTIMATES"
+            f"{where}: no truth within {gap_limit_s:g} s of the start; use another --start, a longer "
+            "--gap-limit or --start-from ESTIMATES"
         )
     covariance = _with_sigmas(prior, components, sigmas)
     return _made(prior, start_ns, mean, covariance)
@@ -231,7 +233,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
     # messages with the stamp of the start are replayed and must not be in the prior already
     before = int(np.searchsorted(times_ns, start_ns, side="left"))
     if before == 0:
-        raise BadInput(f"{where}: has no estimate before the start; give a later --start")
+        raise BadInput(f"{where}: there is no estimate before the start; give a later --start")
     last_ns = int(times_ns[before - 1])
     is_over = before == len(stream)
     if is_over and start_ns - last_ns > np.diff(times_ns).max(initial=0):
@@ -258,8 +260,9 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
     if len(own) != 1:
         listed = f"has several: {', '.join(own)}" if own else f"has {', '.join(estimates.topics)}"
         raise BadInput(
-            f"{estimates.name}: one estimate of {', '.join(components)} is needed to start {label} from "
-            f"instead of {prior.topic}; the log {listed}"
+            f"{estimates.name}: need one estimate of {', '.join(components)} to start {label} from "
+            f"instead "
+            f"of {prior.topic}; the log {listed}"
         )
     return own[0]
 
@@ -269,8 +272,9 @@ def _components(prior: Stream, name: str) -> dict[str, Any]:
     found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
     if not found:
         raise BadInput(
-            f"{name}: topic {prior.topic} names no components, so that no state can replace it; "
-            "state them in the channel's metadata"
+            f"{name}: topic {prior.topic} names no components, so no state can replace it; state them "
+            f"in "
+            "the channel's metadata"
         )
     return found
 

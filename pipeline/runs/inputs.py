@@ -76,7 +76,7 @@ def _digest(path: Path) -> str:
         with open_decompressed(path) as file:
             return hashlib.file_digest(cast(BufferedIOBase, file), "sha256").hexdigest()
     except DAMAGED as error:
-        raise BadInput(f"{path}: cannot be read ({error}); give the file whole") from None
+        raise BadInput(f"{path}: cannot be read ({error}); give the complete file") from None
 
 
 def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: str) -> dict[str, bool]:
@@ -112,7 +112,7 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
         return name, {}, name
     if not name.endswith(".toml") and name not in files:
         known = [*recorders, *files]
-        raise BadInput(f"no scenario '{name}', nor is it a .toml file; {choices(name, known)}")
+        raise BadInput(f"no scenario '{name}', and it is not a .toml file; {choices(name, known)}")
     path = files.get(name, Path(name))
     values = read_toml(path)
     recorder, parameters = values.get("recorder"), values.get("parameters", {})

@@ -89,8 +89,8 @@ def require_memory(what: str, need_bytes: float, time_s: float | None = None) ->
     if need_bytes > there_bytes:
         need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
         raise BadInput(
-            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
-            "ask for fewer runs or shorter ones"
+            f"{what} need at least {need} of memory, but {there} are free{time_too}; "
+            "use fewer or shorter runs"
         )
 
 

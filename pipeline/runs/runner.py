@@ -65,7 +65,7 @@ class Runner:
             return [_in_memory(LogSource(open_log(file))) for file in files]
         if not experiment.record:
             raise BadInput(
-                f"experiment '{experiment.title}': has no data; give one of the tables [record], "
+                f"experiment '{experiment.title}': there is no data; add one of the tables [record], "
                 "[import] and [logs]"
             )
         recorder, values, _ = load_scenario(experiment.record.scenario)

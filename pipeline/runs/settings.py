@@ -31,9 +31,8 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
     for label, table in tables.items():
         if label not in labels or not isinstance(table, dict):
             raise BadInput(
-                f"{path}: has settings of {label}, which is not replayed; a settings file has a table "
-                "for each estimator "
-                f"that is replayed: {', '.join(labels)}"
+                f"{path}: has settings of {label}, which is not replayed; a settings file may only have "
+                f"tables for the replayed estimators: {', '.join(labels)}"
             )
     tables = {label: without_named(table, labels[label]) for label, table in tables.items()}
     refuse_programs(tables, path)
@@ -94,12 +93,15 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
         is_table = is_of_topic(key) and isinstance(settings[key], Mapping)
         takers = [label for label in chosen if ("of_topics" if is_table else key) in known[label]]
         if is_of_topic(key) and not is_table:
-            raise BadInput(f"--set {key}: this command takes no settings of topics; leave it out")
+            raise BadInput(f"--set {key}: this command does not accept settings of topics; leave it out")
         if not takers and key in OPTIONS:
-            raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
+            raise BadInput(
+                f"{OPTIONS[key]}: applies only to methods such as ekf, not to {', '.join(labels)}"
+            )
         if not takers and isinstance(settings[key], Mapping) and key in available("estimators"):
             raise BadInput(
-                f"--set {key}: the estimator {key} is not replayed, {', '.join(labels)} is; add -e {key}"
+                f"--set {key}: {key} is not among the replayed estimators ({', '.join(labels)}); add "
+                f"-e {key}"
             )
         if not takers:
             names = sorted(set(chosen).union(*known.values()))

@@ -89,7 +89,7 @@ def parse_over(text: str) -> Over:
 def over_of(key: str, values: Sequence[Any]) -> Over:
     """Make a list of values, logarithmic if evenly spaced so; raises BadInput for duplicates."""
     if len({*map(str, values)}) < len(values) or not values:
-        raise BadInput(f"sweep over {key}: give at least one value, and each once")
+        raise BadInput(f"sweep over {key}: give at least one value, and each only once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]
     steps = np.diff(np.log(numbers)) if len(numbers) == len(values) > 2 else np.zeros(0)
     is_log = len(steps) > 0 and bool(np.allclose(steps, steps[0]))
@@ -103,7 +103,8 @@ def _range(text: str, key: str, parts: Sequence[str]) -> Over:
     numbers = all(isinstance(each, int | float) and math.isfinite(each) for each in (low, high))
     if not numbers or not count.isdecimal() or int(count) < 2 or not low < high or (is_log and low <= 0):
         raise BadInput(
-            f"--over {text}: give KEY=LOW:HIGH:N with LOW below HIGH and N from 2 on, or logN and LOW "
+            f"--over {text}: expected KEY=LOW:HIGH:N with LOW below HIGH and N at least 2, or logN "
+            f"with LOW "
             "above 0, or a list of values"
         )
     space = np.geomspace if is_log else np.linspace
@@ -127,10 +128,14 @@ def points_of(
     """
     keys = [each.key for each in over]
     if not over or len(set(keys)) < len(keys):
-        raise BadInput("a sweep needs at least one parameter, and each once; give --over KEY=LOW:HIGH:N")
+        raise BadInput(
+            "a sweep needs at least one parameter, and each only once; give --over KEY=LOW:HIGH:N"
+        )
     count = math.prod(len(each.taken) for each in over) if samples is None else samples
     if count > MOST_POINTS:
-        raise BadInput(f"the sweep has {count} points; the most are {MOST_POINTS}; give fewer values")
+        raise BadInput(
+            f"the sweep has {count} points; at most {MOST_POINTS} are allowed; give fewer values"
+        )
     if samples is None:
         return [
             dict(zip(keys, point, strict=True))
@@ -188,7 +193,7 @@ def run_sweep(
     for experiment in experiments:
         if experiment.study != "localization":
             raise BadInput(
-                f"{name}: its study, {experiment.study}, makes more than metrics of single runs; run "
+                f"{name}: the study {experiment.study} computes more than metrics of single runs; run "
                 "the points one by one"
             )
         for label, values in experiment.estimators.items():
@@ -314,7 +319,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
         panels.append(panel)
     shared = ", means over the others" if len(over) > 1 else ""
     of = f" of {case}" if case else ""
-    title = f"{label_of(quantity)}{of}{shared}; bands: nine in ten runs"
+    title = f"{label_of(quantity)}{of}{shared}; bands: middle 90 % of runs"
     return Chart(title=title, panels=panels)
 
 

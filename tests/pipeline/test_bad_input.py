@@ -184,7 +184,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "run landmarks --logs -1": ("--logs", "-1"),
     "run landmarks --data mrclam": ("imports nothing", "--data"),
     "run mrclam": ("needs real data", "--data"),
-    "run mrclam --data mrclam --runs 2": ("as many runs as there are", "leave out seed and runs"),
+    "run mrclam --data mrclam --runs 2": ("a fixed number of runs", "leave out seed and runs"),
     "run bingham-2d --runs 1": ("no standard error", "--runs 2"),
     "run acoustic --set options.multipliers=[2]": ("options of study acoustic", "multipliers", "1"),
     "run acoustic --set options.modes=[]": ("options of study acoustic", "modes", "bearings-only"),
@@ -245,7 +245,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     # estimates
     "evaluate zzz.mcap": ("zzz.mcap", "No such file"),
     "evaluate log.mcap": ("log.mcap", "no estimates", "fuselog replay"),
-    "evaluate line.tum": ("line.tum", "not an MCAP", "with --truth the file"),
+    "evaluate line.tum": ("line.tum", "not an MCAP", "with --truth"),
     "evaluate moved/log.estimates.mcap": ("moved/log.mcap", "is missing", "--log"),
     "evaluate log.estimates.mcap --log zzz.mcap": ("zzz.mcap", "No such file"),
     "evaluate log.estimates.mcap --log other.mcap": ("seed 0", "seed 1"),

@@ -66,7 +66,7 @@ def test_links_and_folders_that_others_may_write_to_stay(
 
 
 @pytest.mark.paper
-@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
+@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="disables compilation")
 def test_what_was_compiled_ahead_is_not_compiled_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_fuselog: Callable[..., subprocess.Popen[str]]
 ) -> None:

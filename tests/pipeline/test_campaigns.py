@@ -181,7 +181,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
         with pytest.raises(KeyboardInterrupt):
             run(place)
     assert not place.exists()
-    assert "keeps 1 finished cells; the same command continues with the others" in caplog.text
+    assert "1 finished cells are kept; run the same command again to compute the others" in caplog.text
     half = unfinished(place) / f".{'0' * 64}.bin.abc.part"  # killed while a cell was being kept
     half.mkdir()
     (half / "fuselog.lock").touch()
@@ -360,7 +360,7 @@ def test_what_is_not_ours_stays(tmp_path):
     note.unlink()
     with checkpoints_of(place) as checkpoints:
         checkpoints.begin()
-        with pytest.raises(BadInput, match="another fuselog command is working on it"):
+        with pytest.raises(BadInput, match="another fuselog command is using this folder"):
             run(place, runs=CELL + 2)
 
 
@@ -373,7 +373,7 @@ def test_a_metric_that_cannot_be_pickled_is_bad_input(monkeypatch, tmp_path):
         return done
 
     monkeypatch.setattr(campaigns.Cell, "work_off", unpicklable)
-    with pytest.raises(BadInput, match="what a metric keeps cannot be sent to another process"):
+    with pytest.raises(BadInput, match="the sums of a metric cannot be sent to another process"):
         run(tmp_path / "result", runs=CELL + 2)
 
 
@@ -409,8 +409,8 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     )
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
-    assert "give local:N with a number of workers" in capsys.readouterr().err
-    with pytest.raises(BadInput, match="give local:N with a number of workers"):
+    assert "expected local:N with at least one worker" in capsys.readouterr().err
+    with pytest.raises(BadInput, match="expected local:N with at least one worker"):
         fl.run("landmarks", runs=130, scheduler="local:many", out=tmp_path / "result")
     assert not list(tmp_path.iterdir())
 

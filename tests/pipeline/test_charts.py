@@ -188,7 +188,7 @@ def test_a_sweep_is_curves_over_what_is_swept() -> None:
     values = np.array([[3.0, 1.0, 2.0], [4.0, 6.0, 5.0]])
     [(name, chart)] = figures_of(swept(over, values), over).items()
     assert name == "position_rmse_m-robot1"
-    assert chart.title == "position error, RMS (m) of robot1; bands: nine in ten runs"
+    assert chart.title == "position error, RMS (m) of robot1; bands: middle 90 % of runs"
     wanted = {label: [over[0].taken, own] for label, own in zip(("ekf", "ukf"), values, strict=True)}
     bands = {f"{label} band": [x, 0.9 * own, 1.2 * own] for label, (x, own) in wanted.items()}
     same(held(chart), {"position error, RMS (m) over ekf.sigma_m": {**wanted, **bands}})

@@ -169,7 +169,9 @@ def test_a_cell_that_is_changed_while_others_are_worked_off_is_worked_off_again(
         assert run(place) == contents(prepared["whole"])
         shutil.rmtree(place)
         monkeypatch.setattr(Checkpoints, "read", lambda *_: None)
-        with pytest.raises(BadInput, match="what is kept there is changed by others, or by the disk"):
+        with pytest.raises(
+            BadInput, match="files there are being changed by another program or a faulty disk"
+        ):
             run(place)
     finally:
         shutil.rmtree(place, ignore_errors=True)

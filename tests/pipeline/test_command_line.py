@@ -270,7 +270,7 @@ def test_info_names_the_estimators_of_what_a_fitting_model_leaves(
     assert "  without a model: -e vehicle-particles vehicles; from /vehicle1/prior" in said
     replay = ("replay", "vehicles.mcap", "-e")
     assert "did you mean 'gm-phd'?" in fuselog(*replay, "GM-PHD").err
-    assert "--set ukf: the estimator ukf is not replayed, ekf is; add -e ukf" in (
+    assert "--set ukf: ukf is not among the replayed estimators (ekf); add -e ukf" in (
         fuselog(*replay, "ekf", "--set", "ukf.gate_probability=1").err
     )
 
@@ -355,7 +355,7 @@ def test_the_formulas_of_a_model_are_printed(fuselog: Fuselog) -> None:
     told = fuselog("models", "vehicle", "--formulas", "--json").json
     assert told["formulas"]["mode drive, move"][0].startswith("v1 = ")
     assert "did you mean 'robot'?" in fuselog("models", "robt", "--formulas").err
-    assert "--formulas: give a model" in fuselog("models", "--formulas").err
+    assert "--formulas needs a model" in fuselog("models", "--formulas").err
 
 
 def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog) -> None:
@@ -400,7 +400,7 @@ def test_observability_of_a_log_is_a_command(world: Path, fuselog: Fuselog) -> N
     assert all(row["rank"] == 3 == len(row["eigenvalues"]) for row in rows)
     assert all(row["weakest"] in told.out for row in rows)
     for option, sentence in (
-        ("--window=0", "--window 0: give seconds above zero"),
+        ("--window=0", "--window 0: expected a positive number of seconds"),
         ("--scale=x=1", "x_m"),
     ):
         said = fuselog("observability", str(world / "log.mcap"), option)
@@ -711,7 +711,7 @@ def test_what_is_in_a_log_never_steers_the_terminal(fuselog: Fuselog) -> None:
 def test_runs_without_end_say_what_they_would_take(experiment: str, fuselog: Fuselog) -> None:
     said = fuselog("run", experiment, "--runs", str(10**12))
     assert said.code == 2
-    assert re.search(r"1000000000000 runs of .* take at least .* GB of memory", said.err)
+    assert re.search(r"1000000000000 runs of .* need at least .* GB of memory", said.err)
     assert list(Path().iterdir()) == []
 
 

@@ -104,7 +104,10 @@ def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fu
     again = pd.read_parquet(tmp_path / "again/tables/errors/ekf-robot1.parquet")
     pd.testing.assert_frame_equal(again, errors[errors["run"] == 0].reset_index(drop=True))
     said = fuselog(*judged)
-    assert (said.code, "--errors: errors are written into a result folder" in said.err) == (2, True)
+    assert (said.code, "--errors: individual errors are written into a" in said.err) == (
+        2,
+        True,
+    )
 
 
 def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
@@ -478,10 +481,10 @@ def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
         (["drive-1.mcap"], "name the estimators to replay it with, such as -e ekf"),
         (["drive-1.mcap", "landmarks", "-e", "ekf"], "give only logs and -e"),
         (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give only logs and -e"),
-        (["drive-9.mcap", "-e", "ekf"], "no log has the name drive-9.mcap"),
+        (["drive-9.mcap", "-e", "ekf"], "no log matches drive-9.mcap"),
         (["landmarks", "-e", "ekf"], "give one experiment at a time"),
-        (["drives.toml", "--data", "nowhere"], "no log has the name nowhere"),
-        (["drives.toml", "--runs", "3"], "as many runs as there are"),
+        (["drives.toml", "--data", "nowhere"], "no log matches nowhere"),
+        (["drives.toml", "--runs", "3"], "a fixed number of runs"),
         (["drive-1.mcap", "-e", "ekf", "--set", "ekf.gate=1"], "no parameter 'gate'"),
     ],
 )

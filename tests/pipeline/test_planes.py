@@ -116,7 +116,7 @@ def test_a_truth_in_an_unknown_plane_is_not_judged_until_it_is_stated(
     assert rmse_of(aligned) < SIGMA_M
     bare = fuselog("evaluate", estimates, "--delta", "5")
     assert bare.code == 2
-    assert "cannot be compared as it is: /car/truth does not state the origin" in bare.err
+    assert "cannot be compared without alignment: /car/truth does not state the origin" in bare.err
     for remedy in (("--origin", "60,10"), ("--set", "/car/truth.plane=60,10,0")):
         assert rmse_of(fuselog("replay", log, "-e", "ekf", *remedy, "--json")) < SIGMA_M
         # which evaluate does as the replay did

@@ -351,8 +351,8 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         ),
         (lambda _: fl.import_("mrclam", "nope"), "nope: no such file or folder"),
         (lambda _: fl.run("landmark"), "did you mean 'landmarks'"),
-        (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: no such entry"),
-        (lambda _: fl.write("a.mcap", [1]), "a.mcap: there is nothing to write; give streams"),
+        (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: not an entry"),
+        (lambda _: fl.write("a.mcap", [1]), "a.mcap: these are no streams; give streams"),
         (lambda _: fl.estimators["ekff"], "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(object(), "ekff"), "no method 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(robot(), "ekf:9"), "method ekf has no variants; give 'ekf' without ':9'"),
@@ -376,17 +376,17 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
             lambda runs: fl.replay(runs, {"kind": fl.modelled(robot(), "ekf"), "sigma_range_m": 0.1}),
             'kind, sigma_range_m: these look like settings of one estimator; give them a label: {"mine"',
         ),
-        (lambda runs: fl.replay(runs, [print]), "an estimator is builtin_function_or_method"),
+        (lambda runs: fl.replay(runs, [print]), "expected an estimator, got builtin_function_or_method"),
         (lambda runs: fl.replay(runs, ["ekf", {"ekf": {}}]), "estimator ekf is given twice"),
         (lambda runs: fl.replay(runs, []), "no estimators to replay"),
         (lambda _: fl.replay([], "ekf"), "no logs to replay"),
-        (lambda _: fl.replay([3], "ekf"), "a log to replay is int"),
+        (lambda _: fl.replay([3], "ekf"), "cannot replay a int"),
         (lambda runs: fl.replay(runs, "ekf", metrics="acuracy"), "did you mean 'accuracy'"),
         (lambda runs: fl.replay(runs, "ekf", gap_limit_s=-1.0), "gap_limit_s is -1.0"),
         (lambda runs: fl.replay(runs, "ekf", start_s=float("nan")), "start_s is nan"),
         (
             lambda runs: fl.replay(runs, "ekf", start_s=9.0),
-            "no messages in this span; the log goes from 0 to 4 s",
+            "no messages in this span; the log extends from 0 to 4 s",
         ),
         (lambda runs: fl.replay(runs, "ekf", start_s=1.0), "--start-from truth"),
     ],
@@ -473,7 +473,7 @@ def test_a_figure_shows_a_case() -> None:
     done = fl.replay(fl.record("landmarks", robots=2, **SHORT), "ekf")
     assert done.figure("robot2").get_suptitle().startswith("robot2, 1 run")
     assert done.figure().get_suptitle().startswith("robot1, 1 run")
-    with pytest.raises(fl.BadInput, match="nothing with the name 'robot3' was judged"):
+    with pytest.raises(fl.BadInput, match="no case 'robot3' was judged"):
         done.figure("robot3")
 
 

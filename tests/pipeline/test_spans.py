@@ -282,7 +282,7 @@ def test_a_view_shows_a_span_of_a_log_and_of_estimates(fuselog: Fuselog) -> None
         assert "/map/landmarks" in read(Path(f"{log}.rrd"), static=True)
     refused = fuselog("view", "run.mcap", "--start", "9", "--save", "none.rrd")
     assert refused.code == 2
-    assert "no messages in this span; the log goes from 0 to 4 s" in refused.err
+    assert "no messages in this span; the log extends from 0 to 4 s" in refused.err
     assert not Path("none.rrd").exists()
 
 

@@ -114,7 +114,7 @@ def test_curves_of_a_sweep_are_means_over_the_other_parameters() -> None:
         assert list(around.low) == [each - 0.5 for each in means]
         assert list(around.high) == [each + 2.0 for each in means]
     assert [panel.x.label for panel in chart.panels] == [each.label for each in over]
-    assert chart.title.endswith(" of robot1, means over the others; bands: nine in ten runs")
+    assert chart.title.endswith(" of robot1, means over the others; bands: middle 90 % of runs")
     assert metrics_of(table[table["point"] != 2], 6)["ekf.nees"] == pytest.approx(
         [6.0, 5.0, math.nan, 3.0, 1.0, 2.0], nan_ok=True
     )
@@ -163,9 +163,9 @@ def test_a_heat_map_has_the_first_parameter_upwards_and_a_cross_at_the_least():
         ("robots=", "expected KEY=LOW:HIGH:N"),
         ("robots=2:1:3", "LOW below HIGH"),
         ("robots=0:1:log3", "LOW above 0"),
-        ("robots=1:2:x", "N from 2 on"),
+        ("robots=1:2:x", "N at least 2"),
         ("robots=1,1", "each once"),
-        ("duration_s=1:2:200000", "the most are 100000"),
+        ("duration_s=1:2:200000", "at most 100000 are allowed"),
     ],
 )
 def test_what_cannot_be_swept_is_bad_input(over, sentence, tmp_path, capsys):
@@ -177,5 +177,5 @@ def test_what_cannot_be_swept_is_bad_input(over, sentence, tmp_path, capsys):
 
 
 def test_a_study_of_its_own_is_not_swept(tmp_path):
-    with pytest.raises(BadInput, match="makes more than metrics of single runs"):
+    with pytest.raises(BadInput, match="computes more than metrics of single runs"):
         fl.sweep("torus-filter", {"seed": [1, 2]}, out=tmp_path / "sweep")

@@ -387,9 +387,8 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     refused = fuselog("replay", world / "log.mcap", "-e", "ukf", "--settings", tuned, "-o", tmp_path)
     assert (refused.code, refused.err) == (
         2,
-        f"fuselog: {tuned}: has settings of ekf, which is not replayed; a settings file has a table "
-        "for each estimator "
-        "that is replayed: ukf\n",
+        f"fuselog: {tuned}: has settings of ekf, which is not replayed; a settings file may only "
+        "have tables for the replayed estimators: ukf\n",
     )
     tune = (
         "tune",
