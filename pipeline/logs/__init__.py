@@ -1,1 +1,1 @@
-"""Handles logs as files: information, editing, and export; begin with `information`."""
+"""Logs as files: information, editing and export; begin with `information`."""
