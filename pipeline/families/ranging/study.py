@@ -57,8 +57,8 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
     found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
     if not found:
         raise BadInput(
-            f"{setting.data}: has no {pattern}, nor has a folder in it; give the recording's folder "
-            "or one above it"
+            f"{setting.data}: neither this folder nor one in it has a file {pattern}; give the folder "
+            "of the recording or one above it"
         )
     return found
 

@@ -147,8 +147,8 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
         ends = begin + np.flatnonzero(window.end.holds(state[begin:, :2]))
         if not len(ends):
             raise BadInput(
-                f"{of.recording.path}: its path does not cross the window; set options.windows to "
-                "one of its own, or to {} for all of it"
+                f"{of.recording.path}: the path does not cross the window; set options.windows to a "
+                "window for this path, or to {} to score all of it"
             )
         end = int(ends[0])
     level = np.abs(state[:, 2] - np.median(state[:, 2])) < level_m
@@ -175,5 +175,7 @@ def printed(folder: Path) -> dict[str, float]:
 
 
 UWB_OUTDOOR = Study(
-    "positions from ranges to anchors outdoors, beside published tracks", study, UwbOutdoorOptions
+    "positions from ranges to anchors outdoors, compared with published tracks",
+    study,
+    UwbOutdoorOptions,
 )

@@ -49,8 +49,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         captured = path.with_name(path.name.replace("UWB", "motion_capture", 1))
         if not captured.exists():
             raise BadInput(
-                f"{path}: has no {captured.name} beside it, the motion capture of the run; give the "
-                "folder as published"
+                f"{path}: the motion capture of the run, {captured.name}, is missing in the same "
+                "folder; give the folder as published"
             )
         name = path.stem.removeprefix("UWB").strip("_") or path.parent.name
         pairs.append(Recording(name, path, (captured,)))
@@ -84,7 +84,7 @@ def figures_of(
     rows = (stamps >= begin_ns) & (stamps <= truth.time_ns[-1])
     if not rows.any():
         raise BadInput(
-            f"{of.recording.path}: no estimate of {label} is within the span of the motion capture"
+            f"{of.recording.path}: no estimate of {label} is within the time span of the motion capture"
         )
     error = states["mean"][rows, :3] - truth.at(stamps[rows])
     error[:, 2] = wrap_angle(error[:, 2])

@@ -147,5 +147,5 @@ def error_chart(steps: pd.DataFrame) -> Chart:
 
 
 EXTENDED_TARGET = Study(
-    "sampling filters against exact moments: updates by points of an extended target", study, Options
+    "sampling filters against exact moments: updates with points of an extended target", study, Options
 )

@@ -160,5 +160,5 @@ def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) 
 
 
 LCD_SAMPLING = Study(
-    "samplings of N(0, I): how near they are to it, and what LCD sets cost", study, LcdOptions, runs=""
+    "samplings of N(0, I): distance from it, and cost of LCD sets", study, LcdOptions, runs=""
 )

@@ -100,7 +100,9 @@ def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
         if kind.startswith("lrkf:")
     }
     if not found:
-        raise BadInput("study lrkf-dimension compares samplings: give estimators such as lrkf:ukf")
+        raise BadInput(
+            "study lrkf-dimension compares samplings, but no estimator has one; add one such as lrkf:ukf"
+        )
     return found
 
 

@@ -69,10 +69,9 @@ def state_bounds(
     prefixes = [each for each in prefixes if all(f"{each}/{leaf}" in first for leaf in leaves)]
     if len(prefixes) < 2 or "/landmarks" not in first:
         raise BadInput(
-            f"{sources[0].name}: the bounds of each robot are taken from the others: two robots or "
-            "more with "
-            "odometry, range_bearing and truth are needed, and /landmarks; "
-            f"there are {len(prefixes)} such robots"
+            f"{sources[0].name}: the bounds of each robot are taken from the others, which needs "
+            "/landmarks and at least two robots with odometry, range_bearing and truth; "
+            f"the log has {len(prefixes)} such robots"
         )
     found = {each: [robot_errors(source, each, gap_limit_s) for source in sources] for each in prefixes}
     stated: dict[str, dict[str, str]] = {}

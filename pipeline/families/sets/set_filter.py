@@ -180,5 +180,5 @@ def _chart(summary: pd.DataFrame) -> Chart:
 
 
 SET_FILTER = Study(
-    "guaranteed sets over time: area, containment, what the past helps, faults", study, BoundOptions
+    "guaranteed sets over time: area, containment, benefit of the past, faults", study, BoundOptions
 )

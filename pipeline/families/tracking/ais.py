@@ -62,7 +62,8 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
     ]
     if not tables:
         raise BadInput(
-            "no tracks to judge: the log has no identities, or no estimator gives tracks; give both"
+            "no tracks to judge: the log has no identities, or no estimator outputs tracks; this study "
+            "needs both"
         )
     return pd.concat(tables).rename(columns={"target": "mmsi"})
 

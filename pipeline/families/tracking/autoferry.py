@@ -156,5 +156,5 @@ def _chart(table: pd.DataFrame) -> Chart:
 
 
 AUTOFERRY = Study(
-    "what each sensor adds to tracks of vessels from a moving one", study, AutoferryOptions
+    "tracks of vessels from a moving vessel: the contribution of each sensor", study, AutoferryOptions
 )

@@ -45,7 +45,7 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
             )
     if not wanted:
         raise BadInput(
-            f"{log.path}: has no tracks and no truths in the plane to export to mot; export it as csv"
+            f"{log.path}: has no tracks or truths in the plane to export to mot; export it as csv"
         )
     source = LogSource(log)
     truths = [topic for topic in wanted if _is_truth(log.topics[topic])]
@@ -55,8 +55,8 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
             sizes = f"{topic.rpartition('/')[0]}/set"
             if sizes not in log.topics:
                 raise BadInput(
-                    f"{log.path}: topic {topic}: there is no {sizes} that states how many tracks there "
-                    "are at a time; export it as csv"
+                    f"{log.path}: topic {topic}: topic {sizes}, the number of tracks at each time, is "
+                    "missing; export it as csv"
                 )
             streams = source.read([sizes, topic])
             lines = list(_track_lines(streams[sizes], streams[topic], source.epoch_ns))

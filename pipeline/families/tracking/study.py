@@ -48,7 +48,7 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
     leaves = [f"/estimates/{label}/{leaf}" for leaf in ("set", "track")]
     if not all(leaf in outputs for leaf in leaves):
         raise BadInput(
-            f"estimator {label} gives no tracks, and this study compares trackers; leave it out"
+            f"estimator {label}: outputs no tracks, but this study compares trackers; remove it"
         )
     sizes, tracks = (outputs[leaf].of_run(run) for leaf in leaves)
     return sizes, tracks

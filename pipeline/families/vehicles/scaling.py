@@ -70,7 +70,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: ScalingOptions = setting.options
     if not experiment.record or set(options.methods) != set(experiment.estimators):
         raise BadInput(
-            f"experiment '{experiment.title}': give [record], and a method for every estimator"
+            f"experiment '{experiment.title}': add a [record] table, and an entry in options.methods "
+            "for every estimator"
         )
     rows, sources = [], []
     for count in setting.progress(options.vehicles, "numbers of vehicles", len(options.vehicles)):

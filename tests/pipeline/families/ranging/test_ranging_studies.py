@@ -57,11 +57,11 @@ def test_published_errors_are_found_again_to_four_digits(navigation: Path, case:
 def test_folders_without_a_recording_are_refused(navigation: Path, tmp_path: Path) -> None:
     for name, wanted in (("uwb-pose", "UWB"), ("uwb-outdoor", "trajectory.csv")):
         _, experiment = load_experiment(name, {}, {})
-        with pytest.raises(BadInput, match=rf"has no {wanted}.*; give the recording's folder"):
+        with pytest.raises(BadInput, match=rf"has a file {wanted}.*; give the folder of the recording"):
             run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     shutil.copy(navigation / "uwb_lias" / "UWB_dynamic_exp_mid.csv", tmp_path)
     _, experiment = load_experiment("uwb-pose", {}, {})
-    with pytest.raises(BadInput, match=r"has no motion_capture_dynamic_exp_mid.csv beside it"):
+    with pytest.raises(BadInput, match=r"motion_capture_dynamic_exp_mid.csv, is missing"):
         run_experiment("uwb-pose", experiment, tmp_path / "out", data=tmp_path)
 
 

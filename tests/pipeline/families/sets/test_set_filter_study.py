@@ -51,5 +51,5 @@ def test_the_study_guarantees_and_refuses(tmp_path):
         assert found[f"filter-l8.area_median_m2.{robot}"] >= found[f"filter.area_median_m2.{robot}"]
     assert (tmp_path / "out" / "timeline.rrd").stat().st_size > 0
     _, alone = load_experiment("set-filter", {**SHORT, "robots": 1}, {})
-    with pytest.raises(BadInput, match="two robots or more"):
+    with pytest.raises(BadInput, match="at least two robots"):
         run_experiment(name, alone, tmp_path / "alone")
