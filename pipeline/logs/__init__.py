@@ -1,1 +1,1 @@
-"""Operations on log files: information, editing, and export; begin with `information`."""
+"""Logs as files: information, editing and export; begin with `information`."""

@@ -1,6 +1,6 @@
-"""Derives constraints from an inertial unit's samples: the body stands, its wheels do not slip.
+"""Zero-velocity and non-holonomic pseudo-measurements from the samples of an inertial unit.
 
-It becomes topics of their own, which the model `inertial` takes beside those of sensors.
+They become topics that the model `inertial` uses in addition to those of sensors.
 """
 
 import numpy as np
@@ -13,17 +13,17 @@ from fuselog.recorders.parameters import Parameters
 
 
 class ConstraintParameters(Parameters):
-    """States how often constraints on a body are told, and how it is known that it stands.
+    """Rates of the pseudo-measurements, and thresholds for detecting that the body is at rest.
 
     Attributes:
-        standing_hz: how many times a second it is told whether the body stands; 0 leaves it out.
-        rolling_hz: how many times a second it is told that the body moves neither to the side nor up, as
-            on wheels; 0 leaves it out.
-        window_s: a body is judged by so long before.
-        still_mps2: it stands where the standard deviation of the specific force was below this, and the
-            turn rate below `still_radps`.
-        still_radps: it stands where the root mean square of the turn rate was below this, and the force
-            below `still_mps2`.
+        standing_hz: rate of messages that state whether the body is at rest; 0 for none.
+        rolling_hz: rate of messages that the body moves neither sideways nor up, as on wheels; 0 for
+            none.
+        window_s: length of the window, up to the current time, by which rest is detected.
+        still_mps2: threshold for the standard deviation of the specific force; the body is at rest if
+            this is below it and the turn rate is below `still_radps`.
+        still_radps: threshold for the root mean square of the turn rate; the body is at rest if this is
+            below it and the specific force is below `still_mps2`.
     """
 
     standing_hz: NonNegativeFloat = 5.0
@@ -34,13 +34,15 @@ class ConstraintParameters(Parameters):
 
 
 def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
-    """Make the topics `standing` and `rolling` beside that of a unit: messages hold 1 where it is so.
+    """Make the topics `standing` and `rolling` next to that of a unit.
+
+    Their value is 1 if the body is at rest, or on wheels, and 0 otherwise.
 
     Args:
-        inertial: the unit's samples.
+        inertial: the samples of the unit.
         parameters: see `ConstraintParameters`.
 
-    Raises BadInput where there are no samples, or nothing is asked for.
+    Raises BadInput if there are no samples, or both rates are zero.
     """
     if not len(inertial):
         raise BadInput(f"topic {inertial.topic}: has no samples; give a log with an inertial unit")

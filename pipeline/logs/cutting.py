@@ -1,4 +1,4 @@
-"""Thinning of streams, and the priors of a cut log."""
+"""Decimation of streams, and the topics that a cut log keeps completely."""
 
 import math
 from collections import Counter
@@ -14,7 +14,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 
 
 def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
-    """List maps, priors, and topics all of whose messages have the first stamp of the log."""
+    """List maps, priors, and topics whose messages all have the first stamp of the log."""
     first_ns, _ = LogSource(log).extent("publish_time")
     early: Counter[str] = Counter()
     for block in stream_blocks(log, topics, None, first_ns + 1):
@@ -32,16 +32,16 @@ def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
 
 
 def is_prior(log: Log, topic: str) -> bool:
-    """Test whether a topic is a prior: a Gaussian estimate that no replay has written."""
+    """Test whether a topic is a prior: a Gaussian estimate that was not written by a replay."""
     schema = log.topics[topic].schema_name
     return schema == schemas.GAUSSIAN_ESTIMATE.full_name and not topic.startswith("/estimates/")
 
 
 @dataclass
 class Thinner:
-    """Keeps the first stamp of every interval: so many stamps, or so much time.
+    """A filter that keeps the first stamp of every interval, a number of stamps or a time.
 
-    `stamps` counts those that came before, `last` is the interval of the latest of them.
+    `stamps` is the number of stamps in earlier blocks, `last` the interval of the latest of them.
     """
 
     every: int = 0
@@ -51,11 +51,11 @@ class Thinner:
     last: int | None = None
 
     def thin(self, stream: Stream) -> Stream:
-        """Return what stays of the next block of the topic, which is not empty."""
+        """Decimate the next block of the topic, which must not be empty."""
         times_ns, row = np.unique(stream.publish_time_ns, return_inverse=True)
         if self.every:
             interval = (self.stamps + np.arange(len(times_ns))) // self.every
-        else:  # stamps are rounded to nanoseconds
+        else:  # adds 1 ns, because stamps are rounded
             interval = np.floor((times_ns - self.zero_ns + 1) * (self.rate_hz * 1e-9)).astype(np.int64)
         is_first = np.append(self.last is None or interval[0] != self.last, np.diff(interval) != 0)
         self.stamps += len(times_ns)
@@ -64,7 +64,7 @@ class Thinner:
 
 
 def thinner(topic: str, rate: int | str, zero_ns: int) -> Thinner:
-    """Make what thins a topic as `rate` says: 10 for every tenth stamp, "5Hz" for five a second."""
+    """Make the thinner of a topic: a `rate` of 10 keeps every tenth stamp, "5Hz" five per second."""
     text = str(rate)
     try:
         if text.lower().endswith("hz"):

@@ -1,7 +1,7 @@
-"""Edits logs: a log cut, constrained, several merged into one, topics and components renamed.
+"""Editing of logs: cutting, merging, renaming topics and components, adding pseudo-measurements.
 
-Logs go through block by block, so that memory does not grow with them, into a new log that says in its
-metadata what was done. No log is changed.
+Logs are processed block by block, so that memory does not grow with their length. The result is a new
+log whose metadata states the operation; the original logs are not changed.
 """
 
 from collections import Counter
@@ -45,26 +45,27 @@ def cut(
     decimate: Mapping[str, int | str] | None = None,
     recover: bool = False,
 ) -> Changed:
-    """Write a part of a log: a span of time, some topics, fewer messages.
+    """Write a part of a log: a time span, selected topics, or fewer messages.
 
-    Stamps and the epoch stay, so that seconds of the run mean the same in both logs. Maps, priors and
-    what was said at the first stamp of the log stay whole, whatever the span.
+    Stamps and the epoch do not change, so a time in seconds means the same in both logs. Maps, priors
+    and topics that have messages only at the first stamp of the log are copied completely, regardless of
+    the span.
 
     Args:
         path: the log, or estimates log.
         out: the log to write.
-        start_s: leave out messages published before, in seconds since the run's epoch.
-        end_s: leave out messages published then or later.
-        topics: which, by names or patterns such as "/robot1/*"; none stands for all.
-        decimate: by topic or pattern, every how many stamps to keep one, as 10, or how many a second to
-            keep at most, as "5Hz"; messages of one stamp stay together.
-        recover: read what is whole of a log that was cut off or damaged.
+        start_s: omit messages published before this time, in seconds since the run's epoch.
+        end_s: omit messages published at this time or later.
+        topics: names or patterns of the topics to copy, such as "/robot1/*"; all topics if empty.
+        decimate: decimation by topic or pattern: an integer n keeps every n-th stamp, a rate such as
+            "5Hz" keeps at most that many stamps per second. Messages with the same stamp stay together.
+        recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+        The path of the new log, the number of messages of each topic, and sentences on what is lost.
 
-    Raises BadInput where a name or pattern is of no topic, nothing is in the span, or something else is
-    in the place of the output.
+    Raises BadInput if a name or pattern matches no topic, the span has no messages, or another file
+    exists at the path of the output.
 
     >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=2.0))
@@ -122,22 +123,23 @@ def merge(
     offsets_s: Mapping[str, float] | None = None,
     recover: bool = False,
 ) -> Changed:
-    """Write one log of several that have no topic in common.
+    """Merge several logs that have no topic in common into one.
 
-    Seconds count from the epoch of the first log. Equal stamps stay in the order of the logs.
+    Times in seconds count from the epoch of the first log. Messages with equal stamps are in the order
+    of the logs.
 
     Args:
         paths: the logs.
         out: the log to write.
-        offsets_s: by log, what to add to all of its stamps, where its clock differed from the others'.
-            The sensors' own clock readings stay as they are.
-        recover: read what is whole of logs that were cut off or damaged.
+        offsets_s: offsets to add to all stamps of a log, by log, to correct differences between clocks.
+            The sensors' own clock readings do not change.
+        recover: read the intact parts of logs that were cut off or damaged.
 
     Returns:
-        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+        The path of the new log, the number of messages of each topic, and sentences on what is lost.
 
-    Raises BadInput where two logs have a topic in common, an offset is of no log or takes stamps out of
-    range, or something else is in the place of the output.
+    Raises BadInput if two logs have a topic in common, an offset refers to an unknown log or moves
+    stamps out of range, or another file exists at the path of the output.
 
     >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=2.0))
@@ -188,23 +190,24 @@ def relabel(
     components: Mapping[str, str] | None = None,
     recover: bool = False,
 ) -> Changed:
-    """Write a log with other names of topics and components.
+    """Write a log with renamed topics and components.
 
-    What the log says elsewhere of a renamed topic, such as which truth an estimate is of, follows.
+    References to a renamed topic, such as that of an estimate to its truth, are updated.
 
     Args:
         path: the log, or estimates log.
         out: the log to write.
-        topics: new names by old ones; where both end in a slash, as "/robot1/": "/robot2/", of all
-            topics that begin so. The truth that estimates name need not be in their log.
-        components: new names by old ones, such as "x_m": "east_m", of every topic that has them.
-        recover: read what is whole of a log that was cut off or damaged.
+        topics: new names by old names. If both end in a slash, as "/robot1/": "/robot2/", they are
+            prefixes, and all topics with the old prefix are renamed. Topics to which estimates refer,
+            such as their truth, need not be in the log.
+        components: new names by old names, such as "x_m": "east_m", in all topics that have them.
+        recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+        The path of the new log, the number of messages of each topic, and sentences on what is lost.
 
-    Raises BadInput where there is no such topic or component, two would have one name, or something else
-    is in the place of the output.
+    Raises BadInput if a topic or component does not exist, two would have the same name, or another
+    file exists at the path of the output.
     """
     log, target = open_log(path, recover=recover), Path(out)
     check_files([(target, changed("relabel"))], {"log": [log.path]})
@@ -239,23 +242,23 @@ def constrain(
     settings: Mapping[str, object] | None = None,
     recover: bool = False,
 ) -> Changed:
-    """Write a log with what its inertial unit says of the body: that it stands, that it rolls on wheels.
+    """Write a log with zero-velocity and non-holonomic pseudo-measurements from its inertial unit.
 
-    The topics `standing` and `rolling` come beside the unit's own, see
+    The topics `standing` and `rolling` are added next to that of the unit; see
     `fuselog.pipeline.logs.constraints`.
 
     Args:
         path: the log.
         out: the log to write.
-        unit: the topic of the inertial samples; the only one unless given.
-        settings: of `ConstraintParameters`, such as {"rolling_hz": 10}.
-        recover: read what is whole of a log that was cut off or damaged.
+        unit: the topic of the inertial samples; required if the log has several.
+        settings: values of `ConstraintParameters`, such as {"rolling_hz": 10}.
+        recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+        The path of the new log, the number of messages of each topic, and sentences on what is lost.
 
-    Raises BadInput where it is not clear which unit is meant, the log has such a topic, nothing is asked
-    for, or something else is in the place of the output.
+    Raises BadInput if the unit is ambiguous or missing, the log already has one of the topics, both
+    rates are zero, or another file exists at the path of the output.
     """
     log, target = open_log(path, recover=recover), Path(out)
     check_files([(target, changed("constrain"))], {"log": [log.path]})
@@ -281,7 +284,7 @@ def constrain(
 
 
 def _unit_of(log: Log, unit: str | None) -> str:
-    """Find the topic of inertial samples that is meant; raises BadInput where it is not clear."""
+    """Choose the topic of inertial samples; raise BadInput if it is missing or ambiguous."""
     kind = schemas.INERTIAL_SAMPLE
     units = topics_of(log.topics, kind)
     if not units:
@@ -296,7 +299,7 @@ def _unit_of(log: Log, unit: str | None) -> str:
 
 
 def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int]:
-    """Return what to add to the stamps of each log; raises BadInput where they leave their range."""
+    """Return the offset of each log; raise BadInput if it would move stamps out of their range."""
     paths = [log.path for log in logs]
     for path, offset_s in offsets_s.items():
         if Path(path) not in paths:
@@ -317,7 +320,7 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
 
 
 def _shifted(stream: Stream, offset_ns: int) -> Stream:
-    """Move a stream to another clock: its stamps, and the times by the log's clock in messages."""
+    """Shift the stamps of a stream, and the times in its messages that are by the log's clock."""
     if not offset_ns:
         return stream
     is_ours = stream.schema.full_name in SCHEMAS
@@ -335,7 +338,7 @@ def _shifted(stream: Stream, offset_ns: int) -> Stream:
 
 
 def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
-    """Name topics anew, and those that metadata names, by old names; those that stay are absent."""
+    """Return the new name of each topic to rename, in the log or in metadata only, by old name."""
     stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
     known = [
         *log.topics,
@@ -359,7 +362,7 @@ def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
 
 
 def _check_components(log: Log, components: Mapping[str, str]) -> None:
-    """Raise BadInput where no topic has a component, or one would have two of a name."""
+    """Raise BadInput if no topic has a component, or a topic would have two components of one name."""
     stated = {
         topic: found["components"].split(",")
         for topic, found in ((name, each.metadata) for name, each in log.topics.items())

@@ -1,7 +1,7 @@
-"""Exports logs for other tools: estimates and truths as trajectories, any stream as a table.
+"""Export of logs to other tools: estimates and truths as trajectories, any stream as a table.
 
-A log is read once, block by block, so that memory does not grow with it, but for tracks, which are told
-frame by frame. No file is ever replaced.
+A log is read once, block by block, so that memory does not grow with its length, except for tracks,
+which are exported frame by frame. Existing files are never replaced.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,7 +37,7 @@ FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]
 
 
 class Exported(NamedTuple):
-    """The written files by topic, and sentences on what they do not contain."""
+    """The written files by topic, and sentences on what is missing in them."""
 
     files: dict[str, Path]
     notes: list[str]
@@ -52,23 +52,23 @@ def export(
     topics: Sequence[str] = (),
     recover: bool = False,
 ) -> Exported:
-    """Export topics of a log: trajectories, tracks, tables or what Foxglove shows.
+    """Export topics of a log as trajectories, tracks, tables or messages for Foxglove.
 
     Args:
         path: the log, or estimates log.
-        to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
-            position, and of poses; "mot" has a file of each tracker's tracks and one of all truths, see
-            `fuselog.pipeline.families.tracking.mot`; "csv" and "parquet" are tables; "foxglove" is one
-            log of what its viewers can show, see `fuselog.pipeline.logs.foxglove`.
-        out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
-            "foxglove", the file.
-        topics: which; none stands for all that fit.
-        recover: read what is whole of a log that was cut off or damaged.
+        to: the format. "tum" and "kitti" are trajectories of poses, and of estimates and truths with a
+            position. "mot" has a file of each tracker's tracks and one of all truths, see
+            `fuselog.pipeline.families.tracking.mot`. "csv" and "parquet" are tables. "foxglove" is one
+            log with messages that Foxglove shows, see `fuselog.pipeline.logs.foxglove`.
+        out: the folder of the files, by default named after the log; the file itself for a single topic
+            (except with "mot") and for "foxglove".
+        topics: the topics to export; all suitable topics if empty.
+        recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The files that were written, by topic, and sentences on what is not in them.
+        The written files by topic, and sentences on what is missing in them.
 
-    Raises BadInput where a topic is not there or does not fit, or the place is taken.
+    Raises BadInput if a topic does not exist or does not suit the format, or the output already exists.
     """
     if to not in get_args(To):
         raise BadInput(f"no format '{to}' to export to; {choices(to, get_args(To))}")
@@ -98,7 +98,7 @@ def export(
 
 
 def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[str]:
-    """Choose the topics to export; what does not fit is noted, or refused where it was asked for."""
+    """Choose the topics to export; note unsuitable topics, or raise BadInput if one was requested."""
     chosen = []
     for topic in dict.fromkeys(topics or log.topics):
         if topic not in log.topics:
@@ -131,8 +131,8 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
 
 
 def _export_mirrors(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
-    """Write one log of the companions of all topics that have some."""
-    from fuselog.pipeline.logs.foxglove import mirrors, sentence_of  # which take long to import
+    """Write a log with the Foxglove mirrors of all topics that have one."""
+    from fuselog.pipeline.logs.foxglove import mirrors, sentence_of  # slow to import
 
     check_files([(place, _new("foxglove"))], {"log": [log.path]})
     written = dict.fromkeys(topics, 0)
@@ -149,9 +149,9 @@ def _export_mirrors(log: Log, topics: Sequence[str], place: Path, notes: list[st
 
 
 def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
-    """Write a folder of what an entry point `fuselog.exports` makes of a log.
+    """Write a folder with the files that an entry point of `fuselog.exports` makes from a log.
 
-    It is called with the log and the topics, and returns for each file its topics and its lines.
+    The entry point is called with the log and the topics, and returns the topics and lines of each file.
     """
     frames: FramesOf = load("exports", to)
     files = frames(log, topics)
@@ -166,12 +166,12 @@ def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: 
 
 
 def _new(to: To) -> Kind:
-    """Return the kind of a file that is not there yet."""
+    """Return the kind of an output file that must not exist yet."""
     return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 
 def _is_state(log: Log, topic: str) -> bool:
-    """Tell whether a topic holds estimates, a truth or poses; a prior is none of these."""
+    """Test whether a topic has estimates, a truth or poses; a prior does not count as an estimate."""
     schema = log.topics[topic].schema_name
     is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
     return is_estimate or schema in (schemas.TRUTH_STATE.full_name, schemas.POSE.full_name)
@@ -186,7 +186,6 @@ def _refuse(place: Path) -> None:
 
 
 def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
-    """Write every topic to its file."""
     with ExitStack() as stack:
         write = {
             topic: stack.enter_context(
@@ -203,7 +202,7 @@ def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
 
 @contextmanager
 def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
-    """Write a text file of poses; what they lack is noted."""
+    """Open a text file of poses for writing; note missing orientations and omitted poses."""
     header, lines_of = TRAJECTORIES[to]
     dropped: dict[str, int] = {}
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -225,7 +224,7 @@ def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
 
 @contextmanager
 def _table_file(path: Path, to: To) -> Iterator[Write]:
-    """Write a file of rows, whose columns are those of the first stream that is written."""
+    """Open a table for writing, with the columns of the first stream that is written."""
     import pyarrow.csv
     import pyarrow.parquet
 

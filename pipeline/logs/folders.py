@@ -1,4 +1,4 @@
-"""Search for logs in folders."""
+"""The logs in a folder, for commands that accept folders."""
 
 from pathlib import Path
 
@@ -6,9 +6,9 @@ from fuselog.recorders.errors import BadInput
 
 
 def logs_in(path: Path) -> list[Path]:
-    """List a folder's logs by name, without the estimates beside them; of another path that path.
+    """List the logs in a folder by name, without estimates logs; return any other path as it is.
 
-    Raises BadInput where a folder has none.
+    Raises BadInput if a folder has no logs.
     """
     if not path.is_dir():
         return [path]
@@ -19,5 +19,5 @@ def logs_in(path: Path) -> list[Path]:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """List a folder's logs by name, without the estimates beside them; none where it is no folder."""
+    """List the logs in a folder by name, without estimates logs; return [] if it is not a folder."""
     return [each for each in sorted(folder.glob("*.mcap")) if not each.match("*.estimates.mcap")]

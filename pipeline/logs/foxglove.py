@@ -1,7 +1,7 @@
-"""Makes companions of a log's streams: Foxglove's messages, which its viewers show without fuselog.
+"""The Foxglove mirror of a log's streams: messages that Foxglove shows without fuselog.
 
-They are for viewers alone: no replay reads them, and no command counts them among a log's streams. The
-definitions are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.
+They serve only viewers: no replay reads them, and no command counts them among a log's streams. The
+schemas are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,25 +33,25 @@ with extra("foxglove", "messages of Foxglove"):
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-# The log's own frame has no name; viewers want one.
+# Viewers need a name for the frame of the log, which has none.
 WORLD = "map"
 POINT_M = 0.3
 LABEL_PX = 12.0
 LINE_PX = 2.0
-# A track that is told of no more stays for so long.
+# How long a viewer shows a track after its last message, in seconds.
 TRACK_S = 60
 
 Made = Iterator[tuple[str, Message, int]]
 
 
 def mirrors(stream: Stream) -> Iterator[Mirror]:
-    """Yield the companions of a stream, or of a block of it: none of a prior or of no messages.
+    """Yield the messages of the Foxglove mirror of a stream or of a block of it.
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
-    FrameTransforms; orientations alone are poses at the origin, and lines of sight of moving sensors
-    poses there whose x axis is the line. Ellipses of 95 %, tracks and landmarks become SceneUpdate,
-    particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is `/foxglove`, the
-    stream's, and what it is.
+    FrameTransforms. Orientations without a position become poses at the origin. Lines of sight of moving
+    sensors become poses at the sensor whose x axis is the line. Ellipses of 95 %, tracks and landmarks
+    become SceneUpdate, particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is
+    `/foxglove`, followed by the stream's topic and a word for the content. A prior has no mirror.
     """
     make = _MAKERS.get(stream.schema.full_name)
     is_stated = stream.topic.startswith("/estimates/")
@@ -69,19 +69,19 @@ def mirrors(stream: Stream) -> Iterator[Mirror]:
 
 
 def left_out(log: Log) -> str:
-    """Say which streams of a log have no companion; empty if all have some."""
+    """Return a sentence on the streams of a log without a Foxglove mirror, or "" if all have one."""
     shown = {topic.metadata[MIRROR_OF] for topic in log.mirrors.values()}
     topics = [name for name, topic in log.topics.items() if topic.messages and name not in shown]
     return sentence_of(topics) if topics else ""
 
 
 def sentence_of(topics: Sequence[str]) -> str:
-    """Say that topics have no companion."""
+    """Return a sentence that the topics have no Foxglove mirror."""
     return f"Foxglove has no message for, left out: {some_of(topics)}"
 
 
 def _states(stream: Stream) -> Made:
-    """Make the poses of truths and estimates, and what these are unsure of."""
+    """Make the poses of truths and estimates, and the ellipses of estimates."""
     field = "mean" if "mean" in stream.columns else "state"
     rows = np.flatnonzero(np.isfinite(stream[field]).all(axis=1))
     known = stream.take(rows)
@@ -107,7 +107,7 @@ def _states(stream: Stream) -> Made:
 
 
 def _fixes(stream: Stream) -> Made:
-    """Make positions, turned by the course where there is one."""
+    """Make poses from positions, with the orientation of the course if the fixes have one."""
     places, quaternions = _padded(stream["position_m"]), None
     if "course_rad" in stream.columns:
         heading_rad = 0.5 * np.pi - np.nan_to_num(stream["course_rad"])
@@ -125,19 +125,21 @@ def _orientations(stream: Stream) -> Made:
 
 
 def _turns(stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], quaternions: Floats) -> Made:
-    """Make poses at the origin, turned by quaternions (n, 4) with w first; no rotation is left out."""
+    """Make poses at the origin from quaternions (n, 4) with w first, omitting invalid ones."""
     known = np.isfinite(quaternions).all(axis=1) & (np.linalg.norm(quaternions, axis=1) > 0.0)
     places = np.zeros((np.count_nonzero(known), 3))
     yield from _poses(stream.take(known), rows[known], places, quaternions[known])
 
 
 def _sights(stream: Stream) -> Made:
-    """Make poses of moving sensors, turned so that their x axis is the line of sight."""
+    """Make poses at moving sensors whose x axis is the line of sight."""
     angles = np.stack([stream["azimuth_rad"], -stream["elevation_rad"]], axis=1)
     known = np.flatnonzero(np.isfinite(angles).all(axis=1))
     seen = stream.take(known)
     turned = Rotation.from_quat(seen["quaternion"], scalar_first=True)
-    forward = Rotation.from_euler("y", -0.5 * np.pi)  # from x to z, where both angles are zero
+    forward = Rotation.from_euler(
+        "y", -0.5 * np.pi
+    )  # turns x to z, the line of sight if both angles are zero
     lines = (turned * Rotation.from_euler("YX", angles[known]) * forward).as_quat(scalar_first=True)
     for row, pose in enumerate(_in_frame(seen, seen["position_m"], lines)):
         yield "pose", pose, int(known[row])
@@ -146,7 +148,7 @@ def _sights(stream: Stream) -> Made:
 def _poses(
     stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], places: Floats, quaternions: Floats | None
 ) -> Made:
-    """Make poses, and with an orientation the transforms that they are."""
+    """Make poses, and transforms if there is an orientation."""
     for row, pose in enumerate(_in_frame(stream, places, quaternions)):
         yield "pose", pose, int(rows[row])
         if quaternions is not None:
@@ -162,7 +164,7 @@ def _poses(
 
 
 def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
-    """Yield a pose for each row of places (n, 3) and quaternions (n, 4); the identity without them."""
+    """Yield a pose for each position (n, 3) and quaternion (n, 4), by default the identity."""
     for row, place in enumerate(places):
         pose = PoseInFrame(frame_id=_frame_of(stream))
         pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
@@ -191,7 +193,7 @@ def _location_fixes(stream: Stream) -> Made:
 
 
 def _landmarks(stream: Stream) -> Made:
-    """Make spheres with their numbers, which stay."""
+    """Make spheres that stay visible, labelled with the numbers of the landmarks."""
     scene = SceneUpdate()
     for row, place in enumerate(_padded(stream["position_m"])):
         number = int(stream["landmark_id"][row])
@@ -201,7 +203,7 @@ def _landmarks(stream: Stream) -> Made:
 
 
 def _tracks(stream: Stream) -> Made:
-    """Make all tracks of a stamp: a sphere with the number, and the ellipse."""
+    """Make a scene for each stamp, with a numbered sphere and an ellipse for each track."""
     if not set(PLANE) <= set(stream.components):
         return
     outlines = _outlines(stream)
@@ -231,7 +233,7 @@ def _detections(stream: Stream) -> Made:
 
 
 def _scans(stream: Stream, places: Floats) -> Made:
-    """Make the scene of all places (n, 3) of a stamp."""
+    """Make a message for each stamp with its positions, from positions (n, 3) of all stamps."""
     for rows in _by_stamp(stream):
         poses = PosesInFrame(frame_id=_frame_of(stream))
         poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))
@@ -241,14 +243,14 @@ def _scans(stream: Stream, places: Floats) -> Made:
 
 
 def _by_stamp(stream: Stream) -> Iterator[list[int]]:
-    """Yield the rows of each stamp, sorted by time as they are."""
+    """Yield the rows of each stamp, which are consecutive."""
     stamps = stream.publish_time_ns
     for _, rows in groupby(range(len(stream)), lambda row: stamps[row]):
         yield list(rows)
 
 
 def _outlines(stream: Stream) -> Floats:
-    """Compute the ellipses (n, vertices, 2) of the plane that hold the states with 95 %."""
+    """Compute the ellipses (n, vertices, 2) in the plane with a probability of 95 %."""
     columns = [stream.components.index(name) for name in PLANE]
     return ellipses(stream["mean"][:, columns], covariances_of(stream, PLANE))
 
@@ -278,7 +280,7 @@ def _add_point(entity: Any, place: Floats, label: str, colour: Sequence[int]) ->
 
 
 def _set_pose(pose: Any, place: Floats, quaternion: Floats | None) -> None:
-    """Write a position, and a quaternion with w first."""
+    """Set the position and orientation of a pose, by a quaternion with w first."""
     _set_vector(pose.position, place)
     w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
     pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = x, y, z, w
@@ -298,14 +300,14 @@ def _colour(stream: Stream) -> Sequence[int]:
 
 
 def _padded(places: Floats) -> Floats:
-    """Extend places (n, 1 to 3) to space: what they lack is zero."""
+    """Extend positions (n, 1 to 3) to three dimensions with zeros."""
     padded = np.zeros((len(places), 3))
     padded[:, : places.shape[1]] = places[:, :3]
     return padded
 
 
 def _frame_of(stream: Stream) -> str:
-    """Return the frame that a stream states, else that of the log."""
+    """Return the frame in the stream's metadata, or that of the log."""
     return stream.metadata.get(FRAME) or WORLD
 
 

@@ -1,4 +1,4 @@
-"""Descriptions of logs and of the cache, as text and as JSON."""
+"""Descriptions of the content of a log and of the cache, as text and as JSON."""
 
 import json
 import shlex
@@ -29,14 +29,14 @@ from fuselog.replay.inference.model.binding import topics_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
-MOST_TOPICS = 6  # that one line names
-ESTIMATES = "/estimates/"  # what topics of estimates logs begin with
+MOST_TOPICS = 6  # listed in one line
+ESTIMATES = "/estimates/"  # prefix of topics in estimates logs
 
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
-    """Print what a log holds: the run, how long it is, its topics; of other data, how to import them.
+    """Print the run, duration and topics of a log; for other data, how to import them.
 
-    Of a result folder or a timeline, what is in it.
+    Result folders and timelines are described as well.
     """
     from fuselog.recorders.importers.ros.files.bags import looks_like_bag
 
@@ -98,7 +98,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 def _main_span(log: Log) -> tuple[int, int] | None:
-    """Find the first and last stamp of most messages if others are years from them; None if damaged."""
+    """Find the first and last stamp of most messages if others are years away, otherwise None."""
     try:
         return LogSource(log).main_span
     except BadInput:
@@ -106,7 +106,7 @@ def _main_span(log: Log) -> tuple[int, int] | None:
 
 
 def _findings(log: Log) -> list[Finding]:
-    """Find what the log says of its own faults; of one that is damaged nothing, and that it is."""
+    """Check the log with lint; warn and return no findings if it is damaged."""
     try:
         return lint_source(LogSource(log), portions=1)
     except BadInput as error:
@@ -115,7 +115,7 @@ def _findings(log: Log) -> list[Finding]:
 
 
 class Fitting(NamedTuple):
-    """How a model fits a log: the topics it would use, its methods, or what is missing."""
+    """Whether a model fits a log: the topics that it would use, suitable methods, or what is missing."""
 
     topics: list[str]
     methods: list[str]
@@ -123,7 +123,7 @@ class Fitting(NamedTuple):
 
 
 def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
-    """Find how every registered model fits a log, by name."""
+    """Test how every registered model fits a log, by name."""
     return {name: _fitting(model, topics) for name, model in registered_models().items()}
 
 
@@ -137,7 +137,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     for name, method in METHODS.items():
         if not method.lacks(model):
             try:
-                parameters = combined(model, method).model_construct()  # the defaults need no check
+                parameters = combined(model, method).model_construct()  # defaults need no validation
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))
@@ -146,7 +146,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
 
 
 def estimators_that_fit(log: Log) -> dict[str, list[str]]:
-    """Return which estimators without a model, such as trackers, fit a log, and the topics of each."""
+    """Find the estimators without a model, such as trackers, that fit a log, with their topics."""
     source = LogSource(log)
     found: dict[str, list[str]] = {}
     for name in available("estimators"):
@@ -167,13 +167,13 @@ def _topics_used(bound: Sequence[Bound]) -> list[str]:
 
 
 def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
-    """Print which models and other estimators fit the log; with `is_all` what other models lack."""
+    """Print which models and other estimators fit the log, and with `is_all` what other models need."""
     fittings = fitting_of(log.topics)
     fit = {name: each for name, each in fittings.items() if each.methods}
     others = {name: each for name, each in fittings.items() if name not in fit}
     by_topics: dict[tuple[str, ...], list[str]] = {}
     used = {topic for each in fit.values() for topic in each.topics}
-    # others are loaded, which takes a while, only where a model leaves something to them
+    # other estimators, which are slow to load, are tested only if models do not use all topics
     if is_all or not used.issuperset(set(log.topics) - truths_among(log.topics)):
         for name, topics in estimators_that_fit(log).items():
             by_topics.setdefault(tuple(topics), []).append(name)
@@ -195,13 +195,13 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
 
 
 def _some_topics(topics: Sequence[str]) -> str:
-    """Name topics, or the first few of many."""
+    """List the first topics, and the number of further ones."""
     more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
     return ", ".join(topics[:MOST_TOPICS]) + more
 
 
 def _say_what_to_do(path: Path, log: Log) -> None:
-    """Print whose estimates a log has, and what can be done with them."""
+    """Print the estimators whose estimates a log has, and commands for them."""
     labels = dict.fromkeys(
         topic.removeprefix(ESTIMATES).partition("/")[0]
         for topic in log.topics
@@ -214,7 +214,7 @@ def _say_what_to_do(path: Path, log: Log) -> None:
 
 
 def _show_bag(path: Path, *, as_json: bool) -> None:
-    """Print what a bag of ROS holds that is no MCAP file."""
+    """Print the topics of a ROS bag that is not an MCAP file."""
     from fuselog.recorders.importers.ros.files.bags import open_bag
 
     with open_bag(path) as bag:
@@ -235,7 +235,7 @@ def _say_how_to_import(path: Path) -> None:
 
 
 def show_cache(*, clear: bool, as_json: bool) -> None:
-    """Print how much each folder of the cache holds; where it is cleared, how much that was."""
+    """Print the number and size of the files in each folder of the cache; with `clear`, delete them."""
     place = cache_folder()
     kept = set(kept_files())
     found: dict[str, dict[str, int]] = {}
@@ -295,7 +295,7 @@ def _say_run(run: RunMetadata) -> None:
 
 
 def _changed(run: RunMetadata) -> dict[str, Any]:
-    """Return the parameters that are not the recorder's defaults; all where there is no recorder."""
+    """Return the parameters that differ from the recorder's defaults; all without a known recorder."""
     try:
         described = describe(load("recorders", run.scenario, Recorder).parameters)
     except BadInput:
@@ -306,7 +306,7 @@ def _changed(run: RunMetadata) -> dict[str, Any]:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
-    """Return nested values by their full names."""
+    """Return nested values by their full, dotted names."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, Mapping) and value:

@@ -1,4 +1,4 @@
-"""Descriptions of timelines and result folders."""
+"""Descriptions of timelines and result folders, for `fuselog info`."""
 
 from collections import Counter
 from pathlib import Path
@@ -11,7 +11,7 @@ from fuselog.recorders.errors import BadInput
 
 
 def show_result(folder: Path, *, as_json: bool) -> None:
-    """Print what a result folder holds: what was run, what came of it, its files."""
+    """Print the content of a result folder: what was run, the outcome, and its files."""
     result = read_result(folder)
     if as_json:
         print_json({"path": str(folder), **result.model_dump(mode="json")})
@@ -36,11 +36,11 @@ def _what(result: Result) -> str:
 
 
 def show_timeline(path: Path, *, as_json: bool) -> None:
-    """Print what a timeline shows: its entities, and how many rows each has.
+    """Print the entities of a timeline and the number of rows of each.
 
-    Raises BadInput where it cannot be read.
+    Raises BadInput if the timeline cannot be read.
     """
-    from rerun.chunk import RrdReader  # which takes long to import
+    from rerun.chunk import RrdReader  # slow to import
 
     try:
         reader = RrdReader(str(path))
@@ -49,7 +49,7 @@ def show_timeline(path: Path, *, as_json: bool) -> None:
         for chunk in reader.stream():
             if not chunk.entity_path.startswith("/__"):
                 rows[chunk.entity_path] += chunk.num_rows
-    except Exception as error:  # rerun raises what it likes
+    except Exception as error:  # rerun does not document its exceptions
         raise BadInput(f"{path}: is no timeline that can be read ({error}); save it again") from error
     entities = dict(sorted(rows.items()))
     if as_json:

@@ -1,4 +1,4 @@
-"""Rewrites logs block by block: which topics are taken, what is lost, and the log that is written."""
+"""Rewriting of logs block by block: the choice of topics, notes on what is lost, and the new log."""
 
 import os
 from collections import Counter
@@ -18,12 +18,12 @@ from fuselog.replay.engine.streams.sources import LogSource
 Blocks = Iterator[list[Stream]]
 
 
-# The scenario of a log that does not name one, as estimates of such a log have it.
+# The scenario of a log that does not name one, as in estimates of such a log.
 UNKNOWN = "unknown"
 
 
 class Changed(NamedTuple):
-    """The written log, its number of messages by topic, and further remarks."""
+    """The path of the written log, the number of messages of each topic, and sentences on losses."""
 
     path: Path
     messages: dict[str, int]
@@ -33,7 +33,7 @@ class Changed(NamedTuple):
 def stream_blocks(
     log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
 ) -> Blocks:
-    """Yield blocks of a span, each with its streams in the order of `topics`, which settles ties."""
+    """Yield the blocks of a span, with streams in the order of `topics`, which orders equal stamps."""
     for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
         yield [block[topic] for topic in topics if topic in block]
 
@@ -45,7 +45,7 @@ def write_changed(
     blocks: Iterable[list[Stream]],
     notes: list[str],
 ) -> Changed:
-    """Write the log; topics without messages are in it, as they were."""
+    """Write the log, including topics without messages."""
     messages = Counter({stream.topic: 0 for stream in empty})
     with LogWriter(target, run) as writer:
         writer.write(empty)
@@ -56,12 +56,12 @@ def write_changed(
 
 
 def ranked(log: Log) -> list[str]:
-    """Order the topics as the log declares them: so its writer ordered equal stamps."""
+    """Sort the topics as the log declares them, which is the order of messages with equal stamps."""
     return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
 
 
 def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
-    """Return the topics that are named, or match a pattern; all where there are none."""
+    """Return the topics that match a name or pattern; all topics if there are no patterns."""
     for pattern in patterns:
         if not any(fnmatchcase(topic, pattern) for topic in log.topics):
             raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
@@ -73,7 +73,7 @@ def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
 
 
 def losses_of(log: Log) -> list[str]:
-    """Find what is missing from a log, or is in it beside its topics and is not carried over."""
+    """Describe what is missing in a log, and what it has besides its topics that is not copied."""
     foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
     losses = [log.loss_statement] if log.loss_statement else []
     if log.mirrors:
@@ -96,9 +96,9 @@ def losses_of(log: Log) -> list[str]:
 def readable_log(
     log: Log, topics: Sequence[str], notes: list[str], asked: Sequence[str] = ()
 ) -> list[str]:
-    """Return the topics that are columns; the messages and fields that are left out are noted.
+    """Return the topics that fuselog can read as columns, and note the omitted messages and fields.
 
-    Raises BadInput where a topic that is asked for by name, or every topic, is none.
+    Raises BadInput if a topic requested by name, or every topic, cannot be read.
     """
     chosen = []
     for topic in topics:
@@ -128,7 +128,7 @@ def readable_log(
 
 
 def run_of(log: Log, target: Path) -> RunMetadata:
-    """Return the log's run, with the place of the log that estimates are of, seen from the target."""
+    """Return the run of a log; in estimates, with the path of their log relative to the target."""
     run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
     if "log" not in run.notes:
         return run
@@ -137,7 +137,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
 
 
 def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """Join what the logs say of their run if they are of one, else only their notes, all of them."""
+    """Return the common run of the logs if they have one, otherwise an unknown run with all notes."""
     runs = [run_of(log, target) for log in logs]
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):
@@ -153,6 +153,6 @@ def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) ->
 
 
 def with_operation(run: RunMetadata, command: str, done: str) -> RunMetadata:
-    """Return the run, with what a command did to its log, after what was done before."""
+    """Append an operation to the list of changes in the notes of a run."""
     before = [run.notes[CHANGES]] if CHANGES in run.notes else []
     return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

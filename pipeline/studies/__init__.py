@@ -1,4 +1,4 @@
-"""Studies what the core estimates, and holds what all studies share; begin with `toolkit.localization`.
+"""Studies of the core's estimators, and functions for all studies; begin with `toolkit.localization`.
 
 The studies of families are in `fuselog.pipeline.families`.
 """

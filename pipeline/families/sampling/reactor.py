@@ -50,7 +50,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _in_case(experiment: Experiment, case: str) -> Experiment:
     """Return the experiment with the prior of a case."""
     if experiment.record is None:
-        raise BadInput("study reactor records its own runs; give the experiment a [record] table")
+        raise BadInput("study reactor records its own runs; add a [record] table to the experiment")
     mean = experiment.record.parameters.get("prior_mean", (0.5, 3.5))
     parameters = experiment.record.parameters | {
         "prior_mean": tuple(mean) if case == "printed" else tuple(mean)[::-1]

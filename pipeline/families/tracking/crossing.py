@@ -77,7 +77,7 @@ def _chart(every: pd.DataFrame) -> Chart:
             panel.series.append(curve(str(label), means.index, mean, "line+markers"))
             panel.bands.append(band(str(label), means.index, low, high))
         panels.append(panel)
-    title = "GOSPA (cutoff 20 m) over clutter; bands: where the mean lies with 95 % over the runs"
+    title = "GOSPA (cutoff 20 m) over clutter; bands: 95 % intervals of the mean over the runs"
     return Chart(title=title, panels=panels, columns=3)
 
 

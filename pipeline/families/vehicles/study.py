@@ -34,7 +34,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: VehiclesOptions = setting.options
     if options.reference not in experiment.estimators:
         raise BadInput(
-            f"experiment '{experiment.title}': estimator {options.reference} is missing; add it"
+            f"experiment '{experiment.title}': the reference estimator {options.reference} is missing; "
+            "add it to [estimators]"
         )
     cases: list[Case] = []
     for name, replayed in Runner(experiment, setting).cases(options.cases):

@@ -1,1 +1,1 @@
-"""Studies inertial units: navigation, outages; begin with `gnss_ins`."""
+"""Studies of inertial units: navigation and GNSS outages; begin with `gnss_ins`."""

@@ -1,8 +1,8 @@
-"""Studies a receiver with an inertial unit: how well they bridge outages of a recording.
+"""A study of a GNSS receiver with an inertial unit: how well they bridge outages in a recording.
 
-The fixes of a recording with centimetres of error are withheld for a while, again and again; what a
-filter and a smoother make of the rest is compared with the withheld fixes, and with what takes no
-inertial unit: the last velocity, and a cubic between both ends.
+Fixes with errors of centimetres are withheld in many windows of a recording. The estimates of a filter
+and a smoother are compared with the withheld fixes, and with two methods without an inertial unit:
+extrapolation with the last velocity, and a cubic between both ends.
 """
 
 from collections.abc import Mapping
@@ -44,23 +44,23 @@ from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
-CHI_SQUARE_95 = 7.81  # of three components
-RUNS_AT_ONCE = 2  # in memory, with their estimates
+CHI_SQUARE_95 = 7.81  # for three degrees of freedom
+RUNS_AT_ONCE = 2  # limits memory
 
 
 class GnssInsOptions(Parameters):
-    """States the protocol of the outages.
+    """The protocol of the outages.
 
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
-        delayed: label of a smoother that takes back the mapping's delay of the velocity, if any.
+        delayed: label of a smoother that undoes the mapping's delay of the velocity, or "".
         lengths_s: lengths of the outages, in s.
-        first_s: when the first window begins, since the receiver's first row.
-        every_s: time from one window's beginning to the next one's.
-        apart: windows share a run that are so many times `every_s` apart.
-        settle_s: fixes are used from so long after the first inertial sample on.
-        innovations_from_s: from when on innovations count.
+        first_s: start of the first window, in s after the receiver's first row.
+        every_s: time between the starts of successive windows.
+        apart: windows in the same run start `apart` times `every_s` after one another.
+        settle_s: time after the first inertial sample from which fixes are used.
+        innovations_from_s: time after the receiver's first row from which innovations count.
     """
 
     filter: str = "ekf"
@@ -75,7 +75,7 @@ class GnssInsOptions(Parameters):
 
 
 class Innovations(NamedTuple):
-    """Holds NIS of one kind of measurement where the fix was good: mean, share above 95 %, by axis."""
+    """NIS of one kind of measurement at good fixes: mean, share above the 95 % limit, mean by axis."""
 
     nis: float
     share_above: float
@@ -87,7 +87,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: GnssInsOptions = setting.options
     experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)
-    # the longest come first: the first run is drawn
+    # the longest come first, because the first run is drawn
     windows = {
         length_s: windows_of(rows, length_s, options.first_s, options.every_s)
         for length_s in sorted(options.lengths_s, reverse=True)
@@ -134,7 +134,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     end = dict(zip(last.components, last["mean"][-1].tolist(), strict=True))
     for name in [each for each in end if "_bias_" in each]:
         outcome.metrics[f"{options.filter}.end_{name}"] = end[name]
-    started = outputs.get(f"/estimates/{options.filter}/started")  # none of a log with a prior
+    started = outputs.get(f"/estimates/{options.filter}/started")  # missing if the log has a prior
     begun = [] if started is None else sentences_of(started.stream)
     notes = [*whole.run.notes.items(), *((sentence, "") for sentence in begun)]
     outcome.tables |= {
@@ -150,7 +150,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """Return the one folder at --data or below that has all files of the mapping."""
+    """Find the folder at --data or below that has all files of the mapping.
+
+    Raises BadInput if there are several.
+    """
     assert setting.data is not None
     assert experiment.import_ is not None
     mapping = read_mapping(str(experiment.import_.parameters.get("mapping", "")))
@@ -162,7 +165,7 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
-    """Return the experiment whose estimator `delayed` takes velocities at their rows' stamps."""
+    """Set the velocity delay of the estimator `delayed` such that it undoes that of the mapping."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
@@ -178,7 +181,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """Return the recording with the fixes that are used, and the rows of the receiver."""
+    """Import the recording, without fixes before `settle_s`, and the rows of the receiver."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))
@@ -194,7 +197,7 @@ def _recording(
 def innovations_of(
     outputs: Mapping[str, Ragged], rows: Rows, options: GnssInsOptions
 ) -> dict[str, Innovations]:
-    """Judge the filter's innovations of positions and velocities in the run without outages."""
+    """Compute the NIS of positions and velocities of the filter in the run without outages."""
     stream = outputs[f"/estimates/{options.filter}/innovation"].stream
     size = stream["innovation"].shape[1]
     covariance = stream["covariance"].reshape(-1, size, size)
@@ -216,7 +219,7 @@ def innovations_of(
 
 
 def _chart(errors: pd.DataFrame) -> Chart:
-    """Draw the error since the beginning of outages, root mean square over the windows of a length."""
+    """Draw the RMS error over the windows of each length against the time since the outage began."""
     panels = []
     for length_s, rows in errors.sort_values("length_s", kind="stable").groupby("length_s"):
         panel = Panel(

@@ -1,8 +1,8 @@
-"""Studies grades of inertial units: how far off a body is, the longer its receiver is silent.
+"""A study of grades of inertial units: how position errors grow during an outage of the receiver.
 
-The same drives with units of several grades, and an outage in the middle. Of n runs the largest error is
-above that which a share q of all runs stays below, with the probability 1 - q^n: .95 for 59 runs and
-q = .95 (Wilks, Annals of Mathematical Statistics 12(1), 1941).
+The same drives, with an outage in the middle, are recorded with units of several grades. The largest
+error of n runs exceeds the q-quantile of the errors with the probability 1 - q^n: 0.95 for 59 runs and
+q = 0.95 (Wilks, Annals of Mathematical Statistics 12(1), 1941).
 """
 
 from typing import NamedTuple
@@ -21,11 +21,11 @@ from fuselog.recorders.simulators.navigation_parameters import NavigationParamet
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.errors.evaluation import Errors
 
-AFTER_S = (10.0, 20.0, 30.0)  # since the last fix: when errors become metrics
+AFTER_S = (10.0, 20.0, 30.0)  # times since the last fix whose errors become metrics
 
 
 class Options(Parameters):
-    """States the grades.
+    """The grades of inertial units.
 
     Attributes:
         grades: parameters of the scenario's inertial unit, by grade.
@@ -35,7 +35,7 @@ class Options(Parameters):
 
 
 class Span(NamedTuple):
-    """Holds an outage, in s since a run's epoch."""
+    """The time span of an outage, in s since the epoch of the run."""
 
     begin_s: float
     end_s: float
@@ -72,7 +72,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def outage_of(source: MemorySource) -> Span:
-    """Return the outage of a drive; BadInput where it has none, or more than one."""
+    """Return the outage of a drive; raise BadInput if it does not have exactly one."""
     given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
     if len(given) != 1:
         raise BadInput(
@@ -82,7 +82,7 @@ def outage_of(source: MemorySource) -> Span:
 
 
 def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
-    """Return how far off an estimator is (m) in every run, so many seconds after the outage began."""
+    """Tabulate the horizontal errors (m) during the outage by run and time since its beginning."""
     inside = (errors.elapsed_s >= span.begin_s) & (errors.elapsed_s < span.end_s)
     plane = [errors.components.index(name) for name in ("x_m", "y_m")]
     error_m = np.linalg.norm(errors.error[inside][:, plane], axis=1)
@@ -91,7 +91,7 @@ def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
 
 
 def _chart(largest: pd.DataFrame) -> Chart:
-    """Draw the largest error over the time since the last fix, by grade and estimator."""
+    """Draw the largest error against the time since the last fix, by grade and estimator."""
     panel = Panel(
         x=Axis(label="time since the last fix (s)"),
         y=Axis(label="95 % of drives are within (m)", log=True),

@@ -1,7 +1,7 @@
-"""Makes outages of a receiver: withholds fixes of a recording; errors where they are known.
+"""Artificial outages of a receiver: withheld fixes of a recording, and errors at them.
 
-A window is a span whose fixes and velocities are withheld entirely, by the times of the receiver's rows.
-Windows that lie far enough apart share a run. Errors are horizontal, at the withheld rows.
+A window is a span in which all fixes and velocities are withheld, by the times of the receiver's rows.
+Windows that are far enough apart share a run. Errors are horizontal, at the withheld rows.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,17 +23,17 @@ from fuselog.replay.engine.vectors.tangent import states_at
 FIX, VELOCITY, TRUTH, INERTIAL = "/fix", "/velocity", "/truth", "/inertial"
 NEEDED = (FIX, VELOCITY, TRUTH, INERTIAL)
 COASTED, HERMITE = "constant-velocity", "hermite"
-# Estimates that lie further apart are not interpolated.
+# Estimates that are further apart, in seconds, are not interpolated.
 _GAP_S = 1.0
 
 
 class Rows(NamedTuple):
-    """Holds what the receiver wrote, a row for every fix; the plane is that of east and north.
+    """The output of the receiver, with a row for every fix, in the plane of east and north.
 
     Attributes:
-        time_ns: (n,), as it is written.
-        place: (n, 2), NaN where it is not known well enough to be a truth.
-        velocity: (n, 2), of the row, whenever that was measured.
+        time_ns: stamps as written by the receiver, (n,).
+        place: positions in m, (n, 2); NaN if they are not accurate enough to be a truth.
+        velocity: velocities in m/s, (n, 2), as written in the row, without correction of a delay.
     """
 
     time_ns: Integers
@@ -42,12 +42,12 @@ class Rows(NamedTuple):
 
     @property
     def since_s(self) -> Floats:
-        """Return seconds since the first row."""
+        """Return the seconds since the first row."""
         return (self.time_ns - self.time_ns[0]) * 1e-9
 
 
 class Window(NamedTuple):
-    """Holds a span (s since the first row) whose rows, by their numbers, are withheld."""
+    """A time span (s since the first row) that is withheld, and the indices of its rows."""
 
     length_s: float
     start_s: float
@@ -55,12 +55,12 @@ class Window(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return what the window is called among the cases."""
+        """Return the name of the window among the cases."""
         return f"{self.length_s:g}s-at-{self.start_s:g}s"
 
 
 def rows_of(source: MemorySource) -> Rows:
-    """Read the receiver's rows; raises BadInput where a topic is missing or has no message."""
+    """Read the receiver's rows; raise BadInput if a topic is missing or has no messages."""
     for topic in NEEDED:
         if topic not in source.topics or not source.topics[topic].messages:
             why = "; rows with a fixed solution make it, and there are none" if topic == TRUTH else ""
@@ -69,7 +69,7 @@ def rows_of(source: MemorySource) -> Rows:
                 f"{', '.join(NEEDED)}"
             )
     fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
-    # a delay that the mapping states moves publish times alone
+    # a delay in the mapping changes only publish times
     time_ns = fix.log_time_ns
     place, speed = np.full((len(fix), 2), np.nan), np.full((len(fix), 2), np.nan)
     for into, stream, values in (
@@ -82,7 +82,7 @@ def rows_of(source: MemorySource) -> Rows:
 
 
 def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> list[Window]:
-    """Find the windows of a length with truth in all rows, and in those before and after."""
+    """Find the windows of a length with truth in all rows, including the rows before and after."""
     since_s = rows.since_s
     found = []
     for start_s in np.arange(first_s, since_s[-1] - length_s, every_s).tolist():
@@ -95,7 +95,7 @@ def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> l
 
 
 def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[Window]]:
-    """Share windows of a length among runs: `apart` steps of `every_s` lie between their starts."""
+    """Distribute windows of a length over runs, with `apart` steps of `every_s` between their starts."""
     shared: dict[int, list[Window]] = {}
     for window in windows:
         shared.setdefault(round((window.start_s - windows[0].start_s) / every_s) % apart, []).append(
@@ -105,7 +105,7 @@ def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[
 
 
 def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> MemorySource:
-    """Return the recording without the rows of windows, of which it tells as outages."""
+    """Remove the rows of the windows from the recording, and add the topic of its outages."""
     gone_ns = np.concatenate([rows.time_ns[:0], *(rows.time_ns[each.rows] for each in windows)])
     streams = dict(source.streams)
     for topic in (FIX, VELOCITY):
@@ -118,16 +118,16 @@ def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> Mem
 
 
 def coasted(rows: Rows, window: Window) -> Floats:
-    """Compute errors (m, 2) of the place and the velocity, as they are printed, of the row before."""
+    """Compute the errors (m, 2) of extrapolation from the row before, with its written velocity."""
     before = window.rows[0] - 1
     ahead_s = (rows.since_s[window.rows] - rows.since_s[before])[:, None]
     return rows.place[before] + ahead_s * rows.velocity[before] - rows.place[window.rows]
 
 
 def hermite(rows: Rows, window: Window) -> Floats:
-    """Compute errors (m, 2) of the cubic through the places and velocities of the rows at both ends.
+    """Compute the errors (m, 2) of the cubic through positions and velocities of the rows at both ends.
 
-    It is the smoother of a white acceleration.
+    This is the smoother for white-noise acceleration.
     """
     ends = [window.rows[0] - 1, window.rows[-1] + 1]
     between = CubicHermiteSpline(rows.since_s[ends], rows.place[ends], rows.velocity[ends])
@@ -135,7 +135,7 @@ def hermite(rows: Rows, window: Window) -> Floats:
 
 
 def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float]:
-    """Compute errors (m, 2) of estimates, NaN for none, and their NEES at the last withheld row."""
+    """Compute errors (m, 2) of estimates, NaN if missing, and their NEES at the last withheld row."""
     time_ns = rows.time_ns[window.rows]
     plane = [states.components.index(name) for name in ("x_m", "y_m")]
     place = states["mean"][:, plane]
@@ -152,7 +152,7 @@ def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float
 def error_table(
     rows: Rows, runs: Sequence[Sequence[Window]], outputs: Mapping[str, Ragged], labels: Sequence[str]
 ) -> pd.DataFrame:
-    """Tabulate by withheld row and estimator: window, seconds since its start, error, NEES at its end.
+    """Tabulate window, time since its start, error and final NEES by withheld row and estimator.
 
     `runs` are the windows of each run of the outputs.
     """
@@ -187,7 +187,7 @@ def _errors(
 
 
 def window_table(errors: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate by window and estimator the error at the end, the RMSE over the window, the NEES."""
+    """Tabulate the error at the end, the RMSE over the window and the NEES by window and estimator."""
     by = errors.groupby(["estimator", "length_s", "start_s", "window"], sort=False)
     found = by.agg(
         end_m=("error_m", "last"),
@@ -198,7 +198,7 @@ def window_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def length_table(windows: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate by estimator and length the RMS errors over the windows, and the mean NEES."""
+    """Tabulate the RMS errors over the windows and the mean NEES by estimator and length."""
     by = windows.groupby(["estimator", "length_s"], sort=False)
     found = by.agg(
         windows=("window", "size"),

@@ -1,1 +1,1 @@
-"""Holds what studies of any family share; begin with `localization`."""
+"""Studies and functions shared by all families; begin with `localization`."""

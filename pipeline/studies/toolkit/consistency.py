@@ -1,8 +1,8 @@
-"""Studies consistency: whether errors are what covariances say, once an estimator is aligned.
+"""A study of consistency: whether errors agree with the covariances after an estimator is aligned.
 
-That of `localization`, and of all stamps from `aligned_s` on the share at which the mean NEES of the
-runs lies in its 95 % interval, and the mean of these. Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 2001, section 5.4.2.
+In addition to the metrics of `localization`, it gives the share of stamps from `aligned_s` on at which
+the mean NEES of the runs is within its 95 % interval, and the mean of these NEES. Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
 """
 
 from pydantic import NonNegativeFloat
@@ -14,10 +14,10 @@ from fuselog.recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
-    """States when estimators count.
+    """When estimators count as aligned.
 
     Attributes:
-        aligned_s: estimators count from then on, since a run's epoch.
+        aligned_s: time since the run's epoch from which estimates are judged.
     """
 
     aligned_s: NonNegativeFloat = 0.0

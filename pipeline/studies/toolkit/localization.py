@@ -1,7 +1,7 @@
-"""Studies estimators that follow a moving thing: errors, consistency, innovations.
+"""A study of estimators that track a moving object: errors, consistency, innovations.
 
-It is what most experiments need: record or import, replay, judge, draw. Families with claims of a paper
-add their own tables, figures and claims.
+Most experiments use it: record or import, replay, judge, draw. Families that reproduce the claims of a
+paper have studies with additional tables, figures and metrics.
 """
 
 from fuselog.pipeline.output.results import Outcome

@@ -1,8 +1,8 @@
-"""Repeats a paper's Monte Carlo experiment: step k over all runs of an ensemble is one repetition.
+"""Repetitions of a paper's Monte Carlo experiment: step k of all runs of an ensemble is one repetition.
 
-A log that holds the same experiment several times over, with fresh noise, gives one estimate each. So an
-ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a rule that a paper states
-for its 100 runs can be tried as often.
+A log can contain the same experiment several times, with new noise and one estimate each time. An
+ensemble of 100 runs with 10 steps thus repeats a paper's 100 runs ten times, and a rule that the paper
+states for its 100 runs can be tested ten times.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,12 @@ from fuselog.recorders.errors import BadInput
 from fuselog.replay.judging.errors.evaluation import Errors
 
 Floats = NDArray[np.float64]
-# Where a mean NEES lies with 95 %.
+# The label of the 95 % interval of a mean NEES.
 EFFICIENT = "95 % if efficient"
 
 
 def require_spread(solutions: int) -> None:
-    """Raise BadInput where `solutions` of one experiment have no standard error."""
+    """Raise BadInput if there are too few `solutions` of an experiment for a standard error."""
     if solutions < 2:
         raise BadInput(
             "one run gives no standard error, by which claims are judged; give --runs 2 or more"
@@ -31,7 +31,7 @@ def require_spread(solutions: int) -> None:
 
 
 def errors_named(replayed: Replayed, estimator: str) -> Errors:
-    """Return the errors of an estimator that has one estimate stream."""
+    """Return the errors of an estimator that has a single stream of estimates."""
     [errors] = [each for each in replayed.errors if each.estimator == estimator]
     return errors
 
@@ -40,12 +40,12 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
     """Arrange the values of estimates by repetition and run.
 
     Args:
-        errors: of n estimates; says of which step and run each is.
-        values: (n, ...), of these.
-        runs: how many runs there are.
+        errors: errors of n estimates, with the step and run of each.
+        values: values of these estimates, (n, ...).
+        runs: number of runs.
 
     Returns:
-        (repetitions, runs, ...), NaN where a solution failed.
+        Values (repetitions, runs, ...), NaN if a solution failed.
     """
     repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
     repeated[errors.step, errors.run] = values
@@ -53,25 +53,25 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
 
 
 def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
-    """Compute the root mean square, leaving out what is NaN.
+    """Compute the root mean square, ignoring NaN.
 
     Args:
-        values: of any shape.
-        axis: the axis, or axes, over which the mean is taken.
+        values: values of any shape.
+        axis: axis or axes over which the mean is taken.
 
     Returns:
-        Of the shape of `values` without these axes.
+        The root mean square, with the shape of `values` without these axes.
     """
     return np.sqrt(np.nanmean(values**2, axis=axis))
 
 
 def rms_length(errors: Floats) -> float:
-    """Return the root mean square of the lengths of errors (n, d); NaN of none."""
+    """Compute the root mean square of the lengths of errors (n, d), NaN for n = 0."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else np.nan
 
 
 def rmse_of_runs(errors: Errors, runs: int) -> Floats:
-    """Return the root mean square length of every run's errors (runs,); NaN for a run without any."""
+    """Compute the root mean square length of the errors of each run (runs,), NaN without errors."""
     squared = np.sum(errors.error**2, axis=1)
     count = np.bincount(errors.run, minlength=runs)
     with np.errstate(invalid="ignore"):
@@ -79,10 +79,10 @@ def rmse_of_runs(errors: Errors, runs: int) -> Floats:
 
 
 def table_of_runs(quantity: str, cases: Mapping[str, Mapping[str, Floats]]) -> pd.DataFrame:
-    """Make the table by which reports compare estimators: a row per estimator, case and run.
+    """Make the table with which reports compare estimators: a row per estimator, case and run.
 
     Args:
-        quantity: the name of what is listed, as in the metrics.
+        quantity: name of the listed quantity, as in the metrics.
         cases: values (runs,) by case and estimator.
     """
     return pd.DataFrame(
@@ -97,15 +97,16 @@ def table_of_runs(quantity: str, cases: Mapping[str, Mapping[str, Floats]]) -> p
 
 
 def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:
-    """Compute how far a paper's RMSEs are from ours, in standard errors.
+    """Compute the largest deviation of a paper's RMSEs from ours, in standard errors.
 
     Args:
-        printed: (k,), the paper's RMSEs.
-        squared: (n, k), our squared errors, NaN where a solution failed.
-        runs: how many runs the paper has.
+        printed: RMSEs in the paper, (k,).
+        squared: our squared errors, (n, k), NaN if a solution failed.
+        runs: number of runs in the paper.
 
     Returns:
-        The largest of k deviations, and what it exceeds with 5 % where both are of one distribution.
+        The largest of the k deviations, and the value that it exceeds with a probability of 5 % if both
+        have the same distribution.
     """
     mean = np.nanmean(squared, axis=0)
     error = np.nanstd(squared, axis=0) * np.sqrt(1.0 / runs + 1.0 / len(squared))
@@ -116,7 +117,7 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
 def groups(
     values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
 ) -> tuple[Axis, list[Series]]:
-    """Draw values side by side in named groups: an axis of groups, and a series per place in them."""
+    """Draw values side by side in named groups: an axis of groups, and a series per position in them."""
     size = max(len(group) for group in values)
     series = []
     for place in range(size):
