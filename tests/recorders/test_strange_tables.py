@@ -205,7 +205,12 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
         [FIX],
         "1e.03 times too small",
     ),
-    "whole seconds": ({"t": np.floor(STAMPS_S)}, TIME, [ODOMETRY], "the first of the two .* has no effect"),
+    "whole seconds": (
+        {"t": np.floor(STAMPS_S)},
+        TIME,
+        [ODOMETRY],
+        "the first of the two .* has no effect",
+    ),
 }
 
 
