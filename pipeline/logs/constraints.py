@@ -71,5 +71,5 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
             )
             found.append(stream)
     if not found:
-        raise BadInput("standing_hz and rolling_hz are both zero; give one of them above zero")
+        raise BadInput("standing_hz and rolling_hz are both zero; set at least one above zero")
     return found

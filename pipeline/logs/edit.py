@@ -85,11 +85,11 @@ def cut(
             thinners[topic] = thinner(pattern, rate, zero_ns)
     once = [] if source.start_ns is source.end_ns is None else static_topics(log, chosen)
     if once:
-        notes.append(f"kept whole, whatever the span: {', '.join(once)}")
+        notes.append(f"copied completely, regardless of the span: {', '.join(once)}")
     if start_s is not None and any(is_prior(log, topic) for topic in once):
         notes.append(
             f"the prior is older than this part: replay it with --start {start_s:g} --start-from truth, "
-            "or from the estimates of an earlier replay"
+            "or start from the estimates of an earlier replay"
         )
 
     def blocks() -> Blocks:
@@ -151,7 +151,7 @@ def merge(
     target = Path(out)
     if len(paths) < 2:
         raise BadInput(
-            f"{', '.join(map(str, paths))}: one log has nothing to be merged with; give at least two"
+            f"{', '.join(map(str, paths))}: merging needs at least two logs; give another one"
         )
     logs = [open_log(path, recover=recover) for path in paths]
     check_files([(target, changed("merge"))], {"log": [log.path for log in logs]})
@@ -163,8 +163,8 @@ def merge(
         common = [name for name in names if name in holder]
         if common:
             raise BadInput(
-                f"{log.path}: topic {common[0]} ({len(common)} in all) is in {holder[common[0]]} too; "
-                f"rename it in one first, such as: fuselog relabel {log.path} --topic /=/b/ -o NEW"
+                f"{log.path}: topic {common[0]} ({len(common)} in all) is also in {holder[common[0]]}; "
+                f"rename it in one log first, such as: fuselog relabel {log.path} --topic /=/b/ -o NEW"
             )
         holder |= dict.fromkeys(names, log.path)
     blocks = (
@@ -268,12 +268,12 @@ def constrain(
     for stream in added:
         if stream.topic in log.topics:
             raise BadInput(
-                f"{log.path}: has a topic {stream.topic} already; rename it first with fuselog relabel"
+                f"{log.path}: already has a topic {stream.topic}; rename it first with fuselog relabel"
             )
     notes = losses_of(log)
     for stream in added:
         held, total = int(stream["value"].sum()), len(stream)
-        notes.append(f"{stream.topic}: holds at {held} of {total} stamps")
+        notes.append(f"{stream.topic}: true at {held} of {total} stamps")
     chosen = readable_log(log, ranked(log), notes)
     empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
     names = " ".join(stream.topic for stream in added)
@@ -288,7 +288,7 @@ def _unit_of(log: Log, unit: str | None) -> str:
     kind = schemas.INERTIAL_SAMPLE
     units = topics_of(log.topics, kind)
     if not units:
-        raise BadInput(f"{log.path}: has no inertial unit, no topic of {kind.full_name}")
+        raise BadInput(f"{log.path}: has no inertial unit (topic of type {kind.full_name})")
     if unit is None and len(units) > 1:
         raise BadInput(
             f"{log.path}: has several inertial units; choose one with --unit: {', '.join(units)}"
@@ -305,7 +305,7 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
         if Path(path) not in paths:
             raise UnknownName(f"no log {path} to merge; {choices(path, list(map(str, paths)))}")
         if not abs(offset_s) <= 1e9:
-            raise BadInput(f"offset of {path}: is {offset_s}; give seconds, such as 0.5")
+            raise BadInput(f"offset of {path}: is {offset_s}; give a number of seconds, such as 0.5")
     by_path = {Path(path): round(offset_s * 1e9) for path, offset_s in offsets_s.items()}
     found = [by_path.get(path, 0) for path in paths]
     for log, offset_ns in zip(logs, found, strict=True):
@@ -313,8 +313,8 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
         stamps_ns = [*source.extent("publish_time"), *source.extent("log_time")]
         if min(stamps_ns) + offset_ns < 0 or max(stamps_ns) + offset_ns >= 2**63:
             raise BadInput(
-                f"{log.path}: an offset of {offset_ns * 1e-9:g} s takes its stamps out of the years "
-                "1970 to 2262; give a smaller one"
+                f"{log.path}: an offset of {offset_ns * 1e-9:g} s moves stamps outside the years 1970 "
+                "to 2262; give a smaller one"
             )
     return found
 
@@ -348,8 +348,8 @@ def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
     for old, new in topics.items():
         if not new.startswith("/") or not new.isprintable() or old.endswith("/") != new.endswith("/"):
             raise BadInput(
-                f"relabel {old}={new}: expected a topic for a topic, as /old=/new, or a beginning for a "
-                "beginning, as /robot1/=/robot2/"
+                f"relabel {old}={new}: expected two topics, as in /old=/new, or two prefixes, as in "
+                "/robot1/=/robot2/"
             )
         found = [name for name in known if name == old or (old.endswith("/") and name.startswith(old))]
         if not found:
@@ -357,7 +357,9 @@ def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
         names |= {name: new + name.removeprefix(old) for name in found}
     for name, count in Counter(names.get(topic, topic) for topic in log.topics).items():
         if count > 1:
-            raise BadInput(f"{log.path}: {count} topics would be {name}; give each a name of its own")
+            raise BadInput(
+                f"{log.path}: {count} topics would have the name {name}; give each a different name"
+            )
     return names
 
 
@@ -379,5 +381,5 @@ def _check_components(log: Log, components: Mapping[str, str]) -> None:
         twice = [name for name in after if after.count(name) > 1]
         if twice and after != names:
             raise BadInput(
-                f"{log.path}: topic {topic} would have two components {twice[0]}; give another name"
+                f"{log.path}: topic {topic} would have two components {twice[0]}; give a different name"
             )

@@ -82,7 +82,9 @@ def export(
     names = {topic: _file_name(topic, to) for topic in chosen}
     for topic, name in names.items():
         if list(names.values()).count(name) > 1:
-            raise BadInput(f"{path}: two topics would be the file {name}; export {topic} by --topic")
+            raise BadInput(
+                f"{path}: two topics would have the same file {name}; export {topic} alone with --topic"
+            )
     if len(topics) == 1:
         (topic,) = chosen
         place = Path(out or f"{log.path.stem}-{names[topic]}")
@@ -107,10 +109,10 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             empty = read_empty(log, topic)
             if to in TRAJECTORIES and not _is_state(log, topic):
                 raise BadInput(
-                    f"{log.path}: topic {topic}: is no estimate, truth or Pose; export it as csv"
+                    f"{log.path}: topic {topic}: is not an estimate, truth or Pose; export it as csv"
                 )
             if to in TRAJECTORIES and trajectory_of(empty) is None:
-                raise BadInput(f"{log.path}: topic {topic}: states no position; export it as csv")
+                raise BadInput(f"{log.path}: topic {topic}: has no position; export it as csv")
         except BadInput as error:
             if topics:
                 raise
@@ -120,13 +122,11 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
         chosen.append(topic)
     if not chosen and to in TRAJECTORIES:
         raise BadInput(
-            f"{log.path}: has no estimates, truth or poses to export to {to}; export it as csv"
+            f"{log.path}: has no estimates, truths or poses to export to {to}; export it as csv"
         )
     if not chosen:
         why = f": {notes[-1].removeprefix(f'{log.path}: ')}" if notes else "; it has no topics"
-        raise BadInput(
-            f"{log.path}: has no topic whose messages are numbers, which export to {to} needs{why}"
-        )
+        raise BadInput(f"{log.path}: has no topic of numeric messages, which export to {to} needs{why}")
     return chosen
 
 
@@ -182,7 +182,7 @@ def _file_name(topic: str, to: To) -> str:
 
 
 def _refuse(place: Path) -> None:
-    raise BadInput(f"{place}: exists, and fuselog export replaces no file; give another --out")
+    raise BadInput(f"{place}: exists, and fuselog export does not replace files; give another --out")
 
 
 def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
@@ -212,13 +212,15 @@ def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
             trajectory = trajectory_of(stream)
             assert trajectory is not None
             if stream.topic not in dropped and trajectory.rotation is None:
-                notes.append(f"{stream.topic}: states no orientation; the identity stands for it")
+                notes.append(f"{stream.topic}: has no orientation; the identity is written instead")
             dropped[stream.topic] = dropped.get(stream.topic, 0) + len(stream) - len(trajectory)
             file.writelines(f"{line}\n" for line in lines_of(trajectory))
 
         yield write
     notes += [
-        f"{topic}: {count} poses are not finite; left out" for topic, count in dropped.items() if count
+        f"{topic}: {count} poses are not finite and were omitted"
+        for topic, count in dropped.items()
+        if count
     ]
 
 
@@ -239,8 +241,8 @@ def _table_file(path: Path, to: To) -> Iterator[Write]:
             writer, columns = begun[0]
             if len(table) and table.column_names != columns:
                 raise BadInput(
-                    f"topic {stream.topic}: has vectors of several lengths, which no table can have; "
-                    "leave the topic out with --topic"
+                    f"topic {stream.topic}: has vectors of different lengths, which a table cannot "
+                    "store; export the other topics with --topic"
                 )
             if len(table):
                 writer.write_table(table)

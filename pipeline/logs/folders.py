@@ -14,7 +14,7 @@ def logs_in(path: Path) -> list[Path]:
         return [path]
     files = recordings_in(path)
     if not files:
-        raise BadInput(f"{path}: has no logs to replay; give a log, or a folder or result with some")
+        raise BadInput(f"{path}: has no logs to replay; give a log, or a folder or result with logs")
     return files
 
 

@@ -77,7 +77,7 @@ def left_out(log: Log) -> str:
 
 def sentence_of(topics: Sequence[str]) -> str:
     """Return a sentence that the topics have no Foxglove mirror."""
-    return f"Foxglove has no message for, left out: {some_of(topics)}"
+    return f"omitted, because Foxglove has no message for them: {some_of(topics)}"
 
 
 def _states(stream: Stream) -> Made:

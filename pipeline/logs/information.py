@@ -59,7 +59,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
         if not (path.is_dir() or isinstance(error, NotMcap)):
             raise
         command = f"fuselog import table {shlex.quote(str(path))}"
-        raise BadInput(f"{error}; tables, such as CSV, become a log with: {command}") from error
+        raise BadInput(f"{error}; to import tables, such as CSV: {command}") from error
     if as_json:
         print_json(_as_json(log))
         return
@@ -68,7 +68,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
     span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
-    others = "; other messages are years from these" if main_ns else ""
+    others = "; other messages are years away from these" if main_ns else ""
     say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}{others}")
     if log.run:
         _say_run(log.run)
@@ -84,7 +84,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     print_table(["topic", "schema", "messages", "per second"], rows)
     if log.mirrors:
         count = sum(topic.messages for topic in log.mirrors.values())
-        say(f"beside them, for viewers: {count} messages on {len(log.mirrors)} topics of Foxglove")
+        say(f"Foxglove mirror, for viewers: {count} messages on {len(log.mirrors)} topics")
     for sentence in worst(_findings(log), path):
         say(sentence)
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
@@ -110,7 +110,7 @@ def _findings(log: Log) -> list[Finding]:
     try:
         return lint_source(LogSource(log), portions=1)
     except BadInput as error:
-        warn(f"{error}; what it holds is not looked at")
+        warn(f"{error}; its messages are not checked")
         return []
 
 
@@ -178,16 +178,16 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
         for name, topics in estimators_that_fit(log).items():
             by_topics.setdefault(tuple(topics), []).append(name)
     if fit or by_topics:
-        say("Estimators that can be replayed over it:")
+        say("Estimators that can be replayed over this log:")
     else:
         why = nearest(registered_models(), log.topics)
-        say(f"No registered model fits it: {why}; {OWN_MODEL}")
+        say(f"No registered model fits this log: {why}; {OWN_MODEL}")
     for name, each in fit.items():
         say(f"  {name}: -e {' '.join(each.methods)}; from {_some_topics(each.topics)}")
     for seen, names in by_topics.items():
         say(f"  without a model: -e {' '.join(names)}; from {_some_topics(seen)}")
     if fit and others and not is_all:
-        say(f"  {', '.join(others)}: do not fit; --all says what they need")
+        say(f"  {', '.join(others)}: do not fit; --all lists what they need")
     for name, each in others.items() if is_all else ():
         say(f"  {name}: needs {'; '.join(each.lacks)}")
     if known := [*(each.methods for each in fit.values()), *by_topics.values()]:
@@ -209,7 +209,7 @@ def _say_what_to_do(path: Path, log: Log) -> None:
     )
     place = log.run.notes.get("log") if log.run else None
     of_log = f" of {place}" if place else ""
-    say(f"Estimates by {', '.join(labels)}{of_log}: for view, evaluate, compare, diagnose, export")
+    say(f"Estimates by {', '.join(labels)}{of_log}: use view, evaluate, compare, diagnose or export")
     say_next("view", str(path))
 
 
@@ -231,7 +231,7 @@ def _show_bag(path: Path, *, as_json: bool) -> None:
 
 
 def _say_how_to_import(path: Path) -> None:
-    say(f"This is a log of ROS; to replay it: fuselog import ros {shlex.quote(str(path))} -o NAME.mcap")
+    say(f"This is a ROS log; to import it: fuselog import ros {shlex.quote(str(path))} -o NAME.mcap")
 
 
 def show_cache(*, clear: bool, as_json: bool) -> None:
@@ -254,7 +254,7 @@ def show_cache(*, clear: bool, as_json: bool) -> None:
         rows = [[name, size["files"], size["bytes"] / 1e6] for name, size in found.items()]
         print_table(["", "files", "MB"], rows)
     if others:
-        say(f"{others} other files are left: fuselog did not write them, or they were changed since")
+        say(f"{others} other files remain: fuselog did not write them, or they have changed since")
 
 
 def _as_json(log: Log) -> dict[str, Any]:

@@ -23,11 +23,11 @@ def show_result(folder: Path, *, as_json: bool) -> None:
     print_others(result.alarms)
     counts = Counter(Path(name).parts[0] for name in result.files)
     rows = [[name, count] for name, count in counts.items() if name != RESULT_FILE]
-    print_table(["in it", "files"], rows)
+    print_table(["content", "files"], rows)
     shown = [f"fuselog report {quote(str(folder))}"]
     if (folder / "timeline.rrd").is_file():
         shown.append(f"fuselog view {quote(str(folder))}")
-    say(f"To see it: {', '.join(shown)}; to go on with it: fuselog compare, check")
+    say(f"To view it: {', '.join(shown)}; to process it further: fuselog compare, check")
 
 
 def _what(result: Result) -> str:
@@ -50,11 +50,11 @@ def show_timeline(path: Path, *, as_json: bool) -> None:
             if not chunk.entity_path.startswith("/__"):
                 rows[chunk.entity_path] += chunk.num_rows
     except Exception as error:  # rerun does not document its exceptions
-        raise BadInput(f"{path}: is no timeline that can be read ({error}); save it again") from error
+        raise BadInput(f"{path}: cannot be read as a timeline ({error}); save it again") from error
     entities = dict(sorted(rows.items()))
     if as_json:
         print_json({"path": str(path), "timeline": names, "entities": entities})
         return
     say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, a timeline of {', '.join(names) or 'nothing'}")
     print_table(["entity", "rows"], list(entities.items()))
-    say(f"To see it: fuselog view {quote(str(path))}")
+    say(f"To view it: fuselog view {quote(str(path))}")

@@ -78,16 +78,16 @@ def losses_of(log: Log) -> list[str]:
     losses = [log.loss_statement] if log.loss_statement else []
     if log.mirrors:
         losses.append(
-            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
+            f"{log.path}: the Foxglove mirror is not copied; to make one of the new log: "
             "fuselog export LOG --to foxglove"
         )
     if foreign:
         losses.append(
-            f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"
+            f"{log.path}: metadata of other programs is not copied: {', '.join(sorted(foreign))}"
         )
     if attachments := log.container.attachments:
         losses.append(
-            f"{log.path}: attachments, which fuselog does not read, are left out: "
+            f"{log.path}: attachments, which fuselog does not read, are not copied: "
             f"{len(attachments)} ({', '.join(attachments)})"
         )
     return losses
@@ -108,7 +108,7 @@ def readable_log(
         except BadInput as error:
             if topic in asked:
                 raise
-            notes.append(f"{error}; its {stated.messages} messages are left out")
+            notes.append(f"{error}; its {stated.messages} messages are not copied")
             continue
         chosen.append(topic)
         described = log.container.schemas[log.container.channels[stated.channel_ids[0]].schema_id]
@@ -116,13 +116,13 @@ def readable_log(
         left_out = {field.name for field in fields} - {field.name for field in schema}
         if left_out:
             notes.append(
-                f"{log.path}: topic {topic}: fields that make no columns are left out: "
+                f"{log.path}: topic {topic}: fields that cannot become columns are not copied: "
                 f"{', '.join(sorted(left_out))}"
             )
     if not chosen:
         raise BadInput(
-            f"{log.path}: has no topic that fuselog reads; import it first, logs of ROS with: "
-            f"fuselog import ros {log.path}"
+            f"{log.path}: has no topic that fuselog can read; import it first, for example a ROS log "
+            f"with: fuselog import ros {log.path}"
         )
     return chosen
 

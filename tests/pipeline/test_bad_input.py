@@ -114,7 +114,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "merge log.mcap -o new.mcap": ("log.mcap", "give at least two"),
     "merge log.mcap other.mcap -o new.mcap": (
         "other.mcap",
-        "topic /landmarks (5 in all) is in log.mcap too",
+        "topic /landmarks (5 in all) is also in log.mcap",
         "fuselog relabel other.mcap --topic /=/b/",
     ),
     "merge log.mcap zzz.mcap -o new.mcap": ("zzz.mcap", "No such file"),
@@ -134,7 +134,9 @@ TABLE: dict[str, tuple[str, ...]] = {
     "relabel log.mcap --topic /robot1/truht=/truth -o new.mcap": ("did you mean '/robot1/truth'",),
     "relabel log.mcap --topic /robot1/truth=truth -o new.mcap": ("=truth", "/old=/new"),
     "relabel log.mcap --topic /robot1/=/b -o new.mcap": ("/robot1/=/b", "/robot1/=/robot2/"),
-    "relabel log.mcap --topic /robot1/truth=/landmarks -o new.mcap": ("2 topics would be /landmarks",),
+    "relabel log.mcap --topic /robot1/truth=/landmarks -o new.mcap": (
+        "2 topics would have the name /landmarks",
+    ),
     "relabel log.mcap --component x=y -o new.mcap": ("no component 'x'", "x_m"),
     "relabel log.mcap --component x_m=y_m -o new.mcap": ("would have two components y_m",),
     "relabel log.mcap --component x_m=a,b -o new.mcap": ("x_m=a,b", "without a comma"),

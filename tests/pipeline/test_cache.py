@@ -47,7 +47,7 @@ def test_what_fuselog_did_not_write_stays(place: Path, fuselog: Callable[..., An
         (place / name).write_bytes(content)
     said = fuselog("cache", "--clear")
     assert said.out.splitlines()[0] == f"{place}: cleared 3 files"
-    assert said.out.splitlines()[-1].startswith("5 other files are left")
+    assert said.out.splitlines()[-1].startswith("5 other files remain")
     left = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
     assert left == {place / name: content for name, content in others.items()}
 

@@ -215,8 +215,8 @@ def test_info_says_that_no_model_fits(
     fl.write("own.mcap", [fl.make_stream("/p/camera", fl.schemas.VECTOR_MEASUREMENT, [10**9], **seen)])
     said = fuselog("info", "own.mcap").out.splitlines()[-1]
     assert said == (
-        "No registered model fits it: it has no topic that a registered model needs; use a model of "
-        'your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the '
+        "No registered model fits this log: it has nothing that a registered model needs; use a model "
+        'of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the '
         "documentation"
     )
 
@@ -767,7 +767,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     """Of an estimates log, of a result folder and of its timeline."""
     estimates, result = world / "log.estimates.mcap", world / "result"
     said = fuselog("info", str(estimates)).out.splitlines()[-2]
-    assert said.startswith("Estimates by ekf of log.mcap: for view, evaluate")
+    assert said.startswith("Estimates by ekf of log.mcap: use view, evaluate")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
     assert "dead-reckoning, ekf and ukf over 2 simulated runs of 2 s (scenario landmarks)" in said
@@ -778,7 +778,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     assert entities["/map/robot1/truth/path"] > 1
     Path("none.rrd").write_text("no timeline")
     refused = fuselog("info", "none.rrd")
-    assert (refused.code, "none.rrd: is no timeline that can be read" in refused.err) == (2, True)
+    assert (refused.code, "none.rrd: cannot be read as a timeline" in refused.err) == (2, True)
 
 
 @pytest.mark.usefixtures("here")

@@ -116,7 +116,7 @@ def test_a_log_without_numbers_is_said_to_have_none(fuselog: Fuselog) -> None:
         writer.finish()
     said = fuselog("export", "log.mcap", "--to", "csv")
     assert said.code == 2
-    assert "has no topic whose messages are numbers" in said.err
+    assert "has no topic of numeric messages" in said.err
     assert "topic /own is own in the encoding 'json'" in said.err
     assert "export it as csv" not in said.err
 
@@ -130,8 +130,8 @@ def test_what_a_pose_lacks_is_said() -> None:
     fl.write("log.mcap", [truth])
     done = fl.export("log.mcap", to="tum")
     assert done.notes == [
-        "/truth: states no orientation; the identity stands for it",
-        "/truth: 1 poses are not finite; left out",
+        "/truth: has no orientation; the identity is written instead",
+        "/truth: 1 poses are not finite and were omitted",
     ]
     assert done.files["/truth"].read_text().splitlines()[1:] == [
         "0.000000000 1.0 2.0 0.0 0.0 0.0 0.0 1.0",
@@ -152,7 +152,7 @@ def test_nothing_is_replaced(world: Path, fuselog: Fuselog) -> None:
         (("--topic", "/robot1/trth"), ("no topic /robot1/trth", "did you mean '/robot1/truth'")),
         (
             ("--topic", "/robot1/odometry"),
-            ("/robot1/odometry", "is no estimate, truth or Pose", "csv"),
+            ("/robot1/odometry", "is not an estimate, truth or Pose", "csv"),
         ),
         (("--to", "tmu"), ("'tmu'", "'kitti'")),
     ):

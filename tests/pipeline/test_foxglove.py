@@ -81,7 +81,7 @@ def test_a_recorded_log_has_its_truth_and_map_beside_the_same_streams(fuselog: F
         str(number) for number in streams["/landmarks"]["landmark_id"]
     ]
     said = fuselog("info", "both.mcap")
-    assert "beside them, for viewers: " in said.out
+    assert "Foxglove mirror, for viewers: " in said.out
     assert "/foxglove/" not in said.out
 
 
@@ -173,7 +173,7 @@ def seen() -> list[Stream]:
 
 def test_orientations_and_moving_sights_are_poses_and_other_streams_are_named(fuselog: Fuselog) -> None:
     made = fuselog("record", "moving-los", "--set", "duration_s=2", "--foxglove", "-o", "los.mcap")
-    assert "los.mcap: Foxglove has no message for, left out: /prior, /truth" in made.err
+    assert "los.mcap: omitted, because Foxglove has no message for them: /prior, /truth" in made.err
     topic = "/sensor1/moving_line_of_sight"
     sights = read_streams(open_log("los.mcap"), [topic])[topic]
     poses = decoded("los.mcap")[f"/foxglove{topic}/pose"]
@@ -200,7 +200,7 @@ def test_any_log_goes_to_foxglove(fuselog: Fuselog) -> None:
     write_log("own.mcap", streams)
     said = fuselog("export", "own.mcap", "--to", "foxglove")
     assert said.code == 0
-    assert "Foxglove has no message for, left out: /temperature" in said.err
+    assert "because Foxglove has no message for them: /temperature" in said.err
     found = decoded("own-foxglove.mcap")
     poses = found["/foxglove/odom/pose"]
     assert {each.frame_id for each in poses} == {"odom"}
@@ -239,7 +239,7 @@ def test_parts_of_a_log_say_that_its_companions_are_left_out(fuselog: Fuselog) -
     assert fuselog(*RECORD, "--foxglove", "-o", "run.mcap").code == 0
     said = fuselog("cut", "run.mcap", "--end", "1", "-o", "part.mcap")
     assert said.code == 0
-    assert "the companions for viewers are left out" in said.err
+    assert "the Foxglove mirror is not copied" in said.err
     assert "--to foxglove" in said.err
     assert not open_log("part.mcap").mirrors
     assert open_log("part.mcap").topics

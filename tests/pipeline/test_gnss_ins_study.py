@@ -175,5 +175,5 @@ def test_a_recording_of_float_solutions_alone_has_no_truth():
         "/velocity", schemas.VELOCITY_FIX, stamps_ns, velocity_mps=place, covariance_m2ps2=spread
     )
     streams = {"/fix": fix, "/velocity": velocity}
-    with pytest.raises(BadInput, match=r"^drive: has no messages of /truth; rows with a fixed"):
+    with pytest.raises(BadInput, match=r"^drive: has no messages of /truth, because no row"):
         rows_of(MemorySource(streams, RunMetadata("table"), "drive"))

@@ -71,7 +71,7 @@ def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(largest_m, runs, 
     ("outages_s", "sentence"),
     [
         ("[]", "0 outages; give exactly one"),
-        ("[[8, 11]]", "no estimate is 10 s after the start of the outage; give a longer outage"),
+        ("[[8, 11]]", "no estimate 10 s after the start of the outage; use a longer outage"),
     ],
 )
 def test_a_drive_without_a_long_outage_is_refused(outages_s, sentence, fuselog, tmp_path):

@@ -75,7 +75,7 @@ def test_from_the_bag_to_a_picture(fuselog: Callable[..., Any], real_data: Path,
     shorter = fuselog("info", str(log)).out
     assert "robot: -e" in shorter
     assert "vehicle: needs" not in shorter
-    assert re.search(r"^  .*vehicle.*: do not fit; --all says what they need$", shorter, re.MULTILINE)
+    assert re.search(r"^  .*vehicle.*: do not fit; --all lists what they need$", shorter, re.MULTILINE)
     both = ["-e", "ekf", "-e", "smoother:ekf"]
     done = fuselog("replay", str(log), *both, "--save", str(rrd), "-o", str(estimates))
     assert done.code == 0

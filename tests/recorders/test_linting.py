@@ -386,7 +386,7 @@ def test_a_gap_of_years_is_found_where_the_reading_is_portioned(
     )
     assert main(["info", str(tmp_path / "log.mcap")]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years from these" in said
+    assert " 49.9899 s from 2023-11-14 22:13:19 UTC; other messages are years away from these" in said
 
 
 def test_what_rests_or_is_skewed_is_not_saturated() -> None:

@@ -54,7 +54,7 @@ class GnssInsOptions(Parameters):
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
-        delayed: label of a smoother that undoes the mapping's delay of the velocity, or "".
+        delayed: label of a smoother that corrects the mapping's delay of the velocity, or "".
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.
@@ -100,9 +100,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     ]
     if not runs:
         raise BadInput(
-            f"{folder}: no window of {', '.join(f'{each:g}' for each in options.lengths_s)} s has a "
-            "truth throughout; "
-            "options.first_s, options.every_s and options.lengths_s move them"
+            f"{folder}: no window of {', '.join(f'{each:g}' for each in options.lengths_s)} s has "
+            "truth in all rows; change options.first_s, options.every_s or options.lengths_s"
         )
     runner = Runner(experiment, setting)
     tables = []
@@ -165,7 +164,7 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
-    """Set the velocity delay of the estimator `delayed` such that it undoes that of the mapping."""
+    """Set the velocity delay of the estimator `delayed` to correct that of the mapping."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
@@ -237,4 +236,4 @@ def _chart(errors: pd.DataFrame) -> Chart:
     return Chart(panels=panels, columns=len(panels))
 
 
-GNSS_INS = Study("a receiver with an inertial unit: how well outages are bridged", study, GnssInsOptions)
+GNSS_INS = Study("a GNSS receiver with an inertial unit: errors during outages", study, GnssInsOptions)

@@ -62,8 +62,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics[f"{estimator}.horizontal_95_m.{grade}-{after_s:g}s"] = float(error_m)
     if not outcome.metrics:
         raise BadInput(
-            f"study imu-grades: no estimate is {AFTER_S[0]:g} s after the start of the outage; give a "
-            "longer outage, as gnss.outages_s=[[50, 80.5]], and estimates every 0.5 s"
+            f"study imu-grades: no estimate {AFTER_S[0]:g} s after the start of the outage; use "
+            "a longer outage, such as gnss.outages_s=[[50, 80.5]], and estimates every 0.5 s"
         )
     outcome.input_sha256 = hash_streams(sources)
     outcome.tables["largest"] = largest
@@ -76,7 +76,8 @@ def outage_of(source: MemorySource) -> Span:
     given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
     if len(given) != 1:
         raise BadInput(
-            f"study imu-grades: {len(given)} outages; give exactly one, as gnss.outages_s=[[50, 80]]"
+            f"study imu-grades: the scenario has {len(given)} outages; give exactly one, such as "
+            "gnss.outages_s=[[50, 80]]"
         )
     return Span(*given[0])
 
@@ -101,5 +102,5 @@ def _chart(largest: pd.DataFrame) -> Chart:
 
 
 IMU_GRADES = Study(
-    "how far off units of several grades are, the longer a receiver is silent", study, Options
+    "growth of position errors during an outage, by grade of the inertial unit", study, Options
 )

@@ -63,10 +63,9 @@ def rows_of(source: MemorySource) -> Rows:
     """Read the receiver's rows; raise BadInput if a topic is missing or has no messages."""
     for topic in NEEDED:
         if topic not in source.topics or not source.topics[topic].messages:
-            why = "; rows with a fixed solution make it, and there are none" if topic == TRUTH else ""
+            why = ", because no row has a fixed solution" if topic == TRUTH else ""
             raise BadInput(
-                f"{source.name}: has no messages of {topic}{why}; outages are made of "
-                f"{', '.join(NEEDED)}"
+                f"{source.name}: has no messages of {topic}{why}; this study needs {', '.join(NEEDED)}"
             )
     fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
     # a delay in the mapping changes only publish times

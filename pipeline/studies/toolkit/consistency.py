@@ -39,7 +39,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 CONSISTENCY = Study(
-    "consistency: whether errors are what covariances say, once estimators are aligned",
+    "consistency: whether errors agree with the covariances after estimators are aligned",
     study,
     ConsistencyOptions,
     is_campaign=True,

@@ -26,7 +26,7 @@ def require_spread(solutions: int) -> None:
     """Raise BadInput if there are too few `solutions` of an experiment for a standard error."""
     if solutions < 2:
         raise BadInput(
-            "one run gives no standard error, by which claims are judged; give --runs 2 or more"
+            "claims are judged by standard errors, which need at least two runs; give --runs 2 or more"
         )
 
 

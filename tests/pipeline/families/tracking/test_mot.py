@@ -78,5 +78,6 @@ def test_what_is_no_track_is_refused(fuselog: Fuselog) -> None:
     assert (said.code, "neither tracks nor truths in the plane" in said.err) == (2, True)
     assert fuselog("export", "run.mcap", "--to", "mot").code == 0
     assert (
-        "exists, and fuselog export replaces no file" in fuselog("export", "run.mcap", "--to", "mot").err
+        "exists, and fuselog export does not replace files"
+        in fuselog("export", "run.mcap", "--to", "mot").err
     )
