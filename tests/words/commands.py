@@ -118,7 +118,7 @@ def _said(arguments: list[str]) -> str:
 def _masked(text: str) -> str:
     """A text without tables, and what is of this machine: how long it took, where it is, its version."""
     text = re.sub(r"^ .*\n─+\n(?: .*\n(?!─))*", "", text, flags=re.MULTILINE)
-    text = re.sub(r"\d[\d.,]* [mµ]?s a message", "TIME a message", text)
+    text = re.sub(r"\d[\d.,]* [mµ]?s per message", "TIME per message", text)
     text = re.sub(r"a run takes (\d[\d.,]* times )?as long", "a run takes RATIO times as long", text)
     text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
     return text.replace(str(ROOT), "ROOT").replace(f"fuselog {version('fuselog')}", "fuselog VERSION")

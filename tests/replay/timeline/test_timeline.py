@@ -1,6 +1,7 @@
 """The timeline: what a .rrd holds, live streams, pictures, and what is refused."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -771,14 +772,16 @@ def test_a_page_is_served_to_this_machine_alone_and_ends_with_the_command(
     command = [program, "view", str(rrd), "--web"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as running:
         assert running.stdout is not None
-        url = running.stdout.readline().partition(" at ")[2].partition(";")[0]
-        with urlopen(url, timeout=10) as page:
-            assert (page.status, b"rerun" in page.read().lower()) == (200, True)
-        children = psutil.Process(running.pid).children(recursive=True)
-        sockets = [each for child in children for each in child.net_connections("inet")]
-        listening = [each.laddr for each in sockets if each.status == psutil.CONN_LISTEN]
-        running.send_signal(signal.SIGINT)
-        running.wait(10)
+        try:
+            [url] = re.findall(r"http:[^;\s]+", running.stdout.readline())
+            with urlopen(url, timeout=10) as page:
+                assert (page.status, b"rerun" in page.read().lower()) == (200, True)
+            children = psutil.Process(running.pid).children(recursive=True)
+            sockets = [each for child in children for each in child.net_connections("inet")]
+            listening = [each.laddr for each in sockets if each.status == psutil.CONN_LISTEN]
+        finally:
+            running.send_signal(signal.SIGINT)
+            running.wait(30)
     assert {address.ip for address in listening} == {"127.0.0.1"}
     assert urlsplit(url).port in {address.port for address in listening}
     assert not any(child.is_running() for child in children)
