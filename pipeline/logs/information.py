@@ -84,7 +84,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     print_table(["topic", "schema", "messages", "per second"], rows)
     if log.mirrors:
         count = sum(topic.messages for topic in log.mirrors.values())
-        say(f"beside them, for viewers: {count} messages on {len(log.mirrors)} topics of Foxglove")
+        say(f"in addition, for viewers: {count} messages on {len(log.mirrors)} topics of Foxglove")
     for sentence in worst(_findings(log), path):
         say(sentence)
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):

@@ -78,7 +78,7 @@ def losses_of(log: Log) -> list[str]:
     losses = [log.loss_statement] if log.loss_statement else []
     if log.mirrors:
         losses.append(
-            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
+            f"{log.path}: the Foxglove mirror is left out; to add it to the new log: "
             "fuselog export LOG --to foxglove"
         )
     if foreign:

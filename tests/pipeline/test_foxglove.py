@@ -81,7 +81,7 @@ def test_a_recorded_log_has_its_truth_and_map_beside_the_same_streams(fuselog: F
         str(number) for number in streams["/landmarks"]["landmark_id"]
     ]
     said = fuselog("info", "both.mcap")
-    assert "beside them, for viewers: " in said.out
+    assert "in addition, for viewers: " in said.out
     assert "/foxglove/" not in said.out
 
 
@@ -239,7 +239,7 @@ def test_parts_of_a_log_say_that_its_companions_are_left_out(fuselog: Fuselog) -
     assert fuselog(*RECORD, "--foxglove", "-o", "run.mcap").code == 0
     said = fuselog("cut", "run.mcap", "--end", "1", "-o", "part.mcap")
     assert said.code == 0
-    assert "the companions for viewers are left out" in said.err
+    assert "the Foxglove mirror is left out" in said.err
     assert "--to foxglove" in said.err
     assert not open_log("part.mcap").mirrors
     assert open_log("part.mcap").topics
