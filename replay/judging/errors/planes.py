@@ -71,7 +71,8 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
                 return (
                     f"{topic} does not state the origin of its tangent plane, and the estimates are "
                     f"relative to {own}, {at}; give it with --set "
-                    f"{topic}.plane=LATITUDE,LONGITUDE,HEIGHT, or align the estimates with fuselog evaluate --align se2"
+                    f"{topic}.plane=LATITUDE,LONGITUDE,HEIGHT, or align the estimates with "
+                    "fuselog evaluate --align se2"
                 )
             of_truth = frame_of(truth.metadata)
             if own is None and frame != of_truth:
