@@ -48,6 +48,7 @@ lint: .venv/with-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.prose.check
 
 wheel: .venv/with-test
 	$(BIN)/python -m build --outdir dist

@@ -8,7 +8,7 @@ While something is being written, it is in a working folder next to its destinat
         old                the folder that NAME replaces, between the two renames
 
 Two writers of one destination never touch each other's working folder. The next writer removes what a
-killed writer left, but only if nobody holds the lock and the folder contains nothing else.
+killed writer left, but only if the lock is free and the folder contains nothing else.
 """
 
 import logging

@@ -108,7 +108,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Recorder(Generic[ParametersType]):
-    """What simulators and importers have in common: a summary and parameters.
+    """Base of simulators and importers, with a summary and parameters.
 
     Attributes:
         summary: description in one line.

@@ -1,4 +1,4 @@
-"""Readers and writers of trajectories as benchmarks exchange them: TUM, KITTI and (read only) EuRoC.
+"""Readers and writers of trajectories in the formats of benchmarks: TUM, KITTI and (read only) EuRoC.
 
 A line of a TUM file has the time (s), the position and the quaternion x, y, z, w. A line of a KITTI file
 has the upper three rows of a pose's matrix, without a stamp. A line of a EuRoC file, with commas, has

@@ -14,7 +14,7 @@ from fuselog.replay.engine.streams.planes import into_plane_of
 def in_one_plane(
     name: str, topics: Mapping[str, Topic], changes: Mapping[str, Change]
 ) -> dict[str, Change]:
-    """Add to the changes of topics those that move all of them into one plane.
+    """Add to the changes of topics those that move all of them into one tangent plane.
 
     This is the plane of the truth, so that estimates are in its coordinates, or that of the first topic.
 

@@ -41,7 +41,7 @@ FAMILIES = {
     r"fuselog\.\w+\.families\.los\.": "Lines of sight",
     r"fuselog\.\w+\.families\.acoustic\.": "Shots and sounds",
     r"fuselog\.\w+\.families\.biometrics\.": "Biometrics",
-    r"": "Of other packages",
+    r"": "Other packages",
 }
 
 

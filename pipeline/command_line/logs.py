@@ -168,7 +168,7 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 @click.option(
     "--web", is_flag=True, help="Serve the timeline to a browser on this machine until Ctrl-C."
 )
-@click.option("--focus", help="What to show first, for example robot3.")
+@click.option("--focus", help="Entity to show first, for example robot3.")
 @recover_option
 @gap_option
 def view(path: Path, **options: Any) -> None:

@@ -146,7 +146,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @click.option(
     "--by",
     type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
-    help="What to optimise: the likelihood, NIS or NEES (closest to their expectation), or RMSE. "
+    help="Metric to optimise: the likelihood, NIS or NEES (closest to their expectation), or RMSE. "
     "[default: likelihood; rmse for an estimator without innovations]",
 )
 @click.option(

@@ -228,7 +228,7 @@ class _Search:
         *,
         target: float = -np.inf,
     ) -> tuple[list[Found], list[Named]]:
-        """Add causes to those found until none is certain, and return what is in doubt after them.
+        """Add causes to those found while another is certain, and return what is in doubt after them.
 
         `peaks` are the gains of the hypotheses over the causes found. With a `target`, the search ends
         if the allowed number of causes cannot reach that log-likelihood. Without one, it also searches

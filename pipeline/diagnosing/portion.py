@@ -68,7 +68,7 @@ def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -
 
 
 class Portion(NamedTuple):
-    """What the estimator reads from a log, in memory, until `end_ns`; None stands for the whole log."""
+    """The messages of a log that the estimator reads, until `end_ns`; None for the whole log."""
 
     source: MemorySource
     end_ns: int | None

@@ -27,7 +27,7 @@ class NewestFirst:
             self._pool.submit(self._do, work, self._newest)
 
     def end(self) -> None:
-        """Stop; the current work is told that newer work waits."""
+        """Stop, and let the current work end early."""
         self._newest += 1
         self._pool.shutdown(wait=False)
 

@@ -67,7 +67,7 @@ def time_range(epoch_ns: int) -> Range1d:
 
 
 def filter_choices(filters: Iterable[str], names: Sequence[str]) -> list[Any]:
-    """Make the choices of both filters, the second of which may be none."""
+    """Make the choices of both filters, the second of which may be "none"."""
     width = (SIDE - 20) // 2
     first, second = [*filters, NONE][:2]
     return [

@@ -1,8 +1,8 @@
 """Warnings about a replay's numbers, the worst first: one sentence each, and what to do.
 
 For a filter with correct covariances, NIS, NEES and the share of rejected measurements are within their
-limits in 999 of 1,000 logs. A value outside gives a warning, and so does a constant error. What the
-value means for the filter is decided by `fuselog.replay.judging.verdicts.Squares`.
+limits in 999 of 1,000 logs. A value outside gives a warning, and so does a constant error. The
+class `fuselog.replay.judging.verdicts.Squares` interprets the values for the filter.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -75,7 +75,7 @@ def check_outputs(
 ) -> None:
     """Raise BadInput if a command may not write its result folder or its timeline.
 
-    This is checked before the work starts, so that none is lost.
+    This is checked before the work starts, so that no work is lost.
     """
     if timeline is not None:
         check_files([(timeline, TIMELINE)], inputs)
@@ -226,7 +226,7 @@ def _is_report(path: Path) -> bool:
     return is_report(path)
 
 
-# Users edit mappings, so none is replaced.
+# Users edit mappings, so they are never replaced.
 MAPPING = Kind(".toml", "a mapping that may be replaced", lambda _: False)
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)

@@ -42,7 +42,7 @@ RUNS = Path("tables", "runs.parquet")
 TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
-# What made a result; the report's opening depends on it.
+# The command that made a result; the report's opening depends on it.
 Kind = Literal["run", "sweep", "compare", "tune", "diagnose", "replay", "evaluate", "noise", "ellipsoid"]
 
 

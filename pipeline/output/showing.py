@@ -15,7 +15,7 @@ MOST_SENTENCES = 5
 
 
 class Shown(NamedTuple):
-    """What is displayed of an object.
+    """The displayed contents of an object.
 
     Attributes:
         title: a description in one line.

@@ -14,7 +14,7 @@ from fuselog.recorders.registry import available
 
 
 class Record(Parameters):
-    """What to simulate.
+    """A simulation to record.
 
     Attributes:
         scenario: a scenario by name or TOML file.
@@ -26,7 +26,7 @@ class Record(Parameters):
 
 
 class Import(Parameters):
-    """What to import; the path of the data is given with --data.
+    """An import of data; the path of the data is given with --data.
 
     Attributes:
         source: name of the importer.

@@ -24,7 +24,7 @@ PARAMETERS, DROPPED = "parameters", "dropped"
 
 
 class Inputs(NamedTuple):
-    """What a change may alter: topics of sensors, topics of controls, priors."""
+    """The inputs that a change may alter: topics of sensors, topics of controls, priors."""
 
     sensed: Collection[str]
     controls: Collection[str]

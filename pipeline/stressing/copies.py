@@ -36,7 +36,7 @@ class How(NamedTuple):
         seed: the seed of signs, coins, and dropped messages.
         gap_limit_s: the truth is not interpolated over longer gaps.
         order: the clock that orders messages.
-        late: how late messages are treated, in the order of log time.
+        late: how out-of-sequence messages are treated, in the order of log time.
     """
 
     seed: int = 0

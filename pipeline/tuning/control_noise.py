@@ -50,8 +50,8 @@ def disturbed(
     """Copy a log with noise added to its controls; each copy is followed by one with the opposite noise.
 
     The noise is as large as the model states, but at most as large as the noise seen in the control.
-    There are no copies if the model states no noise or none is seen. Each of several logs gets its own
-    noise, selected by the number `log`. `pairs` is a power of two.
+    There are no copies if the model states no noise or no noise is seen. Each of several logs gets its
+    own noise, selected by the number `log`. `pairs` is a power of two.
     """
     noises = [noise for each in bound for noise in _noises(source, each)]
     rng = np.random.default_rng([SEED, log])

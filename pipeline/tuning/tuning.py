@@ -578,7 +578,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
     if found.confidence is None or objective.nis(found.optimum) < DIVERGED:
         return found
     coordinates = found.coordinates
-    moves = [  # not steps that the scan would undo
+    moves = [  # not steps that the scan would reverse
         0.0 if each.is_fixed else np.log(2.0) if each.is_log else 2.0 * (each.useful or unit) / unit
         for each, unit in zip(coordinates.free, coordinates.units, strict=True)
     ]

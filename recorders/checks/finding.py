@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 Kind = Literal[
-    # Of a log, found without a filter.
+    # Findings about a log, without a filter.
     "stamps",
     "lost messages",
     "gap",
@@ -22,7 +22,7 @@ Kind = Literal[
     "magnetometer",
     "place",
     "name",
-    # Of a filter's innovations and estimates.
+    # Findings about a filter's innovations and estimates.
     "measurement noise",
     "process noise",
     "factor or sign",
@@ -39,7 +39,7 @@ Kind = Literal[
     "divergence",
     "unseen error",
     "unnamed",
-    # Of a judged replay.
+    # Findings about a judged replay.
     "innovations",
     "errors",
     "uninformed",

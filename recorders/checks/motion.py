@@ -34,7 +34,7 @@ ALIKE, PLAIN = 0.8, 0.95  # correlations; the second if the course may differ fr
 
 
 class Slope(NamedTuple):
-    """What one topic says of windows, as a multiple of what another says.
+    """The ratio between the readings of two topics, over windows.
 
     Attributes:
         value: the multiple, by least squares through zero.

@@ -74,7 +74,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     without = _likeness(windows, source, account, zero_s)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
     evidence = float(_evidence(telling, likeness, usual))
-    if abs(lag_s) > NEAR_S:  # of so many lags, one is the best by chance
+    if abs(lag_s) > NEAR_S:  # of many lags, one is the best by chance
         evidence -= float(np.log(len(lags_s)))
     tried_s, tried = np.concatenate([lags_s, fine_s]), np.concatenate([coarse, near])
     as_likely_s = tried_s[_evidence(telling, likeness, tried) < SURE]

@@ -36,7 +36,7 @@ Read = Callable[[str], NDArray]
 # Tests for each of n messages whether a source has one of the given values.
 Holds = Callable[[str, Sequence[Source]], NDArray[np.bool_]]
 
-# What to do with messages whose quaternions are far from unit length.
+# How to treat messages whose quaternions are far from unit length.
 Quaternions = Literal["refuse", "normalise", "skip"]
 NOT_UNIT = "a quaternion that is not of unit length"
 SCALED = "a quaternion that was scaled to unit length"
@@ -74,7 +74,7 @@ class Inflation(Parameters):
 
 
 class StreamMapping(Parameters):
-    """What becomes one of fuselog's messages, and how.
+    """The source of one of fuselog's streams, and how it is converted.
 
     Attributes:
         becomes: name of the message.

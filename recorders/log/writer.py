@@ -27,7 +27,7 @@ Mirrors = Callable[[Stream], Iterable[Mirror]]
 
 @dataclass
 class _Topic:
-    """What is kept of a topic from its first block to its last, with its number of messages so far."""
+    """The state of a topic between blocks, with its number of messages so far."""
 
     channel_id: int
     schema: Schema
@@ -38,7 +38,7 @@ class _Topic:
 
 @dataclass
 class _Channel:
-    """The channel of a companion, and its number of messages so far."""
+    """The channel of a Foxglove mirror, and its number of messages so far."""
 
     channel_id: int
     messages: int = 0

@@ -187,7 +187,7 @@ def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s:
 
 
 def philox(key: int) -> np.random.Generator:
-    """Make the generator that reference values were drawn with."""
+    """Make a Philox generator with this key."""
     return np.random.Generator(np.random.Philox(key=key))
 
 

@@ -124,7 +124,7 @@ class Prior(Parameters):
 
 
 class NavigationParameters(Parameters):
-    """What moves, where, and its sensors.
+    """Parameters of a moving body, its path, and its sensors.
 
     A person sways and bobs with each step, and turns to both sides of the path; a quadrotor tilts to
     accelerate, and may point in any direction.

@@ -28,7 +28,7 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """Errors of odometry; values of None are read from the log's channels.
+    """Errors of odometry; the log's channels give the values of parameters that are None.
 
     A noise density is the standard deviation of the readings times the square root of the step between
     them: 0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).

@@ -397,7 +397,7 @@ def _check_topics(
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """Make the estimator that reprocesses late messages; raise BadInput if the filter cannot."""
+    """Make the estimator that reprocesses out-of-sequence messages; BadInput if the filter cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(

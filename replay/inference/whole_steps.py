@@ -32,7 +32,7 @@ from fuselog.replay.tracing.functions import Argument, Shape, traced
 class WholeSteps(NamedTuple):
     """The steps of a filter whose state has n components and a tangent space of t components.
 
-    All steps take (mean, covariance, ...). What is added to a covariance is G diag(u) G' + N: a gain G
+    All steps take (mean, covariance, ...). The covariance added by a step is G diag(u) G' + N: a gain G
     with the variances u of its columns, and N, (t, t) or (m, m).
 
     Attributes:

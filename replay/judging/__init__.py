@@ -1,4 +1,4 @@
 """Judging of estimates by truth: errors, consistency, metrics; begin with `judge`.
 
-What families judge in addition, such as sets and tracks, is registered; see `kinds`.
+Families register what they judge in addition, such as sets and tracks; see `kinds`.
 """

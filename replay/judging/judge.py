@@ -386,7 +386,7 @@ class Judge:
 
     @property
     def late(self) -> "pd.DataFrame":
-        """Return late messages: a row per estimator, case, treatment and time span."""
+        """Return out-of-sequence messages: a row per estimator, case, treatment and time span."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.late())

@@ -1,6 +1,6 @@
 """Scene of a log without a family of its own: everything in the log, by schema.
 
-Positions are drawn in one plane for each frame of the log and on a map of the earth: truths, estimates,
+Positions are drawn in a plane for each frame of the log and on a map of the earth: truths, estimates,
 fixes, poses, and landmarks with the measurements of them. A sensor's measurements are drawn around it,
 and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to this.
 """

@@ -53,7 +53,7 @@ def pure(kind: type[Made]) -> type[Made]:
 
 
 class Reads(NamedTuple):
-    """What a function reads: each place, and its value.
+    """The places that a function reads, and their values.
 
     Attributes:
         functions: the function and those that it calls, with their code and defaults.

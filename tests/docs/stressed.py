@@ -39,9 +39,14 @@ JUMPS = (
         "acoustic-sequence",
         "mixture",
         "*",
-        "its 4000 particles are random: another seed moves it as far as an ulp, by up to .5 sigma",
+        "its 4000 particles are random: another seed moves it as far as an ulp, by up to 0.5 sigma",
     ),
-    ("bingham-2d", "kalman", DROPPED, "a Gaussian of a direction, too sure: NEES 2.1 where 1 is right"),
+    (
+        "bingham-2d",
+        "kalman",
+        DROPPED,
+        "a Gaussian of a direction is overconfident: NEES 2.1, expected 1",
+    ),
     (
         "ispace*",
         "*",
@@ -52,7 +57,7 @@ JUMPS = (
         "los-moving",
         "*",
         DROPPED,
-        "takes attitudes as stated, too sure: NEES above 10000; its study has them estimated",
+        "takes attitudes as stated and is overconfident: NEES above 10000; its study estimates them",
     ),
     (
         "los-t*-sensors",
@@ -64,13 +69,13 @@ JUMPS = (
         "manoeuvres",
         "stand",
         DROPPED,
-        "a model of who stands, for one who drives, too sure: NEES 330000",
+        "a model for standing still, used while driving, is overconfident: NEES 330000",
     ),
     (
         "navigation-unknown-heading",
         "*",
         "start",
-        "no heading is known for 5 s: the likeliest of 45 has .03, and another leads",
+        "no heading is known for 5 s: the likeliest of 45 has 0.03, and another leads",
     ),
     (
         "reactor",

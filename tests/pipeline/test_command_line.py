@@ -384,7 +384,7 @@ def test_lists_are_grouped_by_family(fuselog: Fuselog, kind: str) -> None:
     lines = fuselog(kind).out.splitlines()
     names = [words[0] for line in lines if line.startswith("   ") and (words := line.split())]
     assert sorted(names) == sorted(getattr(fl, kind))
-    assert not [line for line in lines if "Of other packages" in line]
+    assert not [line for line in lines if "Other packages" in line]
     families = [line.strip() for line in lines if re.match(" [A-Z]", line)]
     assert len(families) == len({*families}) >= 4
 

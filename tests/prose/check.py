@@ -15,7 +15,8 @@ ROOT = Path(__file__).parents[2]
 ROOMS = ("fuselog", "recorders", "replay", "pipeline")
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
 CODE = re.compile(
-    r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+", re.DOTALL
+    r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|>>> [^\n]*|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+",
+    re.DOTALL,
 )
 LEAST_BLANKS = 2  # of a string that counts as prose
 LETTERS = re.compile("[a-z]{2}")

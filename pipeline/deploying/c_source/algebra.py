@@ -212,8 +212,8 @@ static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M]
 
 ITERATE = """\
 /* One iterate of Gauss-Newton on the posterior: finds the step of an innovation that was linearised at
- * the step before; UNSETTLED while they differ. What is gated, and how much it counts, is decided at the
- * first, whose step before is zero. Bell and Cathey, IEEE TAC 38(2), 1993. */
+ * the step before; UNSETTLED while they differ. The gate and the weight of a measurement are decided at
+ * the first, whose step before is zero. Bell and Cathey, IEEE TAC 38(2), 1993. */
 enum { ITERATIONS = 50, UNSETTLED = -1 };
 static int iterate(NAME *filter, int sensor, int components, int iteration, REAL v[M], REAL S[M][M],
                    REAL C[T][M], REAL step[T], const REAL slope[T], REAL *factor,

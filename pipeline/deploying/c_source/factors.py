@@ -73,7 +73,7 @@ static int fill_root(factorisation *found, int first, int size, REAL *covariance
     return 1;
 }
 
-/* The factor of rows with so many columns, beside which stands a noise; 0 where there is none. */
+/* Factorises rows of `columns` columns, followed by those of a noise; returns 0 if that fails. */
 static int factorise(factorisation *found, int size, int columns, int noises, REAL *noise, int stride)
 {
     for (int k = 0; k < noises; k++) {
@@ -167,7 +167,7 @@ static void start_samples(const NAME *filter, drawn_samples *samples)
                 row < T && column < T ? filter->factor[row][column] : 0.0_S;
 }
 
-/* Rows become the values at samples, and behind them so many components of the samples themselves. */
+/* Sets the rows to the values at the samples, followed by `states` components of the samples. */
 static void spread(const drawn_samples *samples, int count, const REAL *weights, int size, int states,
                    factorisation *found)
 {
@@ -193,7 +193,7 @@ static void retriangulate(NAME *filter)
 """
 
 UPDATE = """\
-/* Updates by rows that hold the values and behind them the state, in so many columns. The factor of
+/* Updates by rows that hold the values and behind them the state, in `columns` columns. The factor of
  * these and of the noise holds that of S, K L and that of P: see Kaminski, Bryson and Schmidt, IEEE TAC
  * 16(6), 1971. A component that is NaN counts as one of a noise of its own, which is as predicted. */
 static int update(NAME *filter, int sensor, int components, int columns, const int *places, REAL v[M],

@@ -31,7 +31,7 @@ UNIT_RUNS = 5  # runs of each fault of the unit per run of a cell: they take a t
 
 
 class Right(NamedTuple):
-    """What a diagnosis should name: kind, topic, component, and the number if there is one."""
+    """The diagnosis that is right: kind, topic, component, and the number if there is one."""
 
     kind: Kind
     topic: str

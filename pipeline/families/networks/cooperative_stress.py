@@ -2,7 +2,7 @@
 
 When a robot sees another, both get a message. The study removes some of these sightings from the log:
 all except one per interval, a random half, or those of a robot that leaves. In another case, a robot has
-an overconfident wrong prior. The estimators fuse immediately, so late messages are left to
+an overconfident wrong prior. The estimators fuse immediately, so out-of-sequence messages are left to
 `network-stress`. Intervals are over the robots; for the wrong prior, they exclude the robot that has it.
 """
 

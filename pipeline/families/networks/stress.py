@@ -247,7 +247,7 @@ def _lie_chart(table: pd.DataFrame) -> Chart:
 
 
 NETWORK_STRESS = Study(
-    "sensor networks with late messages, absent or faulty nodes, and little bandwidth",
+    "sensor networks with delayed messages, absent or faulty nodes, and little bandwidth",
     study,
     StressOptions,
 )

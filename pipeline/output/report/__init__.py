@@ -72,7 +72,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Section:
-    """What the page shows of one result folder, from top to bottom."""
+    """The contents of a page about one result folder, from top to bottom."""
 
     name: str
     title: str

@@ -110,7 +110,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Story:
-    """What a page says about a result, first of all.
+    """The opening of a page about a result.
 
     Attributes:
         verdict: what to do, the most important sentence first.

@@ -179,7 +179,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
-    """Find the point with an estimator's smallest error, where it is not overconfident if possible."""
+    """Find the point with an estimator's smallest error, excluding overconfident ones if possible."""
     sure = [point for point in own.index if sweep.is_overconfident(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])

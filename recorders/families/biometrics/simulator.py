@@ -81,7 +81,7 @@ class BiometricScoresParameters(Parameters):
         failures_to_enrol: number of gallery users that the first face matcher fails to enrol.
         low_galleries: number of gallery users with low scores of the second face matcher.
         poor_fingers_share: share of the users with poor fingers.
-        broken_probes: number of probes whose fingers match nobody.
+        broken_probes: number of probes whose fingers match no user.
     """
 
     users: Annotated[int, Field(ge=20, le=5000)] = 517

@@ -23,7 +23,7 @@ from fuselog.recorders.parsing import read_toml
 
 
 class MessageMapping(StreamMapping):
-    """What messages of one type become; sources are paths of their fields.
+    """How messages of one type are converted; sources are paths of their fields.
 
     Attributes:
         name: last part of the stream's name.

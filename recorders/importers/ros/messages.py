@@ -34,7 +34,7 @@ SIGMAS = {
 
 @dataclass(frozen=True)
 class Part:
-    """What some messages (n,) contribute to one stream.
+    """The part of one stream that comes from some messages (n,).
 
     Attributes:
         kind: last part of the stream's name.

@@ -48,7 +48,7 @@ class _Piece(NamedTuple):
 
 @dataclass
 class _Written:
-    """What is kept of a stream from its first block to its last."""
+    """The state of a stream that is kept from its first block to its last."""
 
     schema: Schema
     metadata: dict[str, str]
@@ -67,7 +67,7 @@ class StreamMaker:
         counts: counts by subject and fact.
         came_of: what was made from a topic, in the order in which it came.
         first_ns: first publish time of all streams.
-        noise: the noise stated for a topic, or the reason why none is.
+        noise: the noise stated for a topic, or the reason why it states no noise.
     """
 
     def __init__(

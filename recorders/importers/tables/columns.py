@@ -39,7 +39,7 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """What is known of a table while its streams are guessed.
+    """The facts about a table from which its streams are guessed.
 
     Attributes:
         path: the file.

@@ -121,7 +121,7 @@ class Table:
 
 
 class TextOptions(NamedTuple):
-    """What a text table does not say itself.
+    """Options for reading a text table.
 
     Attributes:
         names: names of the columns, if the file does not name them.

@@ -106,7 +106,7 @@ class TableStream(StreamMapping):
         topic: name of the topic.
         delay_s: how long before its stamp a message was measured.
         only_first: whether only the first row is used, as for a prior.
-        every: uses the first of every so many rows.
+        every: number of rows of which the first is used.
         noise: standard deviation of white Gaussian noise to add, by field; this makes fixes from a known
             path.
     """

@@ -1,4 +1,4 @@
-"""The local plane of a log's positions, computed from geodetic positions."""
+"""The local tangent plane of a log's positions, computed from geodetic positions."""
 
 from functools import cache
 from typing import Any, NamedTuple

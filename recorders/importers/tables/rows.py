@@ -117,7 +117,7 @@ class Rows:
         """Test whether all rows have been returned."""
         return self._next is None
 
-    # What is read.
+    # Reading of columns.
 
     def _open(self) -> Table:
         own = self.mapping
@@ -319,7 +319,7 @@ class Rows:
         rows = np.arange(_size(batch))
         return is_reversed([self._read_ns(part, clock, its) for part, its in self._parts(batch, rows)])
 
-    # What the first rows say.
+    # Information from the first rows.
 
     def first_ns(self) -> int | None:
         """Return the earliest stamp of the first rows, or of all rows if they are newest first."""
@@ -484,7 +484,7 @@ class Rows:
         if self.mapping.geodetic is not None:
             places = self._places(batch, missing)
             self._check_place(*places[:2])
-            # without a plane there is no position in the whole log
+            # without a tangent plane there is no position in the whole log
             unknown = np.full((3, _size(batch)), np.nan)
             made |= zip(PLACE, unknown if plane is None else plane.place(*places), strict=True)
         if self.mapping.attitude is not None:

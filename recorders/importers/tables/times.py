@@ -238,7 +238,7 @@ def _of_day(
     if not clock:
         return ""
     parts = ["%I" if half else "%H", "%M", "%S"][: 2 + bool(second)]
-    if point and not second:  # nobody writes fractions of minutes
+    if point and not second:  # fractions of minutes are not in use
         parts = ["%M", "%S"]
     of_day = (between or "") + ":".join(parts) + f"{point}%f" * bool(point)
     return of_day + (" %p" if half and half[0] == " " else "%p" * bool(half))

@@ -28,7 +28,7 @@ class UlogParameters(Parameters):
 
 
 class _Surroundings(NamedTuple):
-    """What is read from a log in advance.
+    """The contents of a log that are read in advance.
 
     Attributes:
         origin: origin of the filter's local tangent plane; None if the log does not state it.

@@ -29,7 +29,7 @@ class Walk(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known of each number's topic (NUMBERS,); `since` is "never" for a number without a topic.
+    """The topic of each number (NUMBERS,); `since` is "never" for a number without a topic.
 
     A row has `least` to `most` bytes, begins in the file at byte `since` or later and before byte
     `until`, and has its stamp at byte `stamp`.

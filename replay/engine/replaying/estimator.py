@@ -63,7 +63,7 @@ NEEDED_MESSAGES = 4096  # read at a time, until a message has a needed value
 
 @dataclass(frozen=True)
 class Reading:
-    """What an estimator reads of its topics and parameters, as the functions of its model do.
+    """The fields of topics and the parameters that the functions of an estimator's model read.
 
     Attributes:
         controls: topics that drive the motion.

@@ -6,10 +6,10 @@ policies:
 
     drop            skip a message that is older than the newest one processed
     wait:SECONDS    hold back every message until this time after its stamp; then as drop
-    rewind:SECONDS  go back to a late message and reprocess, by at most this time; skip older ones
+    rewind:SECONDS  reprocess the messages after it, by at most this time; skip older messages
 
-Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Late messages
-that newer ones waited for are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
+Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Messages that
+newer ones waited for are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
 does the reprocessing itself and reports it on `rewound`, as `schemas.REWOUND`
 (`Recursive.out_of_sequence`; for filters of models, `fuselog.replay.inference.run.out_of_sequence`, for
 those of libraries `fuselog.replay.foreign.native.out_of_sequence`).
@@ -30,12 +30,12 @@ from fuselog.replay.engine.streams.blocks import Block, Events, Ragged, join, la
 from fuselog.replay.engine.streams.failures import reason_stream
 
 POLICIES = ("drop", "wait", "rewind")
-OLDER = "older than what was used before"  # part of the reason for skipping a late message
+OLDER = "older than what was used before"  # part of the reason for skipping a message
 LONGEST_S = 1e9
 
 
 class Late(NamedTuple):
-    """Policy for late messages, and how long to wait or how far to go back."""
+    """Policy for out-of-sequence messages, and how long to wait or how far to go back."""
 
     policy: str
     window_ns: int
@@ -85,7 +85,7 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
 
     Args:
         bound: the estimator that wants its messages in order of their stamps.
-        late: what to do with late messages.
+        late: policy for out-of-sequence messages.
     """
     if not isinstance(bound, Recursive):
         raise BadInput(
@@ -276,7 +276,7 @@ def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> R
 def _waited(
     name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
 ) -> tuple[Integers, Ragged]:
-    """Find the newest stamps (runs,) that have arrived, and late messages that newer ones wait for."""
+    """Find the newest stamps (runs,) that have arrived, and messages that newer ones wait for."""
     arrivals = _arrivals(Late("drop", 0), streams, {})
     everything = np.ones(len(arrivals.run), bool)
     arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)

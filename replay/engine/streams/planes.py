@@ -1,8 +1,8 @@
 """Transformation of positions between local tangent planes (ENU) with different origins.
 
 The two planes are rotated and shifted against each other because the earth is curved. A position
-without a height is assumed to be as high above the ellipsoid as the origin of its plane; if it is 100 m
-higher and the other origin is 1 km away, the result is 2 cm off.
+without a height is assumed to be as high above the ellipsoid as the origin of its tangent plane; if it
+is 100 m higher and the other origin is 1 km away, the result is 2 cm off.
 """
 
 from collections.abc import Mapping
@@ -125,7 +125,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
         columns |= _moved_fields(stream, movement)
     elif schema not in (*_STATES, schemas.GEODETIC_FIX.full_name):
         raise BadInput(
-            f"topic {stream.topic} states the origin {own} of its plane, but other topics state "
+            f"topic {stream.topic} states the origin {own} of its tangent plane, but other topics state "
             f"{origin}; messages of type {schema} cannot be transformed between planes, so record them "
             "with the origin of the others"
         )

@@ -179,7 +179,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
     Args:
         scene: knowledge before the measurements.
-        measured: (targets, sensors, 2), NaN where there is no line of sight; other values do not matter.
+        measured: (targets, sensors, 2), NaN without a line of sight; other values do not matter.
         parameters: (n,).
     """
     counted = (range(1, count + 1) for count in measured.shape[:2])

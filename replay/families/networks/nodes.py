@@ -385,7 +385,7 @@ def receive(
             mean, covariance = results.sent_mean[source], results.sent_covariance[source]
         copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
         late_s = (now - activities.time_ns[source]) * 1e-9
-        # other nodes may have forwarded the information of a late message, so it is not independent
+        # other nodes may have forwarded the information of an old message, so it is not independent
         new = 1.0 if not is_own and late_s <= 0.0 else 0.0
         for row in range(size):
             for column in range(size):

@@ -147,7 +147,7 @@ def draw_sets(
 
 
 def draw_areas(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
-    """Draw a case's sets in its plane, and return the plot of their areas."""
+    """Draw a case's sets in the plane of its positions, and return the plot of their areas."""
     _, plots = draw_sets(canvas, scene, case, entity_path(ROOT, case))
     return [*plots]
 

@@ -102,7 +102,7 @@ def advance(
 ) -> None:
     """Pass a message to a filter that has not failed, and store its innovation.
 
-    `caller` is the message that wants the estimate after it, NOBODY if none does.
+    `caller` is the message that wants the estimate after it, `NOBODY` if none does.
     """
     if carried.failure[run] == ALL_WELL:
         addresses, static, events = given

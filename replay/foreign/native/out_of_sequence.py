@@ -132,7 +132,7 @@ def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
 
 @lru_cache(maxsize=1)
 def _loop() -> OverRuns:
-    title = "filters of a library, with reprocessing of late messages"
+    title = "filters of a library, with reprocessing of out-of-sequence messages"
     return compile_over_runs(follow_as_arrived, title=title)
 
 
@@ -160,7 +160,7 @@ def follow_all_as_arrived(
 
 
 def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
-    """List the late messages in blocks, with the number of earlier arrivals reprocessed for each."""
+    """List the out-of-sequence messages in blocks, and how many earlier arrivals each reprocessed."""
     newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
     made = []
     for events in blocks:

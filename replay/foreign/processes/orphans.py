@@ -1,7 +1,7 @@
 """Guard process that ends the programs that we started if we are killed and they do not notice it.
 
 It waits for the end of its standard input, which only we hold open, so that it ends however we end.
-Then it kills the processes that it was told about.
+Then it kills the processes that were reported to it.
 """
 
 import atexit

@@ -36,8 +36,8 @@ class RunGiven(NamedTuple):
         prior: stamp, mean (n,) and covariance (t, t); None if the log has none.
         parameters: in the order of the description.
         seed: seed of random numbers.
-        window_ns: how late messages may be that come in order of arrival; IN_ORDER if they are in order
-            of stamps.
+        window_ns: largest delay of messages that come in order of arrival; IN_ORDER if they are in
+            order of stamps.
     """
 
     static: Static

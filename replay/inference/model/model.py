@@ -155,7 +155,7 @@ class Switching:
 @renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What a sensor measures of the state.
+    """A sensor: the quantity that it measures, as a function of the state.
 
     Attributes:
         topic: name of its topic, under the prefix of what is estimated; a leading slash makes it a full

@@ -178,7 +178,7 @@ def placed_settings(
     origins: Floats | None,
     runs: int,
 ) -> Floats:
-    """Repeat settings (1 + sensors, fields) for each run, with the numbers of its plane's origin.
+    """Repeat settings (1 + sensors, fields) for each run, with the origin of its tangent plane.
 
     Args:
         settings: see `settings_of`; or (runs, 1 + sensors, fields) if each run has its own.

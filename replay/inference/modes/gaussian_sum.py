@@ -321,7 +321,7 @@ def _gaussian_sum(name: str, variant: str, members: int) -> Method:
 
 
 def _made_for(parameters: GaussianSumParameters) -> Method:
-    name, variant = named_filter(parameters.filter, "bank", "for the members of a bank")
+    name, variant = named_filter(parameters.filter, "bank", "for the members of a Gaussian sum")
     return _gaussian_sum(name, variant, parameters.members)
 
 

@@ -1,4 +1,4 @@
-"""Runs of one model by one method over messages: events, recursion, initialization, late messages.
+"""Runs of one model by one method over messages: events, recursion, initialization and reprocessing.
 
 Begin with `recursion`.
 """

@@ -75,7 +75,7 @@ from fuselog.replay.inference.run.timing import (
 )
 from fuselog.replay.inference.sampling.samplers import Sampler
 
-# What a smoother keeps for its backward pass, or a filter for late messages; the type is its own.
+# The history of a smoother for its backward pass, or of a filter for reprocessing; the type is its own.
 Kept = Any  # type: ignore[explicit-any]
 
 
@@ -88,7 +88,7 @@ class FilterState(NamedTuple):
         generators: random generators of samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         unsettled: events that wait for messages that arrive later but were measured earlier.
-        kept: what a smoother keeps for its backward pass, or a filter for late messages.
+        kept: history of a smoother for its backward pass, or of a filter for reprocessing.
         next_output: (runs,) number of the next additional estimate.
     """
 

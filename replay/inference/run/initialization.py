@@ -1,4 +1,4 @@
-"""Initialization of a filter in a log without a prior, and of the origin of its plane.
+"""Initialization of a filter in a log without a prior, and of the origin of its tangent plane.
 
 Such a log gets a prior at the first message that measures the state; see `start.Start`. The prior is
 much wider than the message, so that the message itself, which is also processed as a measurement,

@@ -1,9 +1,9 @@
 """Reprocessing of out-of-sequence messages: the final belief equals that of processing in order.
 
 For every message within a window, the filter stores the message, the state after it, and its innovation.
-A late message is inserted at its stamp and position in the file, and all messages after it are processed
-again. Estimates that were already issued stay as they were; an innovation is issued once no message can
-change it.
+An out-of-sequence message is inserted at its stamp and position in the file, and all messages after it
+are processed again. Estimates that were already issued stay as they were; an innovation is issued once
+no message can change it.
 """
 
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ class LateState(NamedTuple):
         carried: state after all messages so far.
         failure: its failures.
         history: the stored messages.
-        window_ns: how late messages may be.
+        window_ns: largest delay of a message that is reprocessed.
         repeated: (n,) number of updates that each event caused to be repeated.
         row: (runs,) row of the stored message that each run is processing.
     """
@@ -80,7 +80,7 @@ def _compiled(bound_model: BoundModel, method: Method, structure: Structure) -> 
     loop = reprocessing(
         bound_model.model, processing(bound_model, steps, reads), steps.estimate, structure
     )
-    title = f"{title_of(bound_model.model, method.summary)}, which reprocesses late messages"
+    title = f"{title_of(bound_model.model, method.summary)}, which reprocesses out-of-sequence messages"
     return compile_over_runs(loop, title=title), steps
 
 
@@ -290,7 +290,7 @@ class OutOfSequenceFilter:
 
 
 def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
-    """Report the late messages, and how many updates each caused to be repeated.
+    """Report the out-of-sequence messages, and how many updates each caused to be repeated.
 
     Args:
         name: name of the estimator.

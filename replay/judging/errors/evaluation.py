@@ -220,7 +220,7 @@ def errors_of(
     An axis or a quaternion is judged as a whole or not at all. The result is None if a run has no truth
     topic, if the truths have no component in common with the estimates (see
     `components_without_truth`), or if their planes cannot be compared (see `unlike`). A truth in
-    another plane is transformed to that of the estimates.
+    another tangent plane is transformed to that of the estimates.
 
     Args:
         estimates: the stream, or a block of it.
@@ -379,8 +379,8 @@ def reference(
 ) -> Floats:
     """Interpolate the truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
 
-    If the truth states the origin of another plane than that of the estimates, it is transformed to
-    theirs.
+    If the truth states the origin of another tangent plane than that of the estimates, it is transformed
+    to theirs.
 
     Raises BadInput if the truth lacks a component.
     """

@@ -19,7 +19,7 @@ from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.sources import Source
 
 ALIGNED = "aligned"  # in the metadata of estimates that were aligned with the truth's frame
-# By estimator and case, as in topics: for every run, the first fix, which is the origin of its plane.
+# By estimator and case, as in topics: for every run, the first fix, the origin of its tangent plane.
 FirstFixes = Mapping[str, Sequence[Origin | None]]
 
 
@@ -69,9 +69,10 @@ def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
             if own is not None and (is_first or truth.metadata.get(FRAME)):
                 at = "the first fix" if is_first else "their origin"
                 return (
-                    f"{topic} does not state the origin of its plane, and the estimates are relative to "
-                    f"{own}, {at}; give it with --set {topic}.plane=LATITUDE,LONGITUDE,HEIGHT, or align "
-                    "the estimates with fuselog evaluate --align se2"
+                    f"{topic} does not state the origin of its tangent plane, and the estimates are "
+                    f"relative to {own}, {at}; give it with --set "
+                    f"{topic}.plane=LATITUDE,LONGITUDE,HEIGHT, or align the estimates with "
+                    "fuselog evaluate --align se2"
                 )
             of_truth = frame_of(truth.metadata)
             if own is None and frame != of_truth:

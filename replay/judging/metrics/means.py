@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SPANS = 1024
 SPAN_NS = 1_000_000
 MODES, SMOOTHED_MODES, EFFECTIVE = "modes", "smoothed_modes", "effective_share"
-# Treatment of late messages.
+# Treatment of out-of-sequence messages.
 DROPPED, INSERTED, WAITED = "dropped", "inserted", "waited for"
 LATE = (DROPPED, INSERTED, WAITED)
 
@@ -155,7 +155,7 @@ class MeansOfAll:
             yield table.rename(columns={"messages": "estimates"})
 
     def late(self) -> "Iterator[pd.DataFrame]":
-        """Yield tables of late messages: a row per time span and treatment.
+        """Yield tables of out-of-sequence messages: a row per time span and treatment.
 
         `late_s` is their mean delay, `repeated` the mean number of other messages that were reprocessed.
         """

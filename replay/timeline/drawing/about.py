@@ -19,7 +19,7 @@ CORNERS = 49
 
 
 def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DView]:
-    """Draw a sensor's measurements around it, if they have positions in its plane; return the view."""
+    """Draw a sensor's measurements around it, if they have positions in the plane; return the view."""
     if stream.schema.full_name == schemas.DETECTION.full_name:
         seen = stream["position_m"][:, :2]
         if seen.shape[1] == 2:

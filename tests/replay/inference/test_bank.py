@@ -210,5 +210,5 @@ def test_what_has_no_angle_is_refused():
 
     with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, along which"):
         modelled(RANGING_POSITION, "bank:ekf")
-    with pytest.raises(BadInput, match="'pf' is not a filter for the members of a bank"):
+    with pytest.raises(BadInput, match="'pf' is not a filter for the members of a Gaussian sum"):
         modelled(ROLLER, "bank:pf")

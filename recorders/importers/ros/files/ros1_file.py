@@ -210,7 +210,7 @@ def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] |
     record, raw = read
     compression = record.header.get("compression", b"")
     if compression not in _DECOMPRESS:
-        return f"its compression {compression.decode(errors='replace')} is none of: none, bz2, lz4"
+        return f"its compression {compression.decode(errors='replace')} is not one of none, bz2 and lz4"
     try:
         data = np.frombuffer(_DECOMPRESS[compression](raw), np.uint8)
     except (OSError, EOFError, RuntimeError, ValueError) as error:

@@ -87,7 +87,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
     with extra("papers", "a mixture on the torus"):
         from sklearn.cluster import KMeans  # which takes long to import
 
-    with threadpool_limits(1):  # with so few points, a second core would only spin
+    with threadpool_limits(1):  # with few points, a second core would only spin
         labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]
     mean = np.angle(share.T @ np.exp(1j * angles))
