@@ -54,7 +54,7 @@ class GnssInsOptions(Parameters):
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
-        delayed: label of a smoother that undoes the mapping's delay of the velocity, or "".
+        delayed: label of a smoother that compensates the mapping's delay of the velocity, or "".
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.
@@ -87,7 +87,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: GnssInsOptions = setting.options
     experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)
-    # the longest come first, because the first run is drawn
+    # the longest windows come first, because the first run is drawn
     windows = {
         length_s: windows_of(rows, length_s, options.first_s, options.every_s)
         for length_s in sorted(options.lengths_s, reverse=True)
@@ -150,7 +150,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """Find the folder at --data or below that has all files of the mapping.
+    """Find the folder at or below --data that has all files of the mapping.
 
     Raises BadInput if there are several.
     """
@@ -165,7 +165,7 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
-    """Set the velocity delay of the estimator `delayed` such that it undoes that of the mapping."""
+    """Set the velocity delay of the estimator `delayed` to the negative of the mapping's delay."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
@@ -181,7 +181,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """Import the recording, without fixes before `settle_s`, and the rows of the receiver."""
+    """Import the recording; return it without fixes before `settle_s`, and the receiver's rows."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))
