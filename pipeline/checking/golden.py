@@ -24,7 +24,7 @@ from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
-# The golden of a run keeps about NUMBERS numbers; the rows kept of each stream follow, within the bounds.
+# A run keeps about NUMBERS numbers; the number of kept rows of each stream follows, within the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
 # The values of these streams are numbers of sentences, whose wording may change.
