@@ -1,4 +1,4 @@
-"""Functions of numbers from NumPy, Python and libm in LLVM's text: `FUNCTIONS`."""
+"""Functions of numbers from NumPy, Python and libm, lowered to LLVM IR: `FUNCTIONS`."""
 
 import math
 import operator
