@@ -184,7 +184,7 @@ def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int],
     first = prepared()
     cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
     waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
-    first(0, 0)  # compile in this thread: others would wait forever for a module that is being imported
+    first(0, 0)  # compile in this thread: others would deadlock on a module that is being imported
     helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
     try:
         work(first)

@@ -42,7 +42,7 @@ from fuselog.recorders.compiling.notices import compiling, done_once
 from fuselog.recorders.compiling.scratch import Memory
 from fuselog.recorders.errors import BadInput
 
-_ALL = 64  # the most axes of an array
+_ALL = 64  # largest number of axes of an array
 _MADE_BY = "a kernel that fuselog compiled"
 
 

@@ -73,9 +73,8 @@ class Program:
 
     def name(self, stem: str) -> str:
         """Return a unique name for a function or table."""
-        return (
-            f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # "<lambda>" is not a valid name
-        )
+        # "<lambda>" is not a valid name
+        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"
 
     def table(self, numbers: AnyArray) -> Array:
         """Return a constant array, defined once."""
