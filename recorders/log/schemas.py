@@ -2,9 +2,9 @@
 
 A schema is a flat protobuf message whose fields have a fixed width and are `optional`; a vector is a
 packed list of doubles whose length is the same in all messages of a stream. All messages of a stream
-thus share one byte layout (see `layout`), and any protobuf reader can read the file. Field numbers follow
-the order of declaration, so new fields are added at the end. The first field of every message is the time
-of the sensor's own clock.
+thus share one byte layout (see `layout`), and any protobuf reader can read the file. Field numbers
+follow the order of declaration, so new fields are added at the end. The first field of every message is
+the time of the sensor's own clock.
 """
 
 from collections.abc import Iterator
