@@ -1,1 +1,1 @@
-"""Checks of estimators against stored replays, field by field; begin with `checking`."""
+"""Comparison of replays with stored ones, field by field; begin with `checking`."""

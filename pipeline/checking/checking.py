@@ -1,4 +1,4 @@
-"""Checks of logs and results against a golden: what is replayed, and what is reported."""
+"""Checks of logs and results against a golden: selection of the runs, replay and report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ Runs = Mapping[str, LogSource | MemorySource]
 
 @dataclass(frozen=True)
 class Checked:
-    """Holds how a replay compares with its golden.
+    """The result of comparing a replay with its golden.
 
     Attributes:
-        fields: how many fields of the golden's streams and metrics were compared, by run and topic.
-        found: what is not as in the golden.
-        sentences: on the first of these in time.
+        fields: number of compared fields of the golden's streams and metrics, by run and topic.
+        found: the differences from the golden.
+        sentences: description of the earliest difference.
     """
 
     fields: Mapping[tuple[str, str], int]
@@ -40,11 +40,11 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
     """Replay runs with a golden's settings, and compare field by field.
 
     Args:
-        runs: by the names that the golden has them by.
-        golden: as `read` has it.
-        estimators: in place of those that the golden names, such as ones that have no name.
+        runs: the runs, by their names in the golden.
+        golden: the golden, as returned by `read`.
+        estimators: settings of estimators to replay instead of those that the golden names.
 
-    Raises BadInput where the runs are others than the golden's, or no estimator can follow them.
+    Raises BadInput if the runs are not those of the golden, or no estimator supports them.
     """
     stored = golden["settings"]
     if not estimators and not stored["estimators"]:
@@ -60,7 +60,7 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
 
 
 def compared(golden: Golden, replayed: Replayed) -> Checked:
-    """Compare a replay, or estimates made by other means, with a golden."""
+    """Compare a replay, or estimates from another source, with a golden."""
     found = list(discrepancies(golden, replayed))
     fields = {("", "metrics"): len(golden["metrics"])} if golden["metrics"] else {}
     for name, run in golden["runs"].items():
@@ -69,9 +69,9 @@ def compared(golden: Golden, replayed: Replayed) -> Checked:
 
 
 def runs_of(path: Path) -> Runs:
-    """Return the runs of a log, of a folder of logs, or those whose logs a result kept.
+    """Return the runs of a log, of a folder of logs, or of the logs that a result keeps.
 
-    Raises BadInput where there are none.
+    Raises BadInput if there are no logs, or two of them have the same name.
     """
     applied: dict[str, Any] = {}
     if (path / RESULT_FILE).is_file():
@@ -98,9 +98,9 @@ def update(
     columns: Sequence[str] = (),
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """Write the golden of a path's runs to a place.
+    """Write the golden of the runs at `path` to the file `place`.
 
-    Settings that are not given are those of the golden that is there, else those of the result.
+    Settings that are not given are taken from the existing golden, or otherwise from the result.
     """
     check_files([(place, GOLDEN)], {"log": [path]})
     before = read(place) if place.exists() else None
@@ -127,7 +127,7 @@ def _is_golden(path: Path) -> bool:
     try:
         read(path)
     except BadInput as error:
-        return "wrote it (format" in str(error)  # of another version
+        return "wrote it (format" in str(error)  # a golden of another version
     return True
 
 

@@ -1,4 +1,4 @@
-"""The command `fuselog check`: it replays, compares with a golden, and says what is first different."""
+"""The command `fuselog check`, which replays runs and reports the first difference from a golden."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,10 +30,10 @@ def check_path(
     settings: Sequence[str],
     in_place: Callable[[str, Runs, Golden], Settings] | None = None,
 ) -> bool:
-    """Check a path against a golden, or write that; whether all is as in the golden.
+    """Compare the runs at `path` with a golden, or write the golden; return whether all fields agree.
 
-    `in_place` makes of a program's name, of runs and of a golden what is replayed in place of its
-    estimator.
+    `in_place` takes the name of a program, the runs and the golden, and returns the settings to replay
+    instead of the golden's estimators.
     """
     if is_update:
         if junit is not None:

@@ -1,4 +1,4 @@
-"""Comparison of a replay with its golden: where they differ, by how much, and where first."""
+"""Comparison of a replay with its golden: which parts differ, by how much, and from which time."""
 
 import base64
 import math
@@ -26,18 +26,18 @@ from fuselog.replay.judging.errors.evaluation import split_topic
 
 
 class Discrepancy(NamedTuple):
-    """Describes a part of a replay that is not the golden's.
+    """A part of a replay that differs from the golden.
 
     Attributes:
-        run: whose.
-        topic: where.
-        part: the column, or what else of the stream.
-        apart: how far, relative to the column's size; infinite where one is missing.
-        allowed: how far it may be.
-        row: the first kept row that is too far; None where none of them is.
-        component: which one of the column.
-        before, after: the golden's value there, and the replay's.
-        stamp_ns: of the row, where the replayed stream is at hand.
+        run: name of the run.
+        topic: topic of the stream.
+        part: the column, or another part of the stream, such as its metadata.
+        apart: difference relative to the size of the column; infinite if one of the two is missing.
+        allowed: largest allowed difference, relative to the size of the column.
+        row: first kept row that exceeds `allowed`; None if no kept row does.
+        component: component of the column.
+        before, after: values of the golden and of the replay in this row.
+        stamp_ns: stamp of the row, if the replayed stream is available.
     """
 
     run: str
@@ -68,9 +68,9 @@ class Discrepancy(NamedTuple):
 
 
 def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
-    """Find everything in which a replay is not the golden, run by run.
+    """Yield the parts of a replay that differ from the golden by more than allowed, run by run.
 
-    Raises BadInput where the runs, or what was put in, are others.
+    Raises BadInput if the runs or their inputs are not those of the golden.
     """
     found = replayed.golden
     is_same_cpu = golden["arithmetic"] == found["arithmetic"]
@@ -110,7 +110,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
 def _distances(
     golden: Golden, found: Golden, missing: Callable[[str, str, str], Discrepancy]
 ) -> Iterator[Discrepancy]:
-    """Yield how far every part is from the golden's, by its size; infinite where one is missing."""
+    """Yield the relative difference of every part from the golden's; infinite if one is missing."""
     for key, stored, new in _pairs(golden["metrics"], found["metrics"]):
         before, after = _floats(stored), _floats(new)
         if before.shape != after.shape:
@@ -138,7 +138,10 @@ def _pairs(stored: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[
 def _column_distance(
     about: Discrepancy, stored: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Discrepancy:
-    """Find the largest distance of a column, by its root mean square; of angles by one radian."""
+    """Find the largest difference of a column, relative to its root mean square.
+
+    For angles and other bounded components, the divisor is at least one.
+    """
     name, rows, kinds = about.part, stored["rows"], stored["metadata"].get("kinds", "").split(",")
     if name not in stored["columns"] or name not in new["columns"]:
         return about
@@ -178,7 +181,7 @@ def _column_distance(
 
 
 def _component(metadata: Mapping[str, str], place: tuple[int, ...], shape: tuple[int, ...]) -> str:
-    """Name an entry of a row; an entry of a matrix by its row and its column."""
+    """Name an entry of a row; entries of a matrix are named by row and column."""
     if not place:
         return ""
     names = metadata.get("components", "").split(",")
@@ -203,21 +206,21 @@ def _size(before: Mapping[str, Floats], rows: int) -> Floats:
 
 
 def _difference(before: Floats, after: Floats) -> Floats:
-    """Subtract values; those that are infinite or missing in both are equal."""
+    """Subtract `before` from `after`; equal infinities and values missing in both give zero."""
     with np.errstate(invalid="ignore", over="ignore"):
         difference: Floats = after - before
     return np.where((before == after) | (np.isnan(before) & np.isnan(after)), 0.0, difference)
 
 
 def _relative(difference: Floats, size: ArrayLike) -> Floats:
-    """Divide differences by their size; NaN if one of the values is missing."""
+    """Divide differences by `size`; zero differences give zero, missing values NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative: Floats = np.where(difference == 0.0, 0.0, np.abs(difference) / size)
     return relative
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """Describe the first discrepancy in time, where it begins, and the innovation there."""
+    """Describe the earliest discrepancy, the time from which bits differ, and the innovation then."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     sentences = [first.sentence]
@@ -234,7 +237,7 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
 
 
 def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> int | None:
-    """Find the stamp of the first row with other bits; None where rows cannot be compared."""
+    """Find the stamp of the first row whose bits differ; None if there is none or it is unknown."""
     stored, new = (
         each["runs"][first.run]["streams"].get(first.topic) for each in (golden, replayed.golden)
     )
@@ -257,7 +260,7 @@ def _innovation_at(outputs: Outputs, what: tuple[str, str], stamp_ns: int) -> It
             continue
         row = int(np.searchsorted(stream.publish_time_ns, stamp_ns))
         if row == len(stream) or stream.publish_time_ns[row] != stamp_ns:
-            row -= 1  # none at the stamp itself: the last one before
+            row -= 1  # no innovation at the stamp itself: use the last one before it
         if row >= 0:
             values = ", ".join(f"{value:.6g}" for value in np.atleast_1d(stream["innovation"][row]))
             nis = stream["normalised_innovation_squared"][row]

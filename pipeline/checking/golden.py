@@ -1,8 +1,8 @@
-"""Makes goldens: small stored replays that later ones are checked against, field by field.
+"""Creation of goldens: small stored replays with which later replays are compared, field by field.
 
-A golden is packed JSON: settings, a hash of every input, tolerances, and of every output stream the
-number of rows, the metadata, hashes of both clocks, a checksum of each row, and of every column some
-rows spread evenly, in full precision, and sums over all rows. How long anything took is no part of it.
+A golden is compressed JSON with the settings, a hash of every input and the tolerances. For every output
+stream, it has the number of rows, the metadata, hashes of both clocks and a checksum of each row; for
+every column, some evenly spaced rows in full precision, and sums over all rows. It has no timings.
 """
 
 import base64
@@ -24,10 +24,10 @@ from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
-# Of each stream as many rows as this many numbers of the whole golden allow, between the bounds.
+# A run keeps about NUMBERS numbers; the number of kept rows of each stream follows, within the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
-# Their values are numbers of sentences, which may be worded anew.
+# The values of these streams are numbers of sentences, whose wording may change.
 REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name, schemas.STARTED.full_name}
 
 Floats = NDArray[np.float64]
@@ -40,14 +40,14 @@ class Tolerance(NamedTuple):
     relative: float
     reason: str = ""
     elsewhere: bool = False
-    """Whether only where the CPU's arithmetic is not the golden's."""
+    """Whether the tolerance applies only if the CPU's arithmetic differs from the golden's."""
 
 
 Tolerances = Mapping[str, Tolerance]
 
 
 class Replayed(NamedTuple):
-    """The golden of a new replay, and the output streams of each run that it is made of."""
+    """The golden of a new replay, and the output streams of each run from which it was made."""
 
     golden: Golden
     outputs: Mapping[str, Outputs]
@@ -62,17 +62,17 @@ def make(
     columns: Sequence[str] = ("*",),
     tolerances: Tolerances | None = None,
 ) -> Replayed:
-    """Replay runs, each by itself.
+    """Replay runs one by one, and make their golden.
 
     Args:
         sources: the runs by name.
         estimators: settings by label.
-        late: what is done about late messages, in the order of their arrival.
-        arrival_order: go by log time.
-        columns: patterns of what is kept, as `TOPIC COLUMN`.
-        tolerances: by patterns as these.
+        late: handling of out-of-sequence messages, as the option `--late`.
+        arrival_order: whether messages are replayed in order of log time.
+        columns: patterns of the columns to keep, as `TOPIC COLUMN`.
+        tolerances: allowed differences by such patterns.
 
-    Raises BadInput where an estimator can follow no run.
+    Raises BadInput if an estimator supports none of the runs.
     """
     order, policy = order_of(arrival_order=arrival_order, late=late)
     runs: dict[str, Any] = {}
@@ -108,7 +108,7 @@ def golden_of(
     metrics: Mapping[str, Any] | None = None,
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """Return a golden of these parts, as reading gives it back."""
+    """Return a golden of these parts, in the form in which a file is read."""
     found = {
         "format": FORMAT,
         "arithmetic": arithmetic(),
@@ -127,7 +127,7 @@ def input_hash(source: LogSource | MemorySource) -> str:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Test whether an output is an estimate; usage and the note that nothing failed are not."""
+    """Test whether an output belongs in a golden: not coverage, nor empty streams of reasons."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 
@@ -137,7 +137,7 @@ def _is_kept(topic: str, column: str, patterns: Sequence[str]) -> bool:
 
 
 def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]:
-    """Return what a golden has of a stream; of failures and the like only how many, and when."""
+    """Return the golden's entry of a stream; failures and the like have only a count and times."""
     has_values = stream.schema.full_name not in REASONS
     kept = kept_rows(len(stream), rows)
     values = {
@@ -156,12 +156,12 @@ def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]
 
 
 def kept_rows(count: int, most: int) -> NDArray[np.int64]:
-    """Choose at most `most` of a stream's rows, evenly spaced."""
+    """Choose at most `most` evenly spaced rows of a stream of `count` rows."""
     return np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
 
 
 def checksums(columns: Mapping[str, Floats]) -> NDArray[np.uint16]:
-    """Return a checksum (rows,) of each row's bits: which tells where the first that differs is."""
+    """Compute a checksum of the bits of each row, (rows,), by which a changed row can be found."""
     parts = [
         column.reshape(len(column), math.prod(column.shape[1:])) for _, column in sorted(columns.items())
     ]
@@ -185,9 +185,10 @@ def _sha256(array: NDArray) -> str:
 
 
 def arithmetic() -> str:
-    """Hash what elementary functions and linear algebra give here: CPUs differ in the last digit.
+    """Hash results of elementary functions and linear algebra, whose last digits depend on the CPU.
 
-    Where it is not a golden's, neither is a recorded input, and nothing can be equal to 1e-12.
+    If the hash differs from the golden's, inputs that are simulated or imported again differ too, and
+    estimates cannot agree to 1e-12.
     """
     x = np.linspace(0.01, 10.0, 1001)
     matrix = np.exp(-np.abs(np.subtract.outer(x[:40], x[:40])))

@@ -1,4 +1,4 @@
-"""The results of a check as JUnit XML, for continuous integration: one test case per topic."""
+"""Output of the results of a check as JUnit XML for continuous integration, a test case per topic."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,9 +11,9 @@ NAME = "fuselog check"
 
 
 def write_junit(path: Path, golden: str, outcome: Checked | Exception) -> None:
-    """Write the results of a check, or the error that left it without any.
+    """Write the results of a check, or the error that prevented it.
 
-    Times are left out, so that the same check gives the same bytes.
+    The file has no times, so that the same check always gives the same bytes.
     """
     cases: dict[tuple[str, str], list[str]] = {}
     kind, element = "difference", "failure"

@@ -1,4 +1,4 @@
-"""Reading and writing of goldens: packed JSON, whose content is validated when it is read."""
+"""Reading and writing of goldens: compressed JSON, whose content is validated when it is read."""
 
 import base64
 import json
@@ -23,18 +23,18 @@ from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parsing import parse_json
 
 SUFFIX = ".golden.xz"
-# Raised when a golden is written in a way that this reader would misread.
+# Version of the format; incremented if this reader would misread new goldens.
 FORMAT = 1
-# No golden is larger, in bytes of its text and in numbers, lists and tables; a small archive may be.
+# Limits of a golden: bytes of its text, and number of values. A small archive may unpack to far more.
 MOST_BYTES, MOST_VALUES = 64 << 20, 4_000_000
-# xz's own best presets take a quarter of it.
+# Memory limit for unpacking; the best presets of xz need a quarter of it.
 _UNPACKING_BYTES = 256 << 20
 
 Golden = dict[str, Any]
 
 
 def _numbers(values: Any) -> Any:
-    """Refuse what is no array of numbers; a null is NaN."""
+    """Raise ValueError if values are not an array of numbers; null stands for NaN."""
     try:
         np.asarray(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -46,13 +46,13 @@ Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
 class _Part(BaseModel):
-    """A part of a golden, which may have no other names than its type."""
+    """A part of a golden, which may have no other keys than its fields."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class _Column(_Part):
-    """Some rows of a column; over all rows, how many are missing, their sums and squares."""
+    """Some rows of a column; the number of missing values, sums and sums of squares over all rows."""
 
     kept: Numbers
     missing: Numbers
@@ -63,7 +63,7 @@ class _Column(_Part):
     def _is_of_one_shape(self) -> Self:
         shapes = [np.shape(each) for each in (self.missing, self.sum, self.sum_of_squares)]
         kept = np.shape(self.kept)
-        is_empty = kept == (0,)  # of a stream without messages, whatever shape these would have
+        is_empty = kept == (0,)  # without messages, the list does not show the shape of a row
         if not kept or any(shape != (shapes[0] if is_empty else kept[1:]) for shape in shapes):
             raise ValueError("its rows and its sums are of different shapes")
         return self
@@ -127,7 +127,7 @@ class _Golden(_Part):
 
 
 def write(path: Path, golden: Golden) -> None:
-    """Keep a golden; the same one gives the same bytes. Raises BadInput where none could be so large."""
+    """Write a golden; equal goldens give the same bytes. Raises BadInput if it is too large."""
     text = json.dumps(golden, sort_keys=True, separators=(",", ":")).encode()
     if not _is_small(text):
         raise BadInput(
@@ -163,7 +163,7 @@ def read(path: Path) -> Golden:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Unpack the text; raises ValueError if it is longer than a golden may be."""
+    """Unpack the text; raises ValueError if it is larger than a golden may be, or incomplete."""
     with path.open("rb") as file:
         packed = file.read(MOST_BYTES)
     unpacking = lzma.LZMADecompressor(memlimit=_UNPACKING_BYTES)

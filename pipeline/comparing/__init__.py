@@ -1,4 +1,4 @@
-"""Compares two estimators or more over the same runs, with a verdict on every metric.
+"""Comparison of two or more estimators over the same runs, with a verdict on every metric.
 
 Begin with `comparing`.
 """

@@ -1,7 +1,7 @@
-"""Reads the candidates of a comparison: what each gave of every run, wherever that comes from.
+"""Candidates of a comparison: their estimates of every run, judged by the truth.
 
-A candidate's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
-result says of itself. What comes of a trajectory file is an estimate stream like any other.
+The estimates of a candidate come from logs, as written by `fuselog replay`, from a replay with the
+settings of a result, or from a trajectory file, which is converted to a stream of estimates.
 """
 
 import hashlib
@@ -40,9 +40,9 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 from fuselog.replay.judging.metrics.metrics import rmse_of
 from fuselog.replay.judging.tables import joined
 
-# Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.
+# Relative tolerance for the rows of a result and its replay, since CPUs differ in the last digits.
 SAME = 1e-6
-# Entries of an experiment that decide about its results.
+# Entries of an experiment that affect its results.
 DECIDING = ("record", "import", "logs", "alterations", "gap_limit_s", "arrival_order", "late")
 
 
@@ -51,21 +51,21 @@ Pairs = Mapping[str, tuple[Source, Source]]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Holds what an estimator gave, judged run by run.
+    """The estimates of one estimator, judged run by run.
 
     Attributes:
-        name: what to call it.
-        label: what its estimates call it.
+        name: name in the comparison.
+        label: label of its estimates in their logs.
         rows: a row per run, case and quantity: `run`, `case`, `quantity`, `value`.
-        times: a row per run, case and span of time; see `Judge.times`.
-        sizes: of a mean NEES, by quantity and case, how large it should be.
-        settings: what decided about it, by dotted name; None of what was recorded.
-        truths: by run, a hash of what it was judged by.
-        pairs: by run, those that can be drawn: the log, and the estimates.
-        notes: sentences on where it comes from.
-        replay: what the files of `pairs` go with.
-        doubts: about truths, by topic.
-        coverage: what became of every topic.
+        times: a row per run, case and time span; see `Judge.times`.
+        sizes: expected mean NEES by quantity and case.
+        settings: settings that affect the estimates, by dotted name; None for recorded estimates.
+        truths: hash of the truth by run.
+        pairs: log and estimates by run, for the runs that can be drawn.
+        notes: sentences about the origin of the estimates.
+        replay: the replay that made the estimates of `pairs`, if any; it keeps their files.
+        doubts: doubts about truths, by topic.
+        coverage: rows on the use of the messages of every topic.
     """
 
     name: str
@@ -82,19 +82,19 @@ class Candidate:
     coverage: Sequence[Row] = ()
 
     def estimates(self, run: str) -> Renamed:
-        """Return the estimates of a run that can be drawn, under this candidate's name."""
+        """Return the estimates of one of the runs of `pairs`, under this candidate's name."""
         return Renamed(self.pairs[run][1], self.label, self.name)
 
 
 @dataclass(frozen=True)
 class Given:
-    """Describes one side of a comparison.
+    """One side of a comparison.
 
     Attributes:
-        name: what to call it.
-        labels: its estimators.
-        candidate: the candidate that one of them is, under a name.
-        sources: its runs, where they are logs.
+        name: name in the comparison.
+        labels: labels of its estimators.
+        candidate: function that makes a candidate from a label and a name.
+        sources: its runs by key, if they are logs.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Given:
 def measured(
     name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any] | None
 ) -> Candidate:
-    """Judge the estimates of a label, each run by itself: of every pair of a log and its estimates."""
+    """Judge the estimates of a label run by run, where each pair is a log and its estimates."""
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []
     times: list[pd.DataFrame] = []
@@ -143,7 +143,7 @@ def _hash_of_truth(source: Source, estimates: Source) -> str:
 
 
 def key_of(source: Source) -> str:
-    """Return what tells a run from others: scenario, seed and number, or a recorded log's name."""
+    """Return the key of a run: its scenario, seed and number, or the name of a recorded log."""
     run = source.run
     if run is not None and run.seed is not None:
         return f"{run.scenario}, seed {run.seed}, run {run.run}"
@@ -151,7 +151,7 @@ def key_of(source: Source) -> str:
 
 
 def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what decided about the estimates of a label, by dotted name."""
+    """Return the settings that affect the estimates of a label, by dotted name."""
     run = source.run or RunMetadata("unknown")
     return flat(
         {"scenario": run.scenario, "parameters": run.parameters, "estimator": parameters(label, stated)}
@@ -159,7 +159,7 @@ def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[s
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an estimator's parameters, including defaults if known; None if unset."""
+    """Return an estimator's parameters, including defaults if the estimator is known."""
     try:
         return dict(configure(label, stated)[1].model_dump(mode="json"))
     except BadInput:
@@ -178,13 +178,16 @@ def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def name_of(path: Path) -> str:
-    """Return a path's name as a label, without dots and slashes."""
+    """Convert the name of a path to a label, without dots and slashes."""
     stem = path.resolve().name.removesuffix(".estimates.mcap").removesuffix(path.suffix)
     return re.sub(r"[^\w:=+-]+", "-", stem).strip("-") or "side"
 
 
 def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[str] = ()) -> Given:
-    """Return the estimators of a replay, after those whose estimates its logs have already."""
+    """Return the estimators of a replay, preceded by those whose estimates its logs contain.
+
+    Raises BadInput if two of the logs have the same run.
+    """
     runs = list(map(key_of, done.logs))
     for run in runs:
         if runs.count(run) > 1:
@@ -205,9 +208,9 @@ def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[st
 
 
 def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
-    """Return the estimators of an estimates log, or of a folder of them: a run each.
+    """Return the estimators of an estimates log, or of a folder with an estimates log for each run.
 
-    Raises BadInput where there are none, or a log that they are of is not there.
+    Raises BadInput if a log has no estimates, two logs have the same run, or a replayed log is missing.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if not files:
@@ -246,10 +249,10 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
 
 
 def of_result(folder: Path, progress: Progress) -> Given:
-    """Return the estimators of a result folder, replayed from its settings.
+    """Return the estimators of a result folder, replayed with its settings.
 
-    A result holds RMSE and NEES of every run, but not every metric. Where a replay by this version gives
-    the same rows, it gives the other metrics too; where it does not, the rows of the result count.
+    A result contains the RMSE and NEES of every run, but not every metric. If a replay with this version
+    gives the same rows, its other metrics are used too; otherwise only the rows of the result are.
     """
     result = read_result(folder)
     tables = {name: folder / "tables" / f"{name}.parquet" for name in ("runs", "times")}
@@ -326,14 +329,14 @@ def _stored(
 
 
 def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate) -> Candidate:
-    """Make again what was kept of a result, a part of the runs at a time."""
+    """Replay the runs of a result, some at a time, and judge them again."""
     label = kept.label
     if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
         raise BadInput("its settings do not say how to replay it; estimates logs can be compared")
     fields = {each.alias or name for name, each in Experiment.model_fields.items()}
     entries = {key: value for key, value in result.settings.items() if key in fields}
     entries["estimators"] = of_file(entries["estimators"])
-    if "record" not in entries:  # recorded data have as many runs as there are
+    if "record" not in entries:  # the recorded data determine the number of runs
         entries = {key: value for key, value in entries.items() if key not in ("runs", "seed")}
     experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")
     experiment = experiment.model_copy(update={"runs": len(experiment.files) or experiment.runs})
@@ -367,7 +370,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
 
 
 def _row_that_differs(kept: Candidate, again: Candidate) -> str:
-    """Describe the first row in which a replay differs from a result; empty if there is none."""
+    """Describe the first row in which a replay differs from a result; empty if they agree."""
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
     if len(both) < len(kept.rows):
@@ -382,7 +385,7 @@ def _row_that_differs(kept: Candidate, again: Candidate) -> str:
 
 
 def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: float) -> Given:
-    """Return a trajectory file as the estimates of a run, judged by one of its truths."""
+    """Return the trajectory in a file as estimates of a run, to be judged by the topic of a truth."""
     trajectory = read_trajectory(path)
     name = name_of(path)
     truth = source.read([truth_topic])[truth_topic]

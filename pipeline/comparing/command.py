@@ -1,4 +1,4 @@
-"""The command `fuselog compare`: it prints verdicts with their intervals, and writes what is asked."""
+"""The command `fuselog compare`, which prints verdicts with intervals and writes the chosen outputs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,9 +43,10 @@ def compare_candidates(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> bool:
-    """Compare, print a table for each pair and case and the verdicts, write folder and timeline.
+    """Compare candidates; print tables and verdicts, and write the result folder and the timeline.
 
-    With `fail_if_worse`, returns whether no candidate is worse than the first; see `Differences.worse`.
+    Returns False if `fail_if_worse` is set and a candidate is worse than the first (see
+    `Differences.worse`), otherwise True.
     """
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     alterations, own = split_texts(settings)

@@ -50,22 +50,22 @@ from fuselog.replay.judging.intervals import FEWEST_RUNS
 from fuselog.replay.judging.verdicts import DIFFER, Comparison
 
 MARGIN = 0.02
-# The differences over time have at most so many spans.
+# Largest number of time spans in the differences over time.
 SPANS = 32
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Differences:
-    """Holds how estimators differ: the first of each group against every other one.
+    """Differences between the first candidate of each group and every other one.
 
     Attributes:
-        groups: the candidates.
-        margin: which share of a metric is no matter.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        notes: sentences on what is not alike, and what was left out.
+        groups: groups of candidates.
+        margin: relative difference of a metric that is considered irrelevant.
+        gap_limit_s: longest gap over which the truth is interpolated.
+        notes: sentences about unequal inputs and omitted runs or metrics.
         paired: every metric of every pair.
-        times: a row per pair, case, quantity and span of time: the difference and its interval.
-        stress: what changes that should not matter do; None where that was not asked for.
+        times: a row per pair, case, quantity and time span, with the difference and its interval.
+        stress: effects of changes that should not matter; None if they were not tested.
     """
 
     groups: Sequence[Sequence[Candidate]]
@@ -93,19 +93,19 @@ class Differences:
 
     @property
     def sentences(self) -> list[str]:
-        """Return the verdicts in words, those on differences first."""
+        """Return the verdicts in words, beginning with significant differences."""
         order = (*DIFFER, Comparison.UNDECIDED, Comparison.TIE)
         return [
             each.sentence for each in sorted(self.paired, key=lambda p: order.index(p.found.verdict))
         ]
 
     def worse(self) -> list[Paired]:
-        """Return the errors, consistencies and failures of which a candidate is worse than the first.
+        """Return the metrics of error, consistency and failure in which a candidate is worse.
 
-        Each has its whole interval beyond the margin.
+        The interval of their difference from the first candidate is entirely beyond the margin.
 
-        Raises BadInput where none of them has enough runs, or a candidate that is not worse in another
-        one lacks one that the first has, since there is nothing to judge by.
+        Raises BadInput if there are too few runs for an interval, or if a candidate that is not worse in
+        any metric lacks a metric of the first, since it cannot be judged then.
         """
         judged = [each for each in self.paired if _is_judged(each.quantity)]
         runs = max((each.found.runs for each in judged), default=0)
@@ -133,7 +133,7 @@ class Differences:
         return "\n".join([*self.notes, *self.sentences])
 
     def charts(self) -> dict[str, Chart]:
-        """Draw the differences over time, a chart for each pair and case."""
+        """Draw the differences over time in a chart for each pair and case."""
         if self.times.empty:
             return {}
         groups = self.times.groupby(["first", "second", "case"], sort=False)
@@ -143,11 +143,11 @@ class Differences:
         }
 
     def draw(self, save: Path) -> None:
-        """Write to the .rrd file `save` the first run that both candidates of the first group have.
+        """Write the first run that all candidates of the first group have to the .rrd file `save`.
 
-        Raises BadInput where no such run can be drawn.
+        Raises BadInput if there is no such run.
         """
-        from fuselog.replay.timeline.show import Drawing  # which takes long to import
+        from fuselog.replay.timeline.show import Drawing  # slow to import
 
         candidates = self.groups[0]
         check_files([(save, TIMELINE)], {"input": self.inputs})
@@ -163,7 +163,7 @@ class Differences:
     def save(self, folder: str | Path) -> ResultFolder:
         """Write tables, figures and timeline to the result folder `folder`, for `fuselog report`.
 
-        Raises BadInput where something else than a result of ours is in the place.
+        Raises BadInput if `folder` exists and is not a result of fuselog.
         """
         place = Path(folder)
         inputs = self.inputs
@@ -196,7 +196,7 @@ class Differences:
 
     @cached_property
     def coverage(self) -> list[Row]:
-        """Return how many messages of every topic were used, by candidate."""
+        """Return the rows on the use of every topic's messages, for all candidates."""
         return [
             row for candidates in self.groups for candidate in candidates for row in candidate.coverage
         ]
@@ -209,7 +209,7 @@ class Differences:
 
     @property
     def inputs(self) -> list[Path]:
-        """Return the input files."""
+        """Return the input files of the first group."""
         sources = [
             each for candidate in self.groups[0] for pair in candidate.pairs.values() for each in pair
         ]
@@ -222,7 +222,7 @@ def _is_judged(key: str) -> bool:
 
 
 def _judged_by(candidate: Candidate) -> set[str]:
-    """List the metrics by which a candidate is judged; those that count what is bad may be absent."""
+    """List the metrics by which a candidate is judged, except `estimates_without_*` (may be absent)."""
     known = candidate.rows.dropna(subset=["value"])["quantity"]
     return {key for key in known if _is_judged(key) and not key.startswith("estimates_without")}
 
@@ -258,28 +258,29 @@ def compare(
     stress: bool = False,
     progress: Progress = no_progress,
 ) -> Differences:
-    """Compare estimators over the same runs, each other one with the first.
+    """Compare estimators over the same runs, with the first one as the reference.
 
     Args:
-        candidates: result folders, estimates logs or folders of them, and trajectory files; or with
-            `estimators` logs to replay, or folders of them.
-        estimators: which ones, as for `replay`, or the labels of estimates that a recording has beside
-            its sensors, which come first; by default those that all candidates have, or the only ones.
-        truth: the true trajectory, as a file, where all candidates are files.
-        case: what trajectory files are of, such as `robot2`, where a log has several truths.
-        margin: which share of a metric is no matter.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        set: how topics are altered, and parameters of estimators, of logs that are replayed; as for
+        candidates: result folders, estimates logs or folders of them, and trajectory files; with
+            `estimators`, logs to replay or folders of them.
+        estimators: estimators to compare, as for `replay`, or labels of estimates that a log contains
+            in addition to its sensors, which come first. By default, those that all candidates have in
+            common, or the only estimator of each.
+        truth: file of the true trajectory, if all candidates are trajectory files.
+        case: case that trajectory files belong to, such as `robot2`, if a log has several truths.
+        margin: relative difference of a metric that is considered irrelevant.
+        gap_limit_s: longest gap over which the truth is interpolated.
+        set: alterations of topics, and parameters of estimators, for logs that are replayed; as for
             `replay`.
-        recover: read what is whole of logs that were cut off or damaged.
-        stress: withhold verdicts on differences below what changes do that should not matter; see
-            `stress`. It takes logs and `estimators`.
-        progress: is told how a replay of results goes.
+        recover: whether the readable part of truncated or damaged logs is used.
+        stress: whether verdicts are withheld if changes that should not matter move the metric by more
+            than the difference; see `stress`. Requires logs and `estimators`.
+        progress: function that reports the progress of replays of results.
 
     Returns:
         The difference of every metric for every pair, with its interval and a verdict.
 
-    Raises BadInput where there are not two candidates, or they have nothing in common.
+    Raises BadInput if there are fewer than two candidates, or they have no run or metric in common.
 
     >>> from fuselog.pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=5.0))
@@ -324,7 +325,7 @@ def compare(
 def _compared(
     first: Candidate, second: Candidate, margin: float, notes: list[str]
 ) -> tuple[list[Paired], pd.DataFrame]:
-    """Compare every metric that both have, over the runs that both have; and some over time."""
+    """Compare two candidates in their common metrics, over their common runs and over time."""
     keys = ["quantity", "case", "run"]
     both = first.rows.merge(second.rows, on=keys, suffixes=("_first", "_second"))
     of_first, of_second = (set(candidate.rows["quantity"]) for candidate in (first, second))
@@ -361,7 +362,7 @@ def _compared(
 
 
 def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFrame:
-    """Compute the differences of the main RMSE and of NEES by spans of time."""
+    """Compute the differences of the main RMSEs and the NEES by time span."""
     if first.times.empty or second.times.empty:
         return pd.DataFrame()
     width_s = _span_s([first.times, second.times])
@@ -384,7 +385,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
 
 
 def _span_s(tables: Iterable[pd.DataFrame]) -> float:
-    """Choose how long the spans are: whole multiples of those of all tables, at most `SPANS`."""
+    """Choose a span length: a multiple of that of every table, with at most `SPANS` spans."""
     ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
     width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
     longest = max(int(each.max()) for each in ends_ms)
@@ -394,7 +395,7 @@ def _span_s(tables: Iterable[pd.DataFrame]) -> float:
 
 
 def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
-    """Compute by span NEES, and RMSE of position or orientation, else of the first component."""
+    """Compute NEES and RMSE by span: of position and orientation, or else of the first component."""
     columns = [column for column in times if "rmse" in str(column)]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
     parts = []
@@ -411,7 +412,7 @@ def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
 def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
-    """Find the run of spans that has most of a difference, where that is beyond the margin."""
+    """Find the consecutive spans with most of a difference; None if it is not significant."""
     if over_time.empty or found.verdict not in DIFFER:
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]

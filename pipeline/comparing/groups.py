@@ -1,4 +1,4 @@
-"""Groups of estimators from several candidates that can be compared, run by run."""
+"""Reading of the inputs of a comparison, and grouping of the estimators to compare."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,13 +27,13 @@ from fuselog.recorders.trajectories import read_trajectory
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.trajectory_streams import truth_of
 
-# So many settings that differ are named.
+# Number of differing settings that a note names.
 NAMED = 8
 IN_LOGS = ("estimates", "log")
 
 
 def runs_of(count: int) -> str:
-    """Say how many runs there are."""
+    """Format a number of runs."""
     return "1 run" if count == 1 else f"{count} runs"
 
 
@@ -48,7 +48,7 @@ def inputs_of(
     gap_limit_s: float,
     recover: bool,
 ) -> list[Given]:
-    """Read what every path stands for; logs that lack what is named are replayed together."""
+    """Read the input at every path; logs without the named estimates are replayed together."""
     named = named_in(estimators)
     kinds = [kind_of(path, named, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
@@ -87,12 +87,12 @@ def inputs_of(
 
 
 def named_in(estimators: Sequence[str | Mapping[str, Kind]]) -> list[str]:
-    """List the labels of estimators in the form that `replay` accepts."""
+    """List the labels of estimators that are given in the form that `replay` accepts."""
     return [label for each in estimators for label in ([each] if isinstance(each, str) else each)]
 
 
 def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recover: bool) -> list[Path]:
-    """Return paths with the logs to replay of each folder in its place."""
+    """Replace each folder that has logs to replay by these logs."""
     found: list[Path] = []
     for path in paths:
         logs = [] if (path / RESULT_FILE).is_file() else recordings_in(path)
@@ -102,16 +102,16 @@ def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recove
 
 
 def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:
-    """Return the estimators of which all of some logs brought estimates along, as an autopilot's."""
+    """List the labels of recorded estimates, such as an autopilot's, that all of the logs contain."""
     logs = [path for path in paths if kind_of(path, recover=recover) in IN_LOGS and path.is_file()]
     found = [recorded_estimators(open_log(path, recover=recover)) for path in logs]
     return [label for label in found[0] if all(label in each for each in found)] if found else []
 
 
 def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
-    """Return what stands at a path: "result", "estimates", "log" or "trajectory".
+    """Return the kind of input at a path: "result", "estimates", "log" or "trajectory".
 
-    A recording with estimates of its own is a log to whoever asks for `labels` that it lacks.
+    A recording that contains estimates is a "log" if one of the `labels` is not among them.
     """
     if path.is_dir():
         return "result" if (path / RESULT_FILE).is_file() else "estimates"
@@ -126,7 +126,7 @@ def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
 
 
 def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
-    """Return the run that trajectories are of: the other candidates', or the true trajectory alone."""
+    """Return the run of the trajectories: that of the other candidates, or only the true trajectory."""
     if truth is not None:
         trajectory = read_trajectory(truth)
         stream = truth_of(trajectory, "/truth")
@@ -157,7 +157,7 @@ def _truth_topic(source: Source, case: str | None) -> str:
 
 
 def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Candidate]]:
-    """Yield the candidates to compare: estimators of one thing, or one estimator of several."""
+    """Yield groups of candidates: the estimators of one input, or one estimator of several inputs."""
     for each in givens:
         for label in labels:
             if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
@@ -194,7 +194,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 
 def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
-    """Yield sentences on what two candidates do not share; raises BadInput where nothing is shared."""
+    """Yield sentences about unequal runs, truths and settings; raises BadInput if no run is common."""
     runs = [list(dict.fromkeys(candidate.rows["run"])) for candidate in (first, second)]
     common = [run for run in runs[0] if run in set(runs[1])]
     if not common:
@@ -216,7 +216,7 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         count = runs_of(len(apart))
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
     ours, theirs = first.settings or {}, second.settings or {}
-    # what only one of them has is of its method
+    # settings that only one of them has belong to its method
     both = {name: (ours[name], theirs[name]) for name in ours if name in theirs}
     differing = [f"{name} {_stated(a)} and {_stated(b)}" for name, (a, b) in both.items() if a != b]
     if differing:
@@ -226,7 +226,7 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
 
 
 def _stated(value: Any) -> Any:
-    """Return the value of a setting as a sentence has it."""
+    """Return the value of a setting for a sentence."""
     return "not stated" if value is None else value
 
 

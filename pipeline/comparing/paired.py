@@ -13,16 +13,17 @@ ALL = "all"
 
 
 class Paired(NamedTuple):
-    """Holds a metric of two candidates, run by run, with the verdict on it.
+    """A metric of two candidates, with the difference over the runs and the verdict.
 
     Attributes:
-        first, second: the candidates' names.
-        quantity: the metric.
-        case: of what; `all` is the mean over the cases of each run.
-        target: what it should be.
-        found: the difference over the runs.
-        where: when it is, from and to, in seconds since the epoch; None where it is no more at one time.
-        stressed: how far changes that should not matter move it, of either candidate at most.
+        first, second: names of the candidates.
+        quantity: name of the metric.
+        case: case of the estimates; `all` is the mean over the cases of each run.
+        target: best value of the metric.
+        found: difference over the runs.
+        where: start and end of the time span with most of the difference, in s since the run's epoch;
+            None if there is no such span.
+        stressed: largest change of the metric, of either candidate, by changes that should not matter.
     """
 
     first: str
@@ -36,7 +37,7 @@ class Paired(NamedTuple):
 
     @property
     def is_withheld(self) -> bool:
-        """Test whether irrelevant changes move the metric by more than the difference."""
+        """Test whether changes that should not matter move the metric by more than the difference."""
         return self.found.verdict in DIFFER and abs(self.found.more.value) < self.stressed
 
     @property
@@ -67,7 +68,7 @@ class Paired(NamedTuple):
 
 
 def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) -> list[Paired]:
-    """Return each metric with the largest change that stress makes to it, of either candidate."""
+    """Add to each metric its largest change under stress, of either candidate."""
     found = []
     for each in paired:
         key = each.quantity if each.case in ("", ALL) else f"{each.quantity}.{each.case}"

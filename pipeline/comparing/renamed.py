@@ -1,4 +1,4 @@
-"""Gives the estimates of one label as a source, under the name that a comparison has for it."""
+"""A view of the estimates of one label under the name that a comparison uses for them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,12 +34,12 @@ class Renamed:
 
     @property
     def start_ns(self) -> int | None:
-        """Return the begin of the span."""
+        """Return the start of the span."""
         return self.estimates.start_ns
 
     @property
     def rejections(self) -> Rejections:
-        """Return what was left out of the estimates' log."""
+        """Return the counts of messages that were rejected in reading the estimates."""
         return self.estimates.rejections
 
     @cached_property
@@ -62,12 +62,12 @@ class Renamed:
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield topics in blocks that follow one another in time."""
+        """Yield successive blocks of topics."""
         own = [self._old(topic) for topic in topics]
         return map(self._renamed, self.estimates.blocks(own, order, block_messages))
 
     def whole(self) -> "Renamed":
-        """Return the run without a span."""
+        """Return the whole run, not limited to a span."""
         return replace(self, estimates=self.estimates.whole())
 
     def _renamed(self, streams: Mapping[str, Stream]) -> dict[str, Stream]:

@@ -9,7 +9,7 @@ from fuselog.replay.engine.streams.sources import MemorySource, Source
 
 
 def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, MemorySource]:
-    """Return the log of a run, and what all candidates estimated of it, each under its name."""
+    """Return the log of a run, and the estimates of all candidates under their names."""
     source = candidates[0].pairs[run][0]
     streams = {
         topic: stream
@@ -21,8 +21,11 @@ def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, Mem
 
 
 def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
-    """Draw a run from above, and a lens where errors are small; nothing without places in the plane."""
-    from fuselog.pipeline.output.report.first_run import seen_from_above  # which takes long to import
+    """Draw a run from above, and one second of it enlarged if ellipses are too small to be seen.
+
+    The result is empty without truth and estimates of horizontal positions.
+    """
+    from fuselog.pipeline.output.report.first_run import seen_from_above  # slow to import
     from fuselog.pipeline.output.report.scene import lens, plan
 
     found = seen_from_above(*side_by_side(candidates, run), gap_limit_s)

@@ -1,5 +1,4 @@
 """Compilation of plain Python functions to loops over runs, and the cache of their machine code.
 
-Begin with `compile`. The keys of cached code are defined in `kernels.native` for our own compiler, and
-in `kernel_cache` for numba.
+Begin with `compile`. The keys of cached code are defined in `kernels.native`.
 """

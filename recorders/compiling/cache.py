@@ -1,7 +1,6 @@
 """The user's cache of results that can be computed again; damaged or foreign files are not used.
 
-A file has one line of text, which begins with the SHA-256 of the content and says what made the file,
-followed by the content.
+The first line of a file has the SHA-256 of the content and the name of its maker; the content follows.
 """
 
 import logging
@@ -21,15 +20,15 @@ from fuselog.recorders.environment import cache_folder as cache_folder
 from fuselog.recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
-# No cached result takes longer to make, even on a slow and busy machine.
+# Every cached result is made in less time, even on a slow and busy machine.
 _TURN_S = 120.0
 
 
 def is_private(folder: Path) -> bool:
     """Test whether only this user can have written to a folder of the cache; warn if not.
 
-    A missing folder is private: `write_checked` makes it so. Its parent may belong to others, or be
-    writable for others, if it is sticky like /tmp: then nobody else can move an entry away.
+    A missing folder is private, since `write_checked` creates it as such. Its parent may belong to root
+    and be writable for others if it is sticky like /tmp: other users cannot move its entries then.
     """
     for place in (folder.parent, folder):
         try:
@@ -52,9 +51,9 @@ def is_private(folder: Path) -> bool:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Test whether a file or folder belongs to this user, and nobody else may write to it.
+    """Test whether a file or folder belongs to this user, and other users may not write to it.
 
-    Systems without user numbers (Windows) separate the folders of users themselves.
+    The result is True on systems without user numbers (Windows), which separate the folders of users.
     """
     return _user() is None or (status.st_uid == _user() and not status.st_mode & _OTHERS_MAY_WRITE)
 
@@ -117,7 +116,7 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
 def in_turn(path: Path) -> Iterator[bool]:
     """Wait until no other process makes this file; yield whether one did, so that it may exist now.
 
-    The lock ends with the process that holds it. If a process keeps the lock for very long, or the disk
+    The lock is released when its process ends. If a process keeps the lock for very long, or the disk
     does not support locks, the work is done twice, which is harmless.
     """
     lock = FileLock(path.with_suffix(".lock"), timeout=0)
@@ -135,7 +134,7 @@ def in_turn(path: Path) -> Iterator[bool]:
         yield waited
     finally:
         if lock.is_locked:
-            with suppress(OSError):  # the file exists, so nobody needs the lock any more
+            with suppress(OSError):  # the file exists, so the lock is no longer needed
                 Path(lock.lock_file).unlink()
             lock.release()
 

@@ -1,8 +1,9 @@
 """Compilation of functions of one run into loops over all runs, which the cores share.
 
-A kernel is a plain Python function over numbers and arrays, with all functions that it calls, that makes
-no arrays; `fuselog.recorders.compiling.kernels` writes it in LLVM's text, in milliseconds. With
-FUSELOG_UNCOMPILED=1 kernels run as plain Python, which a debugger can follow: that is the reference.
+A kernel is a plain Python function of numbers and arrays that creates no arrays, with all functions that
+it calls. `fuselog.recorders.compiling.kernels` translates it to LLVM IR in milliseconds. With
+FUSELOG_UNCOMPILED=1, kernels run as plain Python, which a debugger can follow and which is the reference
+for compiled code.
 """
 
 import os
@@ -43,13 +44,13 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     This is for functions that Python calls directly; in another kernel they are compiled with the rest.
     Arguments are positional; the function returns nothing, or one number of the annotated kind. A call
-    raises BadInput if a source is not available.
+    raises BadInput if the source of a function is not available.
 
     Args:
-        function: plain Python over arrays and numbers.
+        function: plain Python function of arrays and numbers.
 
     Returns:
-        A function that does the same, compiled.
+        The compiled function.
     """
 
     @cache
@@ -72,19 +73,20 @@ def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
-        run_once: `run_once(run, *arguments)` does the work of run number `run`, and writes only what
-            belongs to that run. It may be a closure over model functions and numbers, which specialises
-            it. It may use NumPy and functions with the same restrictions, and makes no arrays.
-        title: name in notices while it is compiled, such as "ekf of robot".
+        run_once: function `run_once(run, *arguments)` that processes run number `run` and writes only to
+            the elements of that run. It may be a closure over model functions and numbers, for which it
+            is specialised. It may use NumPy and functions with the same restrictions, and creates no
+            arrays.
+        title: name in notices during compilation, such as "ekf of robot".
 
-    Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
-    of runs or cores. The last argument of `run_once` is what `scratch()` returns, once for every core
-    (see `Scratch`): arrays that successive runs may work in. Or it is `per_run[run]`, such as the run's
-    random generator; runs for which that is None are skipped. Raises BadInput if a source is not
-    available (as for a function typed at a prompt).
+    Returns `loop(runs, *arguments, scratch=None, per_run=None)`, whose results do not depend on the
+    number of runs or cores. With `scratch`, the last argument of `run_once` is working memory for
+    successive runs, which `scratch()` makes once per core (see `Scratch`). With `per_run`, it is
+    `per_run[run]`, such as the run's random generator; runs are skipped if this is None. Raises
+    BadInput if the source of a function is not available, as for a function typed at a prompt.
 
-    For debugging: with FUSELOG_UNCOMPILED=1 kernels are plain Python, and an index out of bounds is an
-    IndexError; with FUSELOG_BOUNDSCHECK=1 compiled kernels raise it too.
+    For debugging: with FUSELOG_UNCOMPILED=1, kernels are plain Python, where an index out of bounds
+    raises IndexError; with FUSELOG_BOUNDSCHECK=1, compiled kernels raise it too.
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
 
@@ -103,7 +105,7 @@ class OverRuns:
 
     Attributes:
         run_once: the work of one run.
-        compiled_loop: makes the compiled loop; None for a loop that is always plain Python.
+        compiled_loop: function that makes the compiled loop; None if the loop is always plain Python.
     """
 
     run_once: RunOnce
@@ -172,7 +174,7 @@ def _one_by_one(
 
 
 def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int], None]]) -> None:
-    """Process runs on several cores, in a few pieces per core, since runs differ in length."""
+    """Process runs on several cores, in a few pieces per core, since runs take different times."""
 
     def work(through: Callable[[int, int], None] | None) -> None:
         through = through or prepared()
@@ -182,11 +184,11 @@ def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int],
     first = prepared()
     cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
     waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
-    first(0, 0)  # compile here: a thread would wait forever for a module that is being imported
+    first(0, 0)  # compile in this thread: others would deadlock on a module that is being imported
     helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
     try:
         work(first)
-    finally:  # no thread is at work after this function returns
+    finally:  # no thread may still be running when this function returns
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
     for helper in begun:
@@ -202,7 +204,7 @@ def use_cores(count: int) -> None:
 
 @cache
 def core_count() -> int:
-    """Return the number of cores that kernels use: NUMBA_NUM_THREADS, or those this process may use."""
+    """Return the number of cores for kernels: NUMBA_NUM_THREADS, or the number available."""
     asked = environment.core_count()
     if asked is not None:
         return asked

@@ -1,7 +1,7 @@
-"""A description of what a function is made of, in words: its code, constants, and all that it calls.
+"""Description of a function as text: its code, its constants, and all functions that it calls.
 
-Functions with the same words do the same. The words come from compiled bytecode, closures and the
-globals that the function names, without reading sources.
+Functions with the same description do the same. It is made from bytecode, closures and the globals that
+the function names, without reading sources.
 """
 
 import sys
@@ -20,15 +20,15 @@ OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 
 
 def identity(function: FunctionType) -> str:
-    """Describe a function in words, with each thing that it needs described once."""
+    """Describe a function as text, in which each object that it needs is described once."""
     known: dict[int, int] = {}
-    kept: list[Value] = []  # whose ids are keys
+    kept: list[Value] = []  # keeps objects alive whose ids are keys of `known`
     return "\n".join(_words(function, known, kept, ()))
 
 
 @cache
 def digest_of(room: str) -> str:
-    """Compute the digest of a package's own sources, so that a change invalidates what it made."""
+    """Compute the digest of a package's own sources, so that a change invalidates its cached results."""
     places = sorted(files(room).iterdir(), key=lambda place: place.name)
     sources = [place.read_bytes() for place in places if place.name.endswith(".py")]
     return sha256(b"".join(sources)).hexdigest()
@@ -37,13 +37,13 @@ def digest_of(room: str) -> str:
 def _words(
     value: Value, known: dict[int, int], kept: list[Value], names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield the words of a value used by code with these names, which select its attributes."""
+    """Yield the description of a value; `names`, which the code uses, select its attributes."""
 
     def of(part: Value) -> Iterator[str]:
         return _words(part, known, kept, names)
 
     own = getattr(value, "kernel_identity", None)
-    if callable(own) and not isinstance(value, type):  # it describes itself, see fuselog.replay.tracing
+    if callable(own) and not isinstance(value, type):  # see fuselog.replay.tracing
         yield own()
     elif isinstance(value, bool | int | float | complex | str | bytes | None | np.generic):
         yield repr(value)

@@ -1,15 +1,15 @@
-"""Names for types of kernels and their arguments that cannot be narrower."""
+"""Names for the types of kernels and their arguments that cannot be declared more precisely."""
 
 from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
 
-# (run, *arguments): does the work of one run; the arguments are up to the kernel.
+# A function (run, *arguments) that processes one run; the arguments depend on the kernel.
 RunOnce = Callable[..., None]  # type: ignore[explicit-any]
 # A function that is compiled, or its compiled form.
 KernelFunction = Callable[..., Any]  # type: ignore[explicit-any]
-# A kernel's entry in machine code: takes the numbers and addresses of its arguments, returns a fault.
+# A kernel's entry in machine code, which takes numbers and addresses of arguments and returns a fault.
 Entry = Callable[..., int]  # type: ignore[explicit-any]
 # An argument of a kernel: arrays, numbers, and tuples of them.
 KernelArgument = Any  # type: ignore[explicit-any]

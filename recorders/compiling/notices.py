@@ -1,4 +1,4 @@
-"""Notices of kernels that take long to compile, and the time that a process spends only once."""
+"""Notices about long compilations, and measurement of the time that a thread spends only once."""
 
 import logging
 import sys
@@ -21,7 +21,7 @@ def seconds_done_once() -> float:
 
 @contextmanager
 def done_once() -> Iterator[None]:
-    """Count the time of this context as belonging to a first use, and not to an estimator."""
+    """Attribute the time in this context to a first use instead of to an estimator."""
     begun_s, before_s = time.perf_counter(), seconds_done_once()
     try:
         yield
@@ -31,7 +31,7 @@ def done_once() -> Iterator[None]:
 
 @contextmanager
 def compiling(title: str) -> Iterator[None]:
-    """Report what is compiled if it takes longer than a second, and how long it took."""
+    """Report a compilation that takes longer than a second, when it begins and when it ends."""
     patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
     patience.daemon = True
     begun_s = time.perf_counter()
@@ -47,9 +47,9 @@ def compiling(title: str) -> Iterator[None]:
 
 
 def _say(sentence: str) -> None:
-    """Log a sentence as the command line configured it, or else print it to standard error once.
+    """Log a sentence if logging is configured; otherwise print it to standard error once.
 
-    Worker processes print nothing, since only the parent is watched.
+    Worker processes print nothing, since users watch only the output of the parent.
     """
     if _LOG.hasHandlers():
         _LOG.info(sentence)

@@ -1,4 +1,4 @@
-"""Working memory of cores in loops, which is reused between calls."""
+"""Working memory for each core in a loop, reused between calls."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,7 +6,7 @@ from fuselog.recorders.compiling.kinds import KernelArgument
 
 
 class Memory:
-    """The working memory of one core, and its description for a kernel."""
+    """The working memory of one core, with its description for a kernel."""
 
     __slots__ = ("described", "value")
 
@@ -16,7 +16,7 @@ class Memory:
 
 
 class Scratch:
-    """A maker of working memory, for the option `scratch` of a loop; memory is kept for later calls.
+    """A pool of working memory for the argument `scratch` of a loop, kept for later calls.
 
     One instance serves one loop with arguments of the same sizes.
     """

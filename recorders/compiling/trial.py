@@ -1,4 +1,4 @@
-"""Test, in a separate process, of the processor that the environment asks to compile for.
+"""Test in a separate process whether LLVM can compile for the requested processor.
 
 LLVM ends the process if the processor and its features do not match.
 """
@@ -12,7 +12,7 @@ from fuselog.recorders.processes import start_module
 
 
 def require_processor() -> None:
-    """Raise BadInput if code cannot be compiled for the requested processor, if there is one."""
+    """Raise BadInput if a processor is requested for which code cannot be compiled."""
     if any(environment.processor()):
         _try(*environment.processor())
 

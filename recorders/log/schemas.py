@@ -1,10 +1,10 @@
 """Declarations of all messages of a log.
 
 A schema is a flat protobuf message whose fields have a fixed width and are `optional`; a vector is a
-packed list of doubles with one length per stream. So all messages of a stream share one byte layout (see
-`layout`), and any protobuf reader can read the file. Field numbers follow the order of declaration, so
-new fields are added at the end. The first field of every message is the reading of the sensor's own
-clock.
+packed list of doubles whose length is the same in all messages of a stream. All messages of a stream
+thus share one byte layout (see `layout`), and any protobuf reader can read the file. Field numbers
+follow the order of declaration, so new fields are added at the end. The first field of every message is
+the time of the sensor's own clock.
 """
 
 from collections.abc import Iterator
@@ -117,9 +117,9 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
 
 
 def schema_of(message_type: type[message.Message]) -> Schema:
-    """Return a schema with the numeric fields of any message; other fields are left out.
+    """Return a schema with the numeric fields of any message type, without its other fields.
 
-    If the name is one of ours, our declaration says what may be NaN; otherwise every field may.
+    For messages of fuselog, the declaration here decides which fields may be NaN; for others, all may.
     """
     descriptor = message_type.DESCRIPTOR
     ours = {field.name: field for field in SCHEMAS.get(descriptor.full_name, ())}

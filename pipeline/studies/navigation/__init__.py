@@ -1,1 +1,1 @@
-"""Studies of inertial units: navigation and GNSS outages; begin with `gnss_ins`."""
+"""Studies of inertial navigation during GNSS outages; begin with `gnss_ins`."""

@@ -54,7 +54,11 @@ class GnssInsOptions(Parameters):
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
+<<<<<<< HEAD
         delayed: label of a smoother that corrects the mapping's delay of the velocity, or "".
+=======
+        delayed: label of a smoother that compensates the mapping's delay of the velocity, or "".
+>>>>>>> 058907bc
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.
@@ -87,7 +91,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: GnssInsOptions = setting.options
     experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)
-    # the longest come first, because the first run is drawn
+    # the longest windows come first, because the first run is drawn
     windows = {
         length_s: windows_of(rows, length_s, options.first_s, options.every_s)
         for length_s in sorted(options.lengths_s, reverse=True)
@@ -149,7 +153,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """Find the folder at --data or below that has all files of the mapping.
+    """Find the folder at or below --data that has all files of the mapping.
 
     Raises BadInput if there are several.
     """
@@ -164,7 +168,11 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
+<<<<<<< HEAD
     """Set the velocity delay of the estimator `delayed` to correct that of the mapping."""
+=======
+    """Set the velocity delay of the estimator `delayed` to the negative of the mapping's delay."""
+>>>>>>> 058907bc
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
@@ -180,7 +188,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """Import the recording, without fixes before `settle_s`, and the rows of the receiver."""
+    """Import the recording; return it without fixes before `settle_s`, and the receiver's rows."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))

@@ -23,12 +23,12 @@ from fuselog.replay.engine.vectors.tangent import states_at
 FIX, VELOCITY, TRUTH, INERTIAL = "/fix", "/velocity", "/truth", "/inertial"
 NEEDED = (FIX, VELOCITY, TRUTH, INERTIAL)
 COASTED, HERMITE = "constant-velocity", "hermite"
-# Estimates that are further apart, in seconds, are not interpolated.
+# Longest gap between estimates, in s, over which they are interpolated.
 _GAP_S = 1.0
 
 
 class Rows(NamedTuple):
-    """The output of the receiver, with a row for every fix, in the plane of east and north.
+    """The output of the receiver, a row per fix, with east and north components.
 
     Attributes:
         time_ns: stamps as written by the receiver, (n,).
@@ -47,7 +47,7 @@ class Rows(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A time span (s since the first row) that is withheld, and the indices of its rows."""
+    """A span (s since the first row) in which fixes are withheld, and the indices of its rows."""
 
     length_s: float
     start_s: float
@@ -68,7 +68,7 @@ def rows_of(source: MemorySource) -> Rows:
                 f"{source.name}: has no messages of {topic}{why}; this study needs {', '.join(NEEDED)}"
             )
     fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
-    # a delay in the mapping changes only publish times
+    # log times are used, since a delay in the mapping changes only publish times
     time_ns = fix.log_time_ns
     place, speed = np.full((len(fix), 2), np.nan), np.full((len(fix), 2), np.nan)
     for into, stream, values in (
@@ -153,7 +153,7 @@ def error_table(
 ) -> pd.DataFrame:
     """Tabulate window, time since its start, error and final NEES by withheld row and estimator.
 
-    `runs` are the windows of each run of the outputs.
+    `runs` contains the windows of each run of the outputs.
     """
     tables = []
     for run, windows in enumerate(runs):

@@ -79,7 +79,7 @@ def rmse_of_runs(errors: Errors, runs: int) -> Floats:
 
 
 def table_of_runs(quantity: str, cases: Mapping[str, Mapping[str, Floats]]) -> pd.DataFrame:
-    """Make the table with which reports compare estimators: a row per estimator, case and run.
+    """Make the table by which reports compare estimators, with a row per estimator, case and run.
 
     Args:
         quantity: name of the listed quantity, as in the metrics.
@@ -117,7 +117,7 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
 def groups(
     values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
 ) -> tuple[Axis, list[Series]]:
-    """Draw values side by side in named groups: an axis of groups, and a series per position in them."""
+    """Draw values side by side in named groups; return the axis, and a series per position."""
     size = max(len(group) for group in values)
     series = []
     for place in range(size):

@@ -1,6 +1,6 @@
-"""Description of a kernel's arguments for its key, packing as words, and loading in the kernel.
+"""Arguments of a kernel: their description in its key, packing as words, and loading in the kernel.
 
-NumPy's structure of an array holds the addresses of its numbers and sizes; the word is its own address.
+The word of an array is the address of its NumPy structure, which has the addresses of data and sizes.
 """
 
 import operator
@@ -14,11 +14,11 @@ from fuselog.recorders.compiling.kernels.values import STORED, Array, Record, co
 from fuselog.recorders.compiling.kinds import Value
 from fuselog.recorders.errors import BadInput
 
-KNOWN = 64  # sizes up to this are part of a kernel
+KNOWN = 64  # sizes up to this are constants of a kernel
 
 
 class KnownArray(NamedTuple):
-    """The memory layout of an array: NumPy's letter of its numbers, and its sizes or None."""
+    """The layout of an array: NumPy's type letter, sizes (None if unknown), and contiguity."""
 
     letter: str
     shape: tuple[int | None, ...]
@@ -31,14 +31,15 @@ _LETTERS["Q"] = _LETTERS["L"] = "<u8"
 # bits of NumPy's flags: C order, aligned
 _PACKED, _ALIGNED = 0x0001, 0x0100
 _LAYOUT = _PACKED | _ALIGNED
-# offsets in NumPy's structure of an array (PyArrayObject_fields), after the head of an object
+# offsets in NumPy's structure of an array (PyArrayObject_fields), after the object header
 _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
 
 
 def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
-    """Append the kinds of an argument, for the kernel's key, and its values at run time.
+    """Append the kinds of an argument, for the kernel's key, and its words, for the call.
 
-    The first `varies` axes of an array vary, unless its NamedTuple overrides this (`varies`).
+    The sizes of the first `varies` axes of an array are not part of the kinds; a NamedTuple can override
+    their number for each field by its attribute `varies`.
     """
     if isinstance(value, np.ndarray):
         shape = value.shape
@@ -59,7 +60,7 @@ def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]
 
 
 def with_types(value: Value, kinds: Iterator[Value]) -> Value:
-    """Complete the description of an argument from its part of the key, as `value_of` needs it."""
+    """Describe an argument by its part of the key, in the form that `value_of` needs."""
     kind = next(kinds)
     if isinstance(value, tuple):
         return type(value), tuple(with_types(each, kinds) for each in value)

@@ -1,4 +1,4 @@
-"""Lowering of expressions: what is known is evaluated as in Python, the rest becomes instructions."""
+"""Lowering of expressions: known values are evaluated as in Python, others become instructions."""
 
 import ast
 import operator
@@ -42,12 +42,12 @@ from fuselog.recorders.compiling.kernels.values import (
 )
 from fuselog.recorders.compiling.kinds import AnyArray, Value
 
-# Functions that make arrays, and whether these are initialised with zeros.
+# Functions that create arrays, and whether these are initialised with zeros.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
 
 
 class Expressions(Scope, ABC):
-    """One function while its expressions are lowered."""
+    """The part of a function's lowering that handles expressions."""
 
     @abstractmethod
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
@@ -321,7 +321,7 @@ class Expressions(Scope, ABC):
     def called(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
         """Lower a call; return its result."""
         write = getattr(function, "lowered", None)
-        if write is not None:  # it lowers itself, see fuselog.replay.tracing
+        if write is not None:  # the object lowers itself, see fuselog.replay.tracing
             return write(self.program, self.emitter, arguments)
         if isinstance(function, Hashable) and function in _MAKERS:
             return self.new_array(*arguments, is_zero=_MAKERS[function], **named)
@@ -342,7 +342,7 @@ class Expressions(Scope, ABC):
         if all(map(is_known, (*arguments, *named.values()))):
             try:
                 return self._worked_out(function, arguments, named)
-            except ArithmeticError:  # kernels do not raise it: a division by zero gives infinity
+            except ArithmeticError:  # kernels do not raise errors: a division by zero gives infinity
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
@@ -373,7 +373,7 @@ class Expressions(Scope, ABC):
         """Assign a number to every element of an array."""
 
     def _worked_out(self, function: Value, arguments: list[Value], named: dict[str, Value]) -> Value:
-        """Evaluate a function of known arguments in Python."""
+        """Evaluate a function with known arguments in Python."""
         known = [as_python(each) for each in arguments]
         with np.errstate(all="ignore"):
             return from_python(
@@ -392,7 +392,7 @@ def _whole(size: int | str) -> Value:
 
 
 def _given(function: FunctionType, arguments: list[Value], named: dict[str, Value]) -> list[Value]:
-    """Return all arguments in their order, with defaults."""
+    """Return all arguments in the order of the parameters, including defaults."""
     code = function.__code__
     names = code.co_varnames[: code.co_argcount]
     defaults = dict(zip(names[::-1], (function.__defaults__ or ())[::-1], strict=False))

@@ -22,11 +22,11 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """Raised if a variable has to hold numbers of another kind than its first value."""
+    """An exception for a variable that needs memory for another kind of number than its first value."""
 
 
 class Frame(Expressions):
-    """One function's blocks of instructions, and the memory of its variables."""
+    """The blocks of instructions of one function, and the memory of its variables."""
 
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
@@ -79,7 +79,7 @@ class Frame(Expressions):
             self.emitter.add(f"store {kind} {code}, ptr {address}")
 
     def read(self, place: Value) -> Value:
-        """Load the value in some memory."""
+        """Load the value from its memory."""
         names = []
         for kind, address in leaves(place):
             names.append(self.emitter.fresh())
@@ -97,7 +97,7 @@ class Frame(Expressions):
         self.write(self.places[name], value)
 
     def fitting(self, name: str, value: Value) -> Value:
-        """Convert a value to what its memory holds; raise `Wider` if the memory has to change."""
+        """Convert a value to the kinds of its memory; raise `Wider` if the memory has to change."""
         value = self.widened(name, unsure(at_run_time(value)))
         if name in self.places:
             value = self.converted(name, value, self.places[name])

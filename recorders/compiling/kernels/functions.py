@@ -1,4 +1,4 @@
-"""Functions of numbers from NumPy, Python and libm in LLVM's text: `FUNCTIONS`."""
+"""Functions of numbers from NumPy, Python and libm, lowered to LLVM IR: `FUNCTIONS`."""
 
 import math
 import operator
@@ -155,7 +155,7 @@ _LIBM_RENAMED = {
     np.copysign: "llvm.copysign.f64",
     np.fabs: "llvm.fabs.f64",
 }
-# The counterparts of NumPy's and Python's functions of numbers: (emitter, *arguments) -> number.
+# Lowerings of NumPy's and Python's functions of numbers, as functions (emitter, *arguments) -> number.
 FUNCTIONS: dict[Value, KernelFunction] = {
     **{getattr(np, name): partial(_of_reals, f"llvm.{name}.f64") for name in _INTRINSICS},
     **{getattr(np, name): partial(_of_reals, name) for name in _LIBM},

@@ -1,8 +1,9 @@
-"""Lowering of a function: its source is walked once and written as LLVM's text.
+"""Lowering of a function: its source is traversed once and written as LLVM IR.
 
-Statements are here, expressions in `expressions`. A name with a single assignment before all of its uses
-is that value; other names are places in memory, which LLVM turns into registers. What is known is
-evaluated: a known `if` has one branch, and a loop over a tuple is unrolled.
+Statements are lowered here, expressions in `expressions`. A name with a single assignment before all of
+its uses stands for that value; other names are variables in memory, which LLVM turns into registers.
+Known values are evaluated: an `if` with a known condition has one branch, and a loop over a tuple is
+unrolled.
 """
 
 import ast
@@ -69,7 +70,7 @@ class _Lowering(Frame):
         self, program: Program, function: FunctionType, arguments: list[Value], kinds: dict[str, str]
     ) -> None:
         self._loops: list[_Loop] = []
-        self._depth = 0  # depth of branches and loops that may not be executed
+        self._depth = 0  # depth of nested branches and loops, which may not be executed
         self._returned: Value = None
         self._exit = ""
         super().__init__(program, function, arguments, kinds)
@@ -89,7 +90,7 @@ class _Lowering(Frame):
     # --- statements ---
 
     def statements(self, body: Sequence[ast.stmt]) -> None:
-        """Lower statements up to one after which none is reached."""
+        """Lower statements up to the first that ends the block, such as `return`."""
         for statement in body:
             if self.ended:
                 return
@@ -172,7 +173,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Lower `return`: outside of branches the value may stay known, otherwise it is in memory."""
+        """Lower `return`; the value may stay known outside of branches, otherwise it is in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it has made; pass one that it fills")
@@ -227,7 +228,7 @@ class _Lowering(Frame):
             self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
-        """Lower the statements of a loop, which continues at `then`."""
+        """Lower the statements in the body of a loop, which continues at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)
@@ -268,7 +269,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def counted(self, start: Number, stop: Number, step: int) -> Iterator[Number]:
-        """Yield the number of an iteration, once: between the loop's head and its end."""
+        """Write the head of a counted loop, yield its index once for the body, and write its end."""
         if not is_static(step) or step == 0:
             raise TypeError("the step of a range is a number that is known")
         head, inner, following, after = (self.label(name) for name in ("for", "body", "next", "after"))

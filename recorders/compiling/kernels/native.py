@@ -1,8 +1,8 @@
 """Machine code of kernels: made by LLVM, cached, loaded, and called with NumPy arrays.
 
-A kernel is compiled for the kinds and sizes of its arguments. All sizes of working memory are known; for
-other arrays, those after the first axis are, up to `arguments.KNOWN`. The key of its code covers
-everything that it is made from (`identity`), this package itself, LLVM, and the processor.
+A kernel is compiled for the kinds and sizes of its arguments. The sizes of working memory are constants,
+and so are those of other arrays after the first axis, up to `arguments.KNOWN`. The key of cached code
+covers all functions in it (`identity`), this package, LLVM and the processor.
 """
 
 import ctypes
@@ -42,12 +42,12 @@ from fuselog.recorders.compiling.notices import compiling, done_once
 from fuselog.recorders.compiling.scratch import Memory
 from fuselog.recorders.errors import BadInput
 
-_ALL = 64  # the most axes of an array
+_ALL = 64  # largest number of axes of an array
 _MADE_BY = "a kernel that fuselog compiled"
 
 
 class _Layout:
-    """The kinds of a core's working memory: the same object for the same kinds, for a fast lookup."""
+    """The kinds of a core's working memory, as one object for equal kinds, for a fast lookup."""
 
     def __init__(self, kinds: tuple[Value, ...]) -> None:
         self.kinds = kinds
@@ -57,7 +57,7 @@ _layout_of = cache(_Layout)
 
 
 def _described(memory: Value) -> tuple[_Layout, list[Value]]:
-    """Describe working memory: its kinds, with all sizes known, and the numbers to pass."""
+    """Describe working memory by its kinds, with all sizes known, and the words to pass."""
     kinds: list[Value] = []
     words: list[Value] = []
     describe(memory, 0, kinds, words)
@@ -65,9 +65,9 @@ def _described(memory: Value) -> tuple[_Layout, list[Value]]:
 
 
 class Kernel:
-    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
+    """A compiled loop over runs, called as `kernel.of(arguments)(first, end)`.
 
-    `title` names it in notices.
+    `title` is its name in notices.
     """
 
     def __init__(self, run_once: FunctionType, title: str = "") -> None:
@@ -80,9 +80,10 @@ class Kernel:
     def of(
         self, arguments: Sequence[Value], memory: Memory | None = None, varies: int = 1
     ) -> Callable[[int, int], None]:
-        """Make the loop over the runs from `first` up to `end` for these arguments, kept alive.
+        """Return a function that processes the runs from `first` up to `end` with these arguments.
 
-        The first `varies` axes of arrays vary, except in the memory; see `describe`.
+        It keeps the arguments alive. The first `varies` axes of arrays have unknown sizes, except in the
+        memory; see `describe`.
         """
         kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Value] = []
@@ -114,7 +115,7 @@ class Kernel:
     def _layout_and_entry(
         self, arguments: Sequence[Value], kinds: Iterator[Value]
     ) -> tuple[Struct, KernelFunction]:
-        """Make the layout of such arguments as packed numbers, and the entry that takes them."""
+        """Make the structure that packs such arguments, and the entry that takes them."""
         is_checked = next(kinds)
         described = tuple(with_types(each, kinds) for each in arguments)
         key = is_checked, described
@@ -126,9 +127,9 @@ class Kernel:
 
 
 def function_of(function: KernelFunction) -> KernelFunction:
-    """Compile a function for calls from Python, without assumptions on the sizes of its arrays.
+    """Compile a function for calls from Python, without assumptions about the sizes of its arrays.
 
-    The function makes no arrays, and returns nothing or a number of the annotated kind.
+    The function creates no arrays, and returns nothing or a number of the annotated kind.
     """
     stated = function.__annotations__.get("return", "")
     returned = stated if isinstance(stated, str) else getattr(stated, "__name__", str(stated))
@@ -162,9 +163,9 @@ def function_of(function: KernelFunction) -> KernelFunction:
 
 
 def program_of(function: FunctionType, kinds: Sequence[Value], *, is_checked: bool = False) -> Program:
-    """Make the kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
+    """Write the kernel in LLVM IR: `kernel(first, end, words)` calls the function for every run.
 
-    It returns 0, or the number of the first fault if indices are checked.
+    The kernel returns 0, or the number of the first fault if indices are checked.
     """
     program, emitter, words = Program(lower, is_checked=is_checked), Emitter(), count()
     arguments = [value_of(kind, emitter, words) for kind in kinds]
@@ -198,7 +199,7 @@ def program_of(function: FunctionType, kinds: Sequence[Value], *, is_checked: bo
 
 
 def _checked_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) -> RunOnce:
-    """Make the kernel's entry that raises IndexError for an index out of bounds; it is not cached."""
+    """Make an entry that raises IndexError for an index out of bounds; its code is not cached."""
     with compiling(title):
         program = program_of(function, kinds, is_checked=True)
         kernel = _loaded(object_code(program.text()))
@@ -216,7 +217,7 @@ def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) ->
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
     path = None
-    with suppress(RuntimeError):  # a user without a home folder
+    with suppress(RuntimeError):  # the user has no home folder
         path = cache_folder() / "kernels" / f"{function.__name__}-{key}.bin"
     if path is not None and not is_private(path.parent):
         path = None
@@ -233,7 +234,7 @@ def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) ->
 
 
 def _kept(path: Path, key: str) -> bytes | None:
-    """Read the object code in a file; None if it is damaged, or of another kernel."""
+    """Read the object code in a file; None if it is damaged or belongs to another kernel."""
     found = read_checked(path)
     own = key.encode()
     return found.removeprefix(own) if found is not None and found.startswith(own) else None
@@ -249,7 +250,7 @@ def _keep(path: Path, code: bytes) -> None:
 
 
 def _named(kinds: Value) -> Value:
-    """Describe kinds of arguments in words that are the same in every process."""
+    """Describe kinds of arguments by values that are the same in every process."""
     if isinstance(kinds, type):
         return f"{kinds.__module__}.{kinds.__qualname__}", getattr(kinds, "_fields", ())
     return tuple(map(_named, kinds)) if isinstance(kinds, tuple) else kinds
@@ -257,7 +258,7 @@ def _named(kinds: Value) -> Value:
 
 @cache
 def _surroundings() -> str:
-    """Describe what a kernel's code depends on apart from its own sources."""
+    """Describe the versions, sources and processor on which the code of every kernel depends."""
     machine = _machine()
     return "\n".join(
         [
@@ -280,7 +281,7 @@ def _machine() -> tuple[str, str]:
 
 
 def _new_target() -> Value:
-    """Make LLVM's description of the machine."""
+    """Make LLVM's description of the processor to compile for."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = _machine()
@@ -297,7 +298,7 @@ def _made(function: FunctionType, kinds: Sequence[Value]) -> bytes:
 
 
 def object_code(text: str) -> bytes:
-    """Compile LLVM's text to machine code.
+    """Compile LLVM IR to machine code.
 
     The SLP vectoriser is off, since it takes as long as all other passes and does not speed up these
     kernels.

@@ -1,4 +1,4 @@
-"""Arithmetic and comparisons of numbers in LLVM's text.
+"""Arithmetic and comparisons of numbers in LLVM IR.
 
 Operations are not contracted or reassociated, so that results do not depend on the optimisation.
 Divisions by zero give infinity or NaN.
@@ -19,9 +19,9 @@ _WIDTH = {TRUTH: 0, WHOLE: 1, WORD: 2, REAL: 3}
 
 
 class Number(NamedTuple):
-    """A number while a kernel is lowered: its kind, and its name or constant in LLVM's text.
+    """A number while a kernel is lowered: its kind, and its name or constant in LLVM IR.
 
-    `natural` numbers are known to be zero or more.
+    `natural` numbers are known to be non-negative.
     """
 
     kind: str
@@ -39,7 +39,7 @@ Scalar = Number | Static
 
 
 def constant(value: Value) -> Number:
-    """Convert a known number to LLVM's text; real numbers bit by bit."""
+    """Convert a known number to LLVM IR; real numbers are written bit by bit."""
     if isinstance(value, bool | np.bool_):
         return Number(TRUTH, "true" if value else "false")
     if isinstance(value, np.unsignedinteger):
@@ -77,7 +77,7 @@ class Emitter:
         self.lines.append(f"  {line}")
 
     def memory(self, kind: str, size: int = 1) -> str:
-        """Allocate memory for some numbers; return its address."""
+        """Allocate memory for `size` numbers; return its address."""
         name = self.fresh()
         self.allocated.append(f"  {name} = alloca {kind}, i64 {size}")
         return name
@@ -96,7 +96,10 @@ class Emitter:
         return self.number(REAL, f"call double @{name}({given})")
 
     def stop_if(self, condition: Number, fault: Number) -> None:
-        """Leave the function and all of its callers with a fault; see `Program.define`."""
+        """Leave the function and all of its callers with a fault if a condition is true.
+
+        See `Program.define`.
+        """
         if not self.can_fail:
             self.can_fail = True
             self.allocated += ["  %fault = alloca i64", "  store i64 0, ptr %fault"]
@@ -131,7 +134,7 @@ class Emitter:
         return Number(kind, value.code)
 
     def truth(self, value: Scalar) -> Number:
-        """Test whether a number is not zero."""
+        """Convert a number to whether it is not zero."""
         if not isinstance(value, Number):
             return constant(bool(value))
         if value.kind == TRUTH:
@@ -154,7 +157,7 @@ def kind_of(value: Scalar) -> str:
 
 
 def common_kind(*values: Scalar) -> str:
-    """Find the kind of a result of these numbers.
+    """Find the kind of the result of an operation on these numbers.
 
     Signed and unsigned integers have no common kind.
     """

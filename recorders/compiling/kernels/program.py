@@ -1,4 +1,4 @@
-"""A kernel as LLVM's text: each function is lowered once for each kind of its arguments."""
+"""A kernel as LLVM IR, in which each function is lowered once for each kind of its arguments."""
 
 import ast
 import inspect
@@ -27,13 +27,13 @@ FEW = 30  # functions with fewer lines are always inlined
 
 
 class DoesNotCompile(BadInput):
-    """An error for code that kernels do not support, with its line."""
+    """An error that names the line of code that kernels do not support."""
 
 
 class Instance(NamedTuple):
     """A function lowered for some arguments: its name, and the type and value of its result.
 
-    If `can_fail`, it also returns the number of its fault, 0 for none.
+    If `can_fail` is set, it also returns the number of a fault, or 0.
     """
 
     name: str
@@ -43,9 +43,9 @@ class Instance(NamedTuple):
 
 
 class Program:
-    """The text of a kernel while it grows.
+    """The LLVM IR of a kernel while it is written.
 
-    If indices are checked, `faults` are the lines in which one may be out of bounds.
+    If indices are checked, `faults` lists the source lines in which an index may be out of bounds.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Program:
         self.instances: dict[Value, Instance] = {}
         self._names = count()
         self._open: list[int] = []
-        self._kept: list[Value] = []  # whose ids are keys
+        self._kept: list[Value] = []  # keeps objects alive whose ids are keys
 
     def text(self) -> str:
         """Join the parts of the module."""
@@ -72,8 +72,9 @@ class Program:
         return "\n".join([*tables, *self.functions, *sorted(self.declared), attributes, ""])
 
     def name(self, stem: str) -> str:
-        """Return a name that no other function or table has."""
-        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
+        """Return a unique name for a function or table."""
+        # "<lambda>" is not a valid name
+        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"
 
     def table(self, numbers: AnyArray) -> Array:
         """Return a constant array, defined once."""
@@ -83,7 +84,7 @@ class Program:
         return self.tables[key][1]
 
     def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Value]) -> Value:
-        """Call a function with these arguments; lower it if this was not done before."""
+        """Call a function; lower it first if it was not lowered for such arguments before."""
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
             if id(function) in self._open:
@@ -131,14 +132,14 @@ class Program:
         return Instance(name, kind, returned, body.can_fail)
 
     def _parameter(self, index: int, value: Value) -> tuple[Value, list[tuple[str, str]]]:
-        """Return an argument as its function sees it, and its leaves there."""
+        """Return an argument as the called function uses it, and the leaves of the parameter."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
         known = placed(_unsure(value), is_local=False)
         return rebuilt(known, iter([code for _, code in found])), found
 
 
 def _unsure(value: Value) -> Value:
-    """Return an integer that may be negative in another call of the function."""
+    """Return a number without the assumption that it is not negative, as in other calls."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
@@ -162,7 +163,7 @@ def called(emitter: Emitter, instance: Instance, arguments: Sequence[Value]) -> 
 
 @cache
 def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
-    """Find a function's definition, its file, and the line before its first one."""
+    """Find a function's definition, its file, and the number of lines before it in that file."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError) as error:

@@ -15,7 +15,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Scope:
-    """One function while it is lowered: the current position, and the values of its names."""
+    """The state of a function's lowering: the current line, and the values of names."""
 
     def __init__(self, program: Program, function: FunctionType) -> None:
         self.program = program
@@ -28,12 +28,12 @@ class Scope:
         self._labels = count()
 
     def place_in_source(self) -> str:
-        """Return the file and the current line."""
+        """Describe the current position: the file and the line."""
         _, file, above = definition_of(self.function)
         return f"{file}, line {above + self.line}"
 
     def fault(self) -> int:
-        """Return a new fault number for an index out of bounds in the current line."""
+        """Add a fault for an index out of bounds in the current line; return its number."""
         self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
         return len(self.program.faults)
 

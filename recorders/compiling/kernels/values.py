@@ -1,8 +1,8 @@
 """Values of a kernel's names while it is lowered: numbers, arrays, tuples, constants.
 
 A value is a `Number`, an `Array`, a tuple of values, a `Record` (a NamedTuple of values), or any Python
-object that is already known: a number, a text, a function. Its leaves exist at run time: numbers, and
-for an array its address and its unknown sizes.
+object that is already known, such as a number, a string or a function. The leaves of a value are the
+parts that exist at run time: numbers, and the address and unknown sizes of an array.
 """
 
 import operator
@@ -27,10 +27,10 @@ from fuselog.recorders.compiling.kernels.numbers import (
 )
 from fuselog.recorders.compiling.kinds import AnyArray, Value
 
-Size = int | str  # known, or the name of an integer
-Leaf = tuple[str, str]  # LLVM's type, and a name
+Size = int | str  # known size, or the name of an integer at run time
+Leaf = tuple[str, str]  # LLVM type and name
 POINTER = "ptr"
-# how the numbers of an array are stored, and the kind as which they are read
+# LLVM types in which the numbers of an array are stored, and the kinds to which they are converted
 STORED = {
     "<f8": ("double", REAL),
     "<i8": ("i64", WHOLE),
@@ -45,7 +45,7 @@ STORED = {
 
 @dataclass(frozen=True)
 class Array:
-    """An array: the type of its numbers, its address, and its sizes and strides, in numbers.
+    """An array: its element type, its address, its sizes, and its strides in elements.
 
     `is_local` says whether its memory ends when the function that made it returns.
     """
@@ -182,7 +182,7 @@ def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
 
 
 def part_of(emitter: Emitter, array: Array, index: tuple[Value, ...]) -> Array:
-    """Select a part of an array, by numbers and slices (pairs of bounds, None where open)."""
+    """Select a part of an array by numbers and slices, whose bounds are None at open ends."""
     offset: Size = 0
     shape: list[Size] = []
     strides: list[Size] = []
@@ -250,7 +250,7 @@ def store(emitter: Emitter, place: Array, value: Scalar) -> None:
 
 
 def table(name: str, numbers: AnyArray) -> tuple[str, Array]:
-    """Define a constant array; return LLVM's text and the array."""
+    """Define a constant array; return its LLVM IR and the array."""
     dtype = numbers.dtype.str
     stored, kind = STORED[dtype]
     if stored == "i8" and kind == TRUTH:

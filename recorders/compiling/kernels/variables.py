@@ -1,4 +1,4 @@
-"""Search for names with a single value wherever they are used, and for those that need memory."""
+"""Search for the names in a function that need memory, since their value differs between uses."""
 
 import ast
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class _Names(ast.NodeVisitor):
-    """Assignments and uses of names, with their branches and loops, in order."""
+    """A visitor that lists assignments and uses of names in order, with their branches and loops."""
 
     def __init__(self) -> None:
         self.given: dict[str, list[tuple[tuple[Value, ...], int]]] = {}
