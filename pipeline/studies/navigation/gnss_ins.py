@@ -54,11 +54,7 @@ class GnssInsOptions(Parameters):
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
-<<<<<<< HEAD
-        delayed: label of a smoother that corrects the mapping's delay of the velocity, or "".
-=======
         delayed: label of a smoother that compensates the mapping's delay of the velocity, or "".
->>>>>>> 058907bc
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.
@@ -168,11 +164,7 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
 
 
 def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
-<<<<<<< HEAD
-    """Set the velocity delay of the estimator `delayed` to correct that of the mapping."""
-=======
     """Set the velocity delay of the estimator `delayed` to the negative of the mapping's delay."""
->>>>>>> 058907bc
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     if options.delayed not in experiment.estimators:
