@@ -332,7 +332,7 @@ def test_a_comparison_is_of_the_second_less_the_first_whichever_comes_first(plac
         assert f"margin {0.02 * means[0]:.3g}" in sentence
         page = page_of(place, f"{first}-{second}")
         [percent] = [
-            panel for panel in _panels(page) if panel["x"]["label"] == f"{second} less {first} (%)"
+            panel for panel in _panels(page) if panel["x"]["label"] == f"{second} minus {first} (%)"
         ]
         drawn = [x for each in percent["series"] if each["style"] == "markers" for x in each["x"]]
         assert pytest.approx(100.0 * difference / means[0]) in drawn

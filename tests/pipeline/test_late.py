@@ -134,6 +134,6 @@ def test_the_report_counts_what_became_of_late_messages(log: Path, fuselog: Fuse
     page = Path("page.html").read_text()
     for said in (
         f"{is_behind.sum()} dropped",
-        f"{len(back)} inserted, {back['repeated'].sum()} used again",
+        f"{len(back)} inserted, {back['repeated'].sum()} reprocessed",
     ):
         assert said in page

@@ -59,7 +59,7 @@ def test_samples_that_follow_each_other_are_averaged_until_they_are_white() -> N
     [found] = fl.noise(source).columns
     assert found.block > 2
     said = (
-        f"samples are correlated; averaged over {found.block} ({found.block * step_s:.3g} s), they are"
+        f"samples are correlated; means of {found.block} samples ({found.block * step_s:.3g} s) are"
     )
     assert any(said in note for note in found.notes)
     assert found.numbers["white"].value == pytest.approx(step_s**0.5, rel=0.1)
@@ -242,7 +242,7 @@ def test_the_command_writes_what_others_read(
         numbers[f"/imu.turn_rate_radps.{axis}", "white noise N (rad/s/sqrt(Hz))"] for axis in "xyz"
     )
     assert white == pytest.approx(1e-3, rel=0.05)
-    assert sum("times that" in note for note in said.json["notes"]) == 3
+    assert sum("times this" in note for note in said.json["notes"]) == 3
     none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
     assert sum("turn_rate" in note for note in none_found) == 3
     lines = Path("noise/px4.params").read_text().splitlines()
@@ -338,7 +338,7 @@ def test_bad_input_is_a_sentence() -> None:
     stamps[1000:] -= 1_000_000_007
     assert "stamps go backwards" in refused(replace(rest(size), publish_time_ns=stamps))
     assert "a third of its length" in refused(rest(size), taus=[30.0])
-    assert "ug/sqrt(Hz) is no rad/s/sqrt(Hz) or rad/s/sqrt(s)" in refused(
+    assert "ug/sqrt(Hz) is not rad/s/sqrt(Hz) or rad/s/sqrt(s)" in refused(
         rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"}
     )
 

@@ -298,7 +298,7 @@ def test_an_estimator_needs_no_label(recordings: list[fl.MemorySource]) -> None:
     pd.testing.assert_frame_equal(done.metrics, by_name.metrics)
     with pytest.raises(fl.BadInput, match="estimator ekf is given twice"):
         fl.replay(recordings, [bare, bare])
-    with pytest.raises(fl.BadInput, match="a model without a method; give modelled"):
+    with pytest.raises(fl.BadInput, match="a model without a method is not an estimator; give modelled"):
         fl.replay(recordings, robot())
     assert fl.diagnose(recordings[0], bare).label == "ekf"
     assert fl.tune(recordings, bare, "sigma_range_m", grid=1).label == "ekf"
@@ -371,7 +371,7 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         ),
         (lambda runs: fl.replay(runs, "ekff"), "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda runs: fl.replay(runs, {"ekf": {"sigma": 1}}), "estimator ekf: no parameter 'sigma'"),
-        (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),
+        (lambda runs: fl.replay(runs, {"a": print}), "estimator a is a builtin_function_or_method"),
         (
             lambda runs: fl.replay(runs, {"kind": fl.modelled(robot(), "ekf"), "sigma_range_m": 0.1}),
             'kind, sigma_range_m: these look like settings of one estimator; give them a label: {"mine"',

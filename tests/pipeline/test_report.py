@@ -421,7 +421,7 @@ def test_a_chart_is_described_once_and_drawn_as_it_is_described() -> None:
     [legend] = left.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["95 %", "a", "good"]
     for wrong in (lambda: curve("a", [0], [0, 1]), lambda: band("a", [0], [0], [0, 1])):
-        with pytest.raises(ValueError, match="have one length"):
+        with pytest.raises(ValueError, match="have the same length"):
             wrong()
 
 
@@ -629,7 +629,7 @@ def test_an_experiment_is_not_taken_for_a_command_by_its_name_or_tables(tmp_path
         outcome = Outcome(metrics={"ekf.position_rmse_m": 1.0}, tables=tables, kind=kind)
         write_outcome(folder, name, {"estimators": {"ekf": {}}}, outcome)
         write_report([folder], folder / "report.html")
-        assert ("is likeliest 2 m" in (folder / "report.html").read_text()) == (kind == "tune")
+        assert ("is estimated at 2 m" in (folder / "report.html").read_text()) == (kind == "tune")
 
 
 def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:

@@ -140,8 +140,8 @@ def test_a_card_says_what_a_message_cost() -> None:
         },
     )
     feet = {card.estimator: card.foot for card in told.cards}
-    beside = "5.2 µs a message; a run takes 1.3 times as long as with a"
-    assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
+    beside = "5.2 µs per message; a run takes 1.3 times as long as with a"
+    assert feet == {"a": ["4 µs per message"], "b": [beside], "c": []}
 
 
 def test_who_is_conservative_in_every_run_is_not_consistent_however_few_there_are() -> None:
@@ -170,7 +170,7 @@ def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
         for place, (label, of) in enumerate(nees.items())
     }
     told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
-    assert told.verdict == ["b and a tie in position error: take b, as a is conservative."]
+    assert told.verdict == ["b and a tie in position error: take b, because a is conservative."]
     assert [card.chip for card in told.cards] == ["As good as a", "As accurate as b, but conservative"]
     runs["b"]["nees"] = runs["a"]["nees"]
     told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
@@ -324,7 +324,7 @@ def test_trackers_with_claims_are_told_whom_to_take_over_cases_that_are_cases() 
     assert best.notes[:3] == [
         "Targets on average: 1.5 missed.",
         "Identity switches: 3 per run.",
-        "Least in 3 of 3 cases.",
+        "Smallest error in 3 of 3 cases.",
     ]
     assert last.notes == [f"Refuted: {LONG}"] * 2 + ["1 more is refuted; the table has all claims."]
     assert begun.story.doubts == ["the covariances of all 3, which were not judged"]
@@ -367,7 +367,7 @@ def test_a_page_of_claims_alone_has_a_card() -> None:
         claims=claims,
     )
     [card] = opening(result, {}).story.cards
-    told = "The experiment states 2 sentences; this result confirms 1 and leaves 1 to chance."
+    told = "The experiment states 2 claims; this result confirms 1 and leaves 1 inconclusive."
     assert (card.look, card.chip, card.value, card.consistency) == ("claims", "", "", told)
 
 
@@ -505,7 +505,7 @@ def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -
     assert low < float(ekf.value) < high < low + 4.0
     assert re.fullmatch(r"0\.[12] m is as good, within chance or 2 %\.", ekf.notes[1])
     [doubt] = begun.story.doubts
-    assert re.fullmatch(r"which point is best for ekf, as 0\.[12] m may be as good", doubt)
+    assert re.fullmatch(r"which point is best for ekf, because 0\.[12] m may be as good", doubt)
 
 
 def test_a_sweep_takes_no_point_at_which_the_estimator_is_overconfident() -> None:
@@ -530,9 +530,9 @@ def test_a_sweep_of_estimators_that_are_all_too_sure_says_where_none_is_believed
     assert (
         verdict[0] == "Even at the point with its smallest error, none of the estimators can be trusted."
     )
-    assert title_of(result, ["ekf", "ukf"], 20) == "x, swept"
+    assert title_of(result, ["ekf", "ukf"], 20) == "x, parameter sweep"
     of_logs = result.model_copy(update={"settings": {**result.settings, "logs": {"files": []}}})
-    assert title_of(of_logs, ["ekf", "ukf"], 20) == "x: ekf and ukf, swept"
+    assert title_of(of_logs, ["ekf", "ukf"], 20) == "x: ekf and ukf, parameter sweep"
 
 
 def test_where_the_scenario_is_swept_no_point_is_advised() -> None:
@@ -542,7 +542,7 @@ def test_where_the_scenario_is_swept_no_point_is_advised() -> None:
         "Take ukf: it has the smallest position error, 0.997 m (RMS of 4 cases)."
     ]
     assert begun.story.cards[0].estimator == "ukf"
-    assert begun.story.cards[0].notes[0] == "Least in 1 of 4 cases."
+    assert begun.story.cards[0].notes[0] == "Smallest error in 1 of 4 cases."
     assert begun.story.doubts == [
         "that ukf is best everywhere, because in 3 of 4 cases another estimator has the smallest "
         "position error "

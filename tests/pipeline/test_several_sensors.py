@@ -195,7 +195,7 @@ def test_commands_and_c_have_the_same_names(
     assert "alterations" not in notes
     deploy(log, {"ekf": settings}, tmp_path / "c")
     header = next((tmp_path / "c").glob("[!f]*.h")).read_text()
-    assert "gps2_fix_lever_x_m; /* where the antenna" in header
+    assert "gps2_fix_lever_x_m; /* position of the antenna" in header
     assert "_update_gps1_fix(" in header
 
 

@@ -364,7 +364,7 @@ def test_noise_per_prediction_is_a_discontinuity() -> None:
     said = " ".join(stressed.sentences)
     assert "noise is added per prediction, not per second" in said
     assert (
-        "from 20.0 s on 0.59 rate_radps - 0.58 gyro_radps - 0.56 wheels_radps is not determined" in said
+        "from 20.0 s on, 0.59 rate_radps - 0.58 gyro_radps - 0.56 wheels_radps is not determined" in said
     )
     mended = fl.stress(drive_of(20, 80), {"ukf": fl.modelled(PER_SECOND, "ukf")}).stressed[0]
     assert mended.verdict("stamps") == "harmless"

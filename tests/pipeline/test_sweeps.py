@@ -164,7 +164,7 @@ def test_a_heat_map_has_the_first_parameter_upwards_and_a_cross_at_the_least():
         ("robots=2:1:3", "LOW below HIGH"),
         ("robots=0:1:log3", "LOW above 0"),
         ("robots=1:2:x", "N at least 2"),
-        ("robots=1,1", "each once"),
+        ("robots=1,1", "each only once"),
         ("duration_s=1:2:200000", "at most 100000 are allowed"),
     ],
 )

@@ -97,7 +97,7 @@ def test_a_report_compares_by_the_errors_of_single_runs(tmp_path):
     tried, came = run_sentences(result, tmp_path / "out")
     assert "8 simulated runs" in tried
     pair = r"torus and ukf|ukf and torus"  # the one that took less time comes first
-    assert re.match(rf"A tie so far: 8 runs do not tell (?:{pair}) apart", came)
+    assert re.match(rf"A tie so far: 8 runs cannot distinguish (?:{pair});", came)
 
 
 def test_torus_filter_is_nearly_as_good_as_a_grid(tmp_path):

@@ -79,7 +79,7 @@ def test_the_study_runs_without_drives_and_asks_for_samplings(tmp_path):
     assert len(result.claims) == 8
     assert result.metrics["s2kf-100.mean_error.n3-axes"] < result.metrics["gf-25.mean_error.n3-axes"]
     none = experiment.model_copy(update={"estimators": {"ekf": {}}})
-    with pytest.raises(BadInput, match="add one such as lrkf:ukf"):
+    with pytest.raises(BadInput, match="give estimators such as lrkf:ukf"):
         run_experiment(name, none, tmp_path / "none")
 
 

@@ -114,5 +114,5 @@ def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, t
 def test_other_estimators_are_refused(autoferry: Path, tmp_path: Path):
     over = {"estimators": {"gm-phd": {"sensor": "radar", "sigma_m": 5.0}}}
     name, experiment = load_experiment("autoferry", {}, over)
-    with pytest.raises(BadInput, match="gm-phd: outputs no tracks"):
+    with pytest.raises(BadInput, match="estimator gm-phd gives no tracks"):
         run_experiment(name, experiment, tmp_path / "out", data=autoferry / "scenario2")
