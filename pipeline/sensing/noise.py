@@ -279,4 +279,7 @@ def _against(stated: tuple[str, str, float], numbers: Mapping[str, Interval], un
     yours = numbers[term].rising(lambda each: each / value)
     ends = f"{yours.low:.3g} to {yours.high:.3g}"
     kind = "sqrt(Hz)" if term == "white" else "sqrt(s)"
-    return f"data sheet: {text} ({value:.4g} {unit}/{kind}), yours: {yours.value:.3g} ({ends}) of it"
+    return (
+        f"the data sheet states {text} ({value:.4g} {unit}/{kind}); yours is {yours.value:.3g} ({ends}) "
+        "times that"
+    )

@@ -103,7 +103,7 @@ def test_the_reference_has_every_name() -> None:
         for entry in entries.values():
             assert f"\n## {entry.name}\n" in pages[f"reference/{kind}.md"]
     robot = pages["reference/models.md"].partition("## robot\n")[2].partition("\n## ")[0]
-    assert "    | `gate_probability` | `0.999` |  | number > 0 <= 1 | a measurement" in robot
+    assert "    | `gate_probability` | `0.999` |  | number > 0 <= 1 | measurements" in robot
     odometry = pages["reference/messages.md"].partition("## Odometry\n")[2]
     assert "| 2 | `forward_mps` | `optional double` |" in odometry
 

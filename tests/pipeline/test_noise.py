@@ -242,7 +242,7 @@ def test_the_command_writes_what_others_read(
         numbers[f"/imu.turn_rate_radps.{axis}", "white noise N (rad/s/sqrt(Hz))"] for axis in "xyz"
     )
     assert white == pytest.approx(1e-3, rel=0.05)
-    assert sum("times this" in note for note in said.json["notes"]) == 3
+    assert sum("times that" in note for note in said.json["notes"]) == 3
     none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
     assert sum("turn_rate" in note for note in none_found) == 3
     lines = Path("noise/px4.params").read_text().splitlines()

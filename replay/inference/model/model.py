@@ -186,9 +186,9 @@ class Sensor:
             message, such as a pseudo-measurement.
         delay: parameter with the time, in s, by which a message is stamped after its measurement.
         linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
-        moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of the
-        measurement (m,), its covariance (m, m) including noise, and its covariance with the state (t,
-        m).
+            moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
+            the measurement (m,), its covariance (m, m) including noise, and its covariance with the
+            state (t, m).
         log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
             that can use it.
         stated: parameters that its channel may state in another form: metadata -> number, NaN if it does
