@@ -222,9 +222,9 @@ SHOT_DETECTION = _declare(
 )
 SHOT_REPORT = _declare(
     "ShotReport",
-    "What one of several sensors reports of a shot: where the muzzle blast came from, the bullet's "
-    "direction by its shockwave, and by how much the shockwave came earlier: one of two numbers, by the "
-    "side of the muzzle blast from which the shockwave came.",
+    "Report of one of several sensors on a shot: the direction of the muzzle blast, the direction of "
+    "the shockwave, and the time by which the shockwave arrived earlier. Which of the two times is set "
+    "shows from which side of the muzzle blast the shockwave came.",
     _identifier("sensor_id"),
     _real("muzzle_blast_azimuth_rad"),
     _real("trajectory_rad", may_be_nan=True),
@@ -258,7 +258,7 @@ VELOCITY_FIX = _declare(
 GEODETIC_FIX = _declare(
     "GeodeticFix",
     "A position on the WGS 84 ellipsoid; its covariance, row-major or diagonal, in m^2 east, north and "
-    "perhaps up. Channels of a log may state the origin of its plane: origin_latitude_deg, "
+    "perhaps up. Channels may state the origin of the tangent plane: origin_latitude_deg, "
     "origin_longitude_deg and origin_altitude_m above the ellipsoid.",
     _real("latitude_deg"),
     _real("longitude_deg"),
@@ -302,7 +302,7 @@ SCAN_RANGE_BEARING = _declare(
 )
 SCAN = _declare(
     "Scan",
-    "One sweep of a sensor and how many detections it has; none is information too.",
+    "One sweep of a sensor and its number of detections, which may be 0.",
     _identifier("scan_id"),
     _identifier("detections"),
 )
@@ -314,7 +314,7 @@ ORIENTATION = _declare(
 AXIS = _declare("Axis", "An undirected axis: a unit vector equal to its negative.", _vector("axis"))
 INERTIAL_SAMPLE = _declare(
     "InertialSample",
-    "Specific force, turn rate and, where there is a magnetometer, the magnetic field; body frame.",
+    "Specific force, turn rate and, with a magnetometer, the magnetic field; body frame.",
     _vector("specific_force_mps2", may_be_partial=True),
     _vector("turn_rate_radps", may_be_partial=True),
     _vector("magnetic_field_ut", may_be_nan=True),
@@ -391,7 +391,7 @@ GAUSSIAN_ESTIMATE = _declare(
 )
 ESTIMATE_SIZE = _declare(
     "EstimateSize",
-    "How many elements the set or density estimate of this time has; none is an estimate too.",
+    "Number of elements in the set or density estimate at this time, which may be 0.",
     _identifier("elements"),
 )
 SET_ESTIMATE = _declare(
@@ -456,12 +456,13 @@ DIAGNOSED = _declare(
 )
 REWOUND = _declare(
     "Rewound",
-    "A late measurement was used after all; so many messages after it were used again.",
+    "A late measurement was used, and this number of later messages was reprocessed.",
     _identifier("repeated"),
 )
 WAITED = _declare(
     "Waited",
-    "A late measurement was used in its order, since newer ones waited for it: by so much newer.",
+    "A late measurement was used in its order, because newer ones waited for it; by how much they are "
+    "newer.",
     _real("behind_s"),
 )
 COVERAGE = _declare(
@@ -500,8 +501,8 @@ ITERATION = _declare(
 )
 OBSERVABILITY = _declare(
     "Observability",
-    "What the measurements since an earlier stamp say of the state at that stamp: rank and eigenvalues, "
-    "ascending, of the local Gramian in units of the prior, and the direction of the least.",
+    "Information of the measurements since an earlier stamp about the state at that stamp: rank and "
+    "eigenvalues, ascending, of the local Gramian in units of the prior, and the direction of the least.",
     Field("begin_time_ns", "time_ns"),
     _identifier("rank"),
     _identifier("measurements"),
@@ -534,7 +535,8 @@ ASSOCIATION = _declare(
 )
 APPROXIMATION = _declare(
     "Approximation",
-    "So many tracks shared so many detections of a scan that how probable each is was approximated.",
+    "The number of tracks that share detections of a scan, for which association probabilities were "
+    "approximated.",
     _identifier("tracks"),
 )
 

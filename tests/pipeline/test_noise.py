@@ -58,9 +58,7 @@ def test_samples_that_follow_each_other_are_averaged_until_they_are_white() -> N
     source = fl.MemorySource({stream.topic: stream}, fl.RunMetadata("made", {}), "made")
     [found] = fl.noise(source).columns
     assert found.block > 2
-    said = (
-        f"samples are correlated; means of {found.block} samples ({found.block * step_s:.3g} s) are"
-    )
+    said = f"samples are correlated; means of {found.block} samples ({found.block * step_s:.3g} s) are"
     assert any(said in note for note in found.notes)
     assert found.numbers["white"].value == pytest.approx(step_s**0.5, rel=0.1)
 
