@@ -118,7 +118,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({**ANCHORS, "estimate": ["range_m[0:6]", "range_m[2]"]}, r"the parameter is named twice"),
     (
         {"estimate_time_s": {"bias_range_m": 1.0}},
-        "estimate_time_s.bias_range_m: bias_range_m is not in `estimate`",
+        "estimate_time_s.bias_range_m: bias_range_m is not in",
     ),
 ]
 
