@@ -72,7 +72,7 @@ class Plan:
             estimates: for each run, the path of its estimates and its source log.
             save: the file for the first run's timeline.
             connect: the Rerun viewer to stream the timeline to.
-            companions: makes messages for other viewers, written next to the estimates.
+            mirrors: makes messages for other viewers, written next to the estimates.
             progress: reports progress after every block.
 
         Raises BadInput if an estimator cannot replay any run.

@@ -33,7 +33,7 @@ class Mirror(NamedTuple):
 
 
 class Numbered(NamedTuple):
-    """A companion with its channel, and its number there."""
+    """A mirror with its channel, and its number there."""
 
     channel_id: int
     sequence: int

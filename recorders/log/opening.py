@@ -54,7 +54,7 @@ class Log:
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """Return the topics by name, sorted, without companions."""
+        """Return the topics by name, sorted, without mirrors."""
         return {name: topic for name, topic in self._all.items() if MIRROR_OF not in topic.metadata}
 
     @cached_property

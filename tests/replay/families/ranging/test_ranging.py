@@ -116,7 +116,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"estimate": ["bearing_rad[0]"]}, "measures bearing_rad about the points of 0 maps"),
     ({"estimate": ["range_m[0]"]}, r"estimate_sigma.range_m\[0\]="),
     ({**ANCHORS, "estimate": ["range_m[0:6]", "range_m[2]"]}, r"the parameter is named twice"),
-    ({"estimate_time_s": {"bias_range_m": 1.0}}, "estimate_time_s.bias_range_m: `estimate` lacks"),
+    (
+        {"estimate_time_s": {"bias_range_m": 1.0}},
+        "estimate_time_s.bias_range_m: bias_range_m is not in `estimate`",
+    ),
 ]
 
 
