@@ -27,7 +27,7 @@ def to_ns(
         unit_ns: length of the unit in ns.
         since_ns: the zero of the values, NOT_A_TIME if it is unknown.
         where: beginning of error messages: file and column or topic.
-        mend: end of error messages: what to do.
+        remedy: end of error messages: what to do.
 
     Returns:
         The stamps, NOT_A_TIME for missing values.

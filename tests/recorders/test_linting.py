@@ -212,12 +212,12 @@ def test_a_field_at_the_ends_of_the_earths_is_the_earths() -> None:
     for norm, words in (
         (22.0, ""),
         (67.0, ""),
-        (21.9, "is in no unit"),
-        (67.1, "is in no unit"),
+        (21.9, "is in an unknown unit"),
+        (67.1, "is in an unknown unit"),
         (0.22, "is in G"),
         (0.67, "is in G"),
-        (0.219, "is in no unit"),
-        (0.671, "is in no unit"),
+        (0.219, "is in an unknown unit"),
+        (0.671, "is in an unknown unit"),
     ):
         level = replace(stream, columns={**stream.columns, FIELD: np.tile([norm, 0.0, 0.0], (600, 1))})
         told = [each.evidence for each in units(level, {})]
@@ -243,7 +243,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "stamps",
         "go back",
     ),
-    "rows twice": (rows(IMU, lambda n: np.r_[0:50, 49, 50:n]), IMU, "stamps", "there twice"),
+    "rows twice": (rows(IMU, lambda n: np.r_[0:50, 49, 50:n]), IMU, "stamps", "messages are duplicates"),
     "half lost": (
         rows(IMU, lambda n: np.random.default_rng(0).random(n) < 0.5),
         IMU,
@@ -283,7 +283,12 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "field in T": (field(lambda m: m / 1e6), MAG, "magnetometer", "in T"),
     "hard iron": (field(ellipse(8.0, 0.0, 1.0)), MAG, "magnetometer", "hard"),
     "soft iron": (field(ellipse(0.0, 0.0, 1.3)), MAG, "magnetometer", "soft"),
-    "latitude 139": (column(FIX, "latitude_deg", lambda x: x + 90.0), FIX, "place", "exchanged"),
+    "latitude 139": (
+        column(FIX, "latitude_deg", lambda x: x + 90.0),
+        FIX,
+        "place",
+        "are swapped: a latitude is 139",
+    ),
     "at 0, 0": (
         lambda s: column(FIX, "latitude_deg", setting(0, 9, 0.0))(
             column(FIX, "longitude_deg", setting(0, 9, 0.0))(s)
@@ -327,7 +332,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         lambda s: renamed(IMU, "/imu/data", keeps=False)(renamed(IMU, "/imu/data_raw", keeps=True)(s)),
         "/imu/data",
         "name",
-        "is /imu/data_raw again",
+        "repeats /imu/data_raw",
     ),
     "own namespace": (apart, "/gps/fix", "name", "alone in its namespace"),
     "rounded": (force(lambda f: np.round(f / 0.2) * 0.2), IMU, "values", "rounded to 0.2"),
@@ -408,7 +413,7 @@ def test_rows_that_are_there_twice_are_counted() -> None:
     twice = np.r_[0:50, 49, 50:70, 69, 70:80]
     [found] = [each for each in lint([{IMU: clean(1)[IMU].take(twice)}]) if each.kind == "stamps"]
     assert found.value == 2.0
-    assert "2 of its 82 messages are there twice" in found.evidence
+    assert "2 of its 82 messages are duplicates" in found.evidence
 
 
 def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:

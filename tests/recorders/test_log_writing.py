@@ -82,7 +82,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", lambda *_: open("/dev/full", "wb"))  # noqa: PTH123, SIM115
     with pytest.raises(BadInput, match=r"run\.mcap: cannot be written \(No space left on device\)$"):
         write_log(path, some_streams(1, count=5000))
-    monkeypatch.correct()
+    monkeypatch.undo()
     assert path.read_bytes() == before
     assert names_in(tmp_path) == ["run.mcap"]
 
@@ -268,9 +268,9 @@ def test_a_topic_gets_its_width_from_its_first_message(tmp_path):
 
 
 @given(stamps=st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=12))
-def test_companions_stand_in_the_order_of_log_time_and_ties_as_given(tmp_path_factory, stamps):
+def test_mirrors_stand_in_the_order_of_log_time_and_ties_as_given(tmp_path_factory, stamps):
     """In chunks of about two messages, whose spans are those of their messages."""
-    path = tmp_path_factory.mktemp("companions") / "run.mcap"
+    path = tmp_path_factory.mktemp("mirrors") / "run.mcap"
     given = [
         Mirror("/viewer", "/scan", Timestamp(seconds=number), *clocks)
         for number, clocks in enumerate(stamps)

@@ -257,7 +257,7 @@ def test_quaternions_in_another_order_are_told_by_turn_rates() -> None:
         ([1, 2, 3, 0], 1.0, ["are x, y, z, w,"]),
         ([0, 1, 2, 3], opposite, ["are w, x, y, z of the opposite rotation,"]),
         ([1, 2, 3, 0], opposite[[1, 2, 3, 0]], ["are x, y, z, w of the opposite rotation,"]),
-        ([0, 1, 2, 3], 1.01, ["no unit ones"]),
+        ([0, 1, 2, 3], 1.01, ["are not of unit length"]),
     ):
         streams["/orientation"] = make_stream(
             "/orientation", schemas.ORIENTATION, stamps_ns, quaternion=factor * quaternion[:, order]
@@ -273,7 +273,7 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
     slow = replace(wheels, log_time_ns=(1.01 * wheels.publish_time_ns).astype(np.int64))
     rest = {each.topic: each for each in others}
     [found] = compared({wheels.topic: twice, **rest})
-    assert found.evidence.startswith("/car/odometry: 2 of its 1002 messages are there twice")
+    assert found.evidence.startswith("/car/odometry: 2 of its 1002 messages are duplicates")
     [found] = compared({wheels.topic: slow, **rest})
     assert (found.kind, found.where) == ("clock drift", "/car/odometry")
 

@@ -847,7 +847,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     pose = "geometry_msgs/msg/PoseStamped"
     turned = bag("turned", ("/pose", make(pose, pose__orientation=[0.0, 0.0, 0.0, 0.5])))
     assert refusal(turned).startswith(
-        "topic /pose: 1 of its quaternions is not of unit length, the first of length 0.5; check what "
+        "topic /pose: 1 of its quaternions is not of unit length, the first of length 0.5; check "
     )
     far = bag("far", ("/gps", make("sensor_msgs/msg/NavSatFix", latitude=90.5)))
     assert refusal(far) == "topic /gps: a latitude is 90.5 deg, beyond 90; check the column and its unit"

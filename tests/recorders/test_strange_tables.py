@@ -155,13 +155,13 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
         {"heading": np.where(np.arange(400) % 20 == 3, 511, np.degrees(COURSE))},
         f"{TIME}\n{ATTITUDE} }}",
         [FIX, HEADING],
-        "the heading in rad is .* in 20 messages, .*: a code of a missing value",
+        "the heading in rad is .* in 20 messages, .*: a code for a missing value",
     ),
     "a code among speeds": (
         {"speed": np.where(np.arange(400) % 20 == 3, 52.6, SPEED)},
         TIME,
         [ODOMETRY],
-        "forward_mps is 52.6 in 20 messages, .*: a code of a missing value",
+        "forward_mps is 52.6 in 20 messages, .*: a code for a missing value",
     ),
     "a heading of 0": (
         {"heading": np.zeros(400)},

@@ -41,7 +41,7 @@ class Hypothesis:
         limit: the largest magnitude of the number.
         without: returns the trial without a fault of this number.
         words: describes the fault, from the number and the ends of its 95 % interval.
-        mend: returns advice for this number; None if it is followed already.
+        remedy: returns advice for this number; None if it is followed already.
         specials: numbers that are tried exactly, such as the factor of a unit.
         size: how many numbers the fault has.
         floor: the magnitude below which the number is no fault.

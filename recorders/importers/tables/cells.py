@@ -28,7 +28,7 @@ def read_ns(
         digits: number of digits after the point that are nanoseconds: 9 if the unit is a second.
         since_ns: the zero of the values.
         where: beginning of error messages.
-        mend: end of error messages.
+        remedy: end of error messages.
 
     Returns:
         The stamps, NOT_A_TIME for a cell that is empty or NaN.

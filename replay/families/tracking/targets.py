@@ -63,7 +63,7 @@ class Targets(NamedTuple):
     """Assumptions about the targets.
 
     Attributes:
-        stage: their bound model, with one motion or with all modes.
+        bound_model: their bound model, with one motion or with all modes.
         parameters: the model's numbers; NaN for a number that is not used.
         newborn: a target of which only the position is known.
     """

@@ -272,7 +272,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
             raise BadInput(
                 f"topic {seen_name} is in {frame_in_words(frame)}, but {found.detections[0]} is in "
                 f"{frame_in_words(found.frames[0])}, and all tracks must be in one frame; select "
-                "sensors with the same frame by --set sensors=..."
+                "sensors of one frame with --set sensors=..."
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(

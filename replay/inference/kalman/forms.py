@@ -29,9 +29,11 @@ class Parts(NamedTuple):
 
     Attributes:
         form: the form in which covariances are stored.
-        linear_motion, sampled_motion: (stage), (stage, samples) -> `predict`; see `gaussian_filter`.
-        linear_update, sampled_update: (stage, number), (stage, number, samples) -> update by a sensor.
-        gap_motion: (stage) -> prediction in a gap of the control.
+        linear_motion, sampled_motion: (bound_model), (bound_model, samples) -> `predict`; see
+            `gaussian_filter`.
+        linear_update, sampled_update: (bound_model, number), (bound_model, number, samples) -> update by
+            a sensor.
+        gap_motion: (bound_model) -> prediction in a gap of the control.
     """
 
     form: Form

@@ -43,7 +43,7 @@ def iterated_update(bound_model: BoundModel, number: int) -> Update:
     innovation and likelihood are those of the last iterate.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]

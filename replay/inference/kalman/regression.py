@@ -310,7 +310,7 @@ def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
     Noise of the control enters through the derivative at the mean, noise of the motion through samples.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         number: index of the samples in the workspace.
     """
     model, motion = bound_model.model, bound_model.motion
@@ -361,7 +361,7 @@ def sampled_sensor(bound_model: BoundModel, number: int, samples: int) -> Innova
     """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         samples: index of its samples in the workspace.
     """

@@ -231,8 +231,8 @@ def workspace(bound_model: BoundModel, samples: tuple[Samples, ...] = ()) -> Wor
     """Allocate the workspace of a bound model.
 
     Args:
-        stage: the bound model, with n components of the state, t of the tangent space, and at most m of
-            a sensor.
+        bound_model: the bound model, with n components of the state, t of the tangent space, and at most
+            m of a sensor.
         samples: memories of `regression`, motion first, one for each of `Steps.sampled`.
     """
     model, t = bound_model.model, bound_model.model.tangent
@@ -270,15 +270,15 @@ def gaussian_filter(
     """Make the steps of a filter whose belief is one Gaussian.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         predict: `predict(mean, covariance, interval, work)` moves one run's mean (n,) and covariance (t,
             t) in place and returns whether it succeeded.
         updates: for every sensor, `update(mean, covariance, measurement, work, record)`; see
             `kalman_update`.
-        memory: (sets) -> the workspace; `workspace(stage)` by default.
+        memory: (sets) -> the workspace; `workspace(bound_model)` by default.
         sampled: see `Steps.sampled`.
         form: form in which covariances are stored.
-        gap_motion: (stage) -> prediction in a gap of the control; `keeping` by default.
+        gap_motion: (bound_model) -> prediction in a gap of the control; `keeping` by default.
 
     Returns:
         The steps; they continue after gaps of the control if the motion has a `gap_noise`.

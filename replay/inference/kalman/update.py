@@ -166,7 +166,7 @@ def linear_sensor(bound_model: BoundModel, number: int) -> Innovate:
     """Make the computation of the innovation by the derivative at the mean.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
 
     Returns:
@@ -294,7 +294,7 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
     if no component remains. Accepted measurements may still be down-weighted; see `inflation`.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         innovate: `innovate(mean, covariance, measurement, work)` fills the innovation v (m,), S (m, m),
             C (t, m) of the sensor and returns whether the covariance was positive definite.

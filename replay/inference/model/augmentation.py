@@ -144,7 +144,7 @@ def augmented_model(bound_model: BoundModel, added: Added) -> BoundModel:
     """Add parameters and errors to the state of a bound model.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         added: components to add to its state.
     """
     names, errors = added.parameters, added.errors
@@ -186,7 +186,7 @@ def begin(
     Args:
         label: label of the estimator, for errors.
         topic: topic of the prior.
-        stage: the bound model before augmentation.
+        bound_model: the bound model before augmentation.
         added: components that are added to its state.
         settings: (1 + sensors, fields), before augmentation.
 

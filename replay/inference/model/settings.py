@@ -71,7 +71,7 @@ def settings_of(
 
     Args:
         label: label of the estimator, for errors.
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         found: its topics.
         parameters: parameters given by the user.
 
@@ -213,7 +213,7 @@ def assumed_of(
 
     Args:
         label: label of the estimator, for errors.
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         found: its topics.
         parameters: parameters given by the user.
     """

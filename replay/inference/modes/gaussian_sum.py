@@ -106,7 +106,7 @@ def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> S
     """Make the steps of a Gaussian sum with at most `members` filters.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         inner: steps of the filter of one member.
         members: largest number of members.
     """

@@ -94,7 +94,7 @@ def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Step
     """Make the steps of an interacting multiple model filter whose modes have these filters.
 
     Args:
-        stage: the bound model with all its modes and the sensors of the log.
+        bound_model: the bound model with all its modes and the sensors of the log.
         filters: steps of every mode's filter, in the order of the modes.
     """
     model, switching = bound_model.model, bound_model.model.switching

@@ -115,7 +115,7 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
     sum_j mu_j N(v_j; 0, S_j).
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         update_mode: update of one Gaussian by this sensor; see `Steps.updates`.
     """

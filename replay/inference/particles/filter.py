@@ -80,7 +80,7 @@ def particle_steps(
     """Make the steps of a bootstrap filter.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         particles: number of particles.
         resample_below: fraction of effective particles below which they are resampled.
         progressive: see `ParticleParameters`.

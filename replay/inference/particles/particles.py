@@ -181,7 +181,7 @@ def moving(bound_model: BoundModel, by_control: int, renew: Renew) -> PredictRun
     """Make the prediction, in which every particle moves with its own noise after any resampling.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         by_control: number of a particle's draws, at the start, that are errors of the control.
         renew: `renew(run, cloud, memory)` resamples and returns whether it succeeded.
     """

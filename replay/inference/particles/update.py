@@ -53,7 +53,7 @@ def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> Upda
     and a particle that does not predict one of the others keeps its share of the weight.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         progressive: whether a measurement may be processed in parts.
     """

@@ -88,7 +88,7 @@ def events_of(
     """Return the result of `filter_events`, which may be known from an earlier replay of the block.
 
     Args:
-        stage, found, block, context, settings: as for `filter_events`.
+        bound_model, found, block, context, settings: as for `filter_events`.
     """
     drives = () if found.control is None else (found.control.name,)
     read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
@@ -108,7 +108,7 @@ def filter_events(
     """Convert a block's messages to events of the recursion.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         found: its topics.
         block: messages of these topics, in all runs.
         context: maps and origins.
@@ -220,7 +220,7 @@ def sensor_table(
     Messages without a covariance, or with only NaN, are marked as not used.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         ragged: its messages in all runs.
         context: maps and origins.
@@ -275,7 +275,7 @@ def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Flo
     """Compute the variances that a sensor assigns to messages without a covariance; NaN if it has none.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         number: number of the sensor among these.
         settings: (1 + sensors, fields); see `settings_of`.
     """
@@ -365,7 +365,7 @@ def passed_over(
 
     Args:
         name: name of the filter.
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         found: its topics.
         block: messages of these topics.
         without_covariance: whether each message (n,) lacks its covariance.

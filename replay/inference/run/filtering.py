@@ -122,7 +122,7 @@ def samplers_of(
     """Make a sampler for each sampled function.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         method: method whose `sampling` makes the samples.
         parameters: parameters of the method.
 
@@ -141,7 +141,7 @@ class Filter:
     Attributes:
         name: its output topics begin with this, after `/estimates/`.
         found: its topics.
-        stage, method, parameters: the bound model, the method and its parameters.
+        bound_model, method, parameters: the bound model, the method and its parameters.
         settings: (1 + sensors, fields); see `settings_of`.
         samplers: one for each of `Steps.sampled`.
         each_run: (runs, 1 + sensors, fields), the settings if each run has its own.

@@ -60,7 +60,7 @@ def state_by_message(bound_model: BoundModel, number: int, data: Floats) -> tupl
     """Compute the mean (n,) and the much larger sigmas (t,) of a state that one message measures.
 
     Args:
-        stage: the bound model with its sensors.
+        bound_model: the bound model with its sensors.
         number: number of the sensor.
         data: measurement and noise of the message, as a row of `sensor_table`.
     """

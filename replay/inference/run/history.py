@@ -97,7 +97,7 @@ def no_history(bound_model: BoundModel, carried: RecursionState) -> History:
     """Make a history that contains only the priors.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         carried: state at the priors.
     """
     runs, innovation_size, (width, _) = (

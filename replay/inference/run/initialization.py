@@ -53,7 +53,7 @@ class Initializer:
     Attributes:
         name: its output topics begin with this, after `/estimates/`.
         found: its topics.
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         settings: (1 + sensors, fields), numbers of motion and sensors.
         assumed: parameters among them that the log does not state.
     """

@@ -25,7 +25,7 @@ def reading_of(bound_model: BoundModel, found: Found, settings: Floats) -> Readi
     """Describe what an estimator reads.
 
     Args:
-        stage: the bound model before tracing, with the sensors of the log.
+        bound_model: the bound model before tracing, with the sensors of the log.
         found: its topics.
         settings: (1 + sensors, fields), numbers of motion and sensors.
     """

@@ -250,7 +250,7 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
     """Make the function that processes one event of a run; see `recursion`.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         steps: steps of the method for it.
         settings_of: `settings_of(settings, row)` makes the parameters of a row.
 
@@ -343,7 +343,7 @@ def recursion(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) 
     """Make the loop over events, for `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         steps: steps of the method for it.
         settings_of: `settings_of(settings, row)` makes the parameters of a row: row 0 is the motion, the
             others are the sensors.

@@ -39,7 +39,7 @@ def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
     """Compute the delays of stamps after the measurement, in ns, by source of an event.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         settings: (1 + sensors, fields); see `settings_of`.
 
     Returns:
@@ -61,7 +61,7 @@ def compensate_delays(
     older one may still arrive; at the end, no event waits.
 
     Args:
-        stage: the bound model, with the sensors of the log.
+        bound_model: the bound model, with the sensors of the log.
         events: events in the order of their stamps.
         delays_ns: (sensors + 2,); see `delays_of`.
         is_end: whether no more events will arrive.

@@ -101,7 +101,7 @@ def smoothing_steps(bound_model: BoundModel, steps: Steps) -> Steps:
     """Make the steps of a filter that stores nodes; its `predict` must fill `Workspace.product`.
 
     Args:
-        stage: the bound model.
+        bound_model: the bound model.
         steps: steps of the forward filter.
     """
     model, t, predict_filter = bound_model.model, bound_model.model.tangent, steps.predict

@@ -308,7 +308,7 @@ def test_all_runs_at_once_are_one_call() -> None:
     out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
     assert seen == [2]
     assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(BadInput, match="give one of follow, follow_all and advance"):
+    with pytest.raises(BadInput, match="give exactly one of follow, follow_all and advance"):
         recursive("none", **given)
     with pytest.raises(BadInput, match="out_of_sequence and finish need advance"):
         recursive("late", follow_all=settle, finish=told, **given)

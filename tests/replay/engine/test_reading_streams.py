@@ -205,7 +205,9 @@ def test_a_networks_state_is_known_by_its_names() -> None:
 
     assert_equal(replayed("network", with_priors(source, interleaved)), replayed("network", source))
     nameless = with_priors(source, lambda prior: replace(prior, metadata={"components": "a,b,c,d"}))
-    with pytest.raises(BadInput, match="topic /prior: its channel states a, b, c, d; positions"):
+    with pytest.raises(
+        BadInput, match="topic /prior: its channel states a, b, c, d; expected positions"
+    ):
         replayed("network", nameless)
 
 

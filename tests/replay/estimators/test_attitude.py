@@ -93,7 +93,7 @@ def test_a_disturbed_field_is_kept_out_by_the_gate_and_turns_the_heading_without
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        (np.full(3, np.nan), "no magnetic field in its first 1 s"),
+        (np.full(3, np.nan), "no magnetic field in the first 1 s"),
         (np.array([0.0, 0.0, 40.0]), "parallel at the start, so they do not determine"),
     ],
 )

@@ -292,7 +292,7 @@ def test_models_are_traced_once_for_all_that_have_the_same_sensors(
     """Logs may have a thousand robots."""
     traced: list[BoundModel] = []
     monkeypatch.setattr(
-        estimators, "stage_of", lambda *parts: traced.append(bound_model_of(*parts)) or traced[-1]
+        estimators, "bound_model_of", lambda *parts: traced.append(bound_model_of(*parts)) or traced[-1]
     )
     recording, run = record_run("landmarks", {"duration_s": 0.1, "robots": 3}, 0)
     filters = bind("ekf", [memory_source(recording, run)], {"kind": "ekf"})

@@ -473,13 +473,13 @@ def test_what_the_gate_kept_out_says_nothing_backwards_either(uncompiled: None) 
 @pytest.mark.parametrize(
     ("forward", "sentence"),
     [
-        ("smoother", "'smoother' is not a filter that a smoother can use; there are: ekf"),
+        ("smoother", "'smoother' is not a filter that a smoother can use; available: ekf"),
         ("efk", "did you mean 'ekf'"),
         ("ekf:s2kf-50", "filter ekf has no variants; give 'smoother:ekf' without ':s2kf-50'"),
         ("ekf:lag=0ms", "lag=0ms is not a valid lag; give a positive whole number and its unit"),
-        ("ekf:lag=-1s", "lag=-1s is not a lag"),
-        ("ekf:lag=5", "lag=5 is not a lag"),
-        ("lrkf:s2kf-50:lag=", "lag= is not a lag"),
+        ("ekf:lag=-1s", "lag=-1s is not a valid lag"),
+        ("ekf:lag=5", "lag=5 is not a valid lag"),
+        ("lrkf:s2kf-50:lag=", "lag= is not a valid lag"),
         ("lrkf:nonsense", "sampling"),
     ],
 )

@@ -130,5 +130,7 @@ def test_sets_and_tracks_in_a_turned_frame_are_judged_there_or_not_at_all(label:
 
 def test_a_tracker_takes_no_sensors_of_two_frames() -> None:
     source = run_of(recorded("vehicles"))
-    with pytest.raises(BadInput, match="is in frame infrastructure, /network/detection in the plane"):
+    with pytest.raises(
+        BadInput, match="is in frame infrastructure, but /network/detection is in the plane"
+    ):
         bind("tracker:jipda", [source], {"sigma_m": 0.7, "clutter_per_m2": 1e-6})

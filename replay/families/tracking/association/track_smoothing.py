@@ -37,7 +37,7 @@ def smooth_tracks(
     The motion of the model must be linear and without a control.
 
     Args:
-        stage: the bound model of the targets.
+        bound_model: the bound model of the targets.
         parameters: the numbers that its functions read.
         track: (n,), index of the track of each estimate.
         time_ns: (n,), increasing in each track.

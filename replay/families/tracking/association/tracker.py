@@ -20,7 +20,7 @@ class Tracker(NamedTuple):
     """A tracker as an assembly of its parts.
 
     Attributes:
-        stage: the targets' bound model, with one of its motions or with all modes.
+        bound_model: the targets' bound model, with one of its motions or with all modes.
         kinds: the kinds of sensors.
         association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
         names: the parameters that the parts read, in the order of the columns of the settings.
