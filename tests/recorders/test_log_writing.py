@@ -82,7 +82,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", lambda *_: open("/dev/full", "wb"))  # noqa: PTH123, SIM115
     with pytest.raises(BadInput, match=r"run\.mcap: cannot be written \(No space left on device\)$"):
         write_log(path, some_streams(1, count=5000))
-    monkeypatch.correct()
+    monkeypatch.undo()
     assert path.read_bytes() == before
     assert names_in(tmp_path) == ["run.mcap"]
 
