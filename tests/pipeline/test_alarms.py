@@ -73,7 +73,8 @@ def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -
     [biased, *_] = replay(record("moving-los", seed=1, duration_s=10.0), ["ekf"]).alarms
     assert biased.kind == "errors"
     assert (
-        "the truth has sensor_1_yaw_bias_rad and 11 more, which it does not estimate" in biased.sentence
+        "the truth contains sensor_1_yaw_bias_rad and 11 more, which the estimator does not estimate"
+        in biased.sentence
     )
 
 
@@ -158,7 +159,7 @@ def test_gates_that_differ(log: MemorySource) -> None:
     opened = {"open": {"kind": "ekf", "gate_probability": 1.0}}
     last = replay(log, ["ekf", opened], set={"sigma_range_m": 0.05}).alarms[-1]
     assert last.kind == "gates"
-    assert "gate_probability is 0.999 of ekf, 1 of open" in last.sentence
+    assert "gate_probability is 0.999 for ekf, 1 for open" in last.sentence
 
 
 def test_a_minimum_that_is_not_the_least(log: MemorySource) -> None:

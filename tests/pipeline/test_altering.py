@@ -51,7 +51,7 @@ def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
 
 @pytest.mark.paper
 @pytest.mark.parametrize(
-    ("topic", "fault", "by", "undone"),
+    ("topic", "fault", "by", "corrected"),
     [
         (SEEN, put.shifted("range_m"), 0.2, "bias_range_m"),
         (SEEN, put.delayed, 0.3, f"{SEEN}.delay_s"),

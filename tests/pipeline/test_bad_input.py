@@ -35,13 +35,16 @@ TABLE: dict[str, tuple[str, ...]] = {
     "replay log.mcap -e ekf --model robt": ("no model 'robt'", "did you mean 'robot'"),
     "replay log.mcap -e ekf --model vehicle": (
         "does not fit",
-        "nothing that vehicle needs",
+        "no topic that vehicle needs",
         "/robot1/prior",
     ),
-    "replay log.mcap -e triad --model robot": ("--model", "methods such as ekf", "triad takes none"),
+    "replay log.mcap -e triad --model robot": ("--model", "methods such as ekf", "not to triad"),
     "replay log.mcap -e ekf --every 0": ("'every_s' is 0", "greater than 0"),
     "replay log.mcap -e ekf --every soon": ("--every", "soon"),
-    "replay log.mcap -e ekf --late drop": ("only in the order of their arrival", "--arrival-order"),
+    "replay log.mcap -e ekf --late drop": (
+        "only if they are processed in order of arrival",
+        "--arrival-order",
+    ),
     "replay log.mcap -e ekf --arrival-order --late drp": ("wait:SECONDS", "did you mean 'drop'"),
     "replay log.mcap -e ekf --arrival-order --late drop:1": ("takes no seconds", "give --late drop"),
     "replay log.mcap -e ekf --arrival-order --late wait": ("zero or more seconds", "wait:0.5"),
@@ -55,9 +58,9 @@ TABLE: dict[str, tuple[str, ...]] = {
     "replay log.mcap -e ekf --every 0.1 --arrival-order --late rewind:1": ("--every", "--late wait"),
     "replay log.mcap -e ekf --arrival-order --late drop --start-from truth --start 1": (
         "--start-from truth",
-        "leave out one",
+        "use only one of these options",
     ),
-    "run landmarks --late drop": ("only in the order of their arrival",),
+    "run landmarks --late drop": ("only if they are processed in order of arrival",),
     "run reactor --arrival-order": ("study reactor replays in the order of the stamps", "leave out"),
     'replay log.mcap -e ekf --set estimate=["bias_rnge_m"]': (
         "this model cannot estimate a parameter of this name",
@@ -74,7 +77,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     ),
     'replay log.mcap -e ekf --set estimate=["bias_range_m","bias_range_m"] '
     "--set estimate_sigma.bias_range_m=1": ("twice",),
-    "replay log.mcap -e ekf --set estimate_drift.bias_range_m=1": ("`estimate` lacks bias_range_m",),
+    "replay log.mcap -e ekf --set estimate_drift.bias_range_m=1": ("bias_range_m is not in `estimate`",),
     "replay log.mcap -e ekf --set mode=calm": ("mode = calm", "one motion", "leave out"),
     "replay log.mcap -e ekf --set sigma_rnge_m=1": ("no such", "'sigma_range_m'"),
     "replay log.mcap -e ekf --set point_variance_m2=1": (
@@ -111,7 +114,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "cut json.mcap --topics /robot1/odometry -o new.mcap": ("json.mcap", "the encoding 'json'"),
     "cut json.mcap --topics /robot1/o* -o new.mcap": ("json.mcap", "import it first"),
     "cut nan.mcap -o new.mcap": ("nan.mcap", "is NaN in message"),
-    "merge log.mcap -o new.mcap": ("log.mcap", "give at least two"),
+    "merge log.mcap -o new.mcap": ("log.mcap", "needs at least two logs"),
     "merge log.mcap other.mcap -o new.mcap": (
         "other.mcap",
         "topic /landmarks (5 in all) is also in log.mcap",
@@ -128,7 +131,10 @@ TABLE: dict[str, tuple[str, ...]] = {
         "NAME=VALUE",
     ),
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=soon": ("LOG=SECONDS", "-0.5"),
-    "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=nan": ("is nan", "give seconds"),
+    "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=nan": (
+        "is nan",
+        "give a number of seconds",
+    ),
     "relabel log.mcap -o new.mcap": ("nothing to rename",),
     "constrain log.mcap -o new.mcap": ("has no inertial unit",),
     "relabel log.mcap --topic /robot1/truht=/truth -o new.mcap": ("did you mean '/robot1/truth'",),
@@ -187,7 +193,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "run landmarks --data mrclam": ("imports nothing", "--data"),
     "run mrclam": ("needs real data", "--data"),
     "run mrclam --data mrclam --runs 2": ("a fixed number of runs", "leave out seed and runs"),
-    "run bingham-2d --runs 1": ("no standard error", "--runs 2"),
+    "run bingham-2d --runs 1": ("standard errors, which need at least two runs", "--runs 2"),
     "run acoustic --set options.multipliers=[2]": ("options of study acoustic", "multipliers", "1"),
     "run acoustic --set options.modes=[]": ("options of study acoustic", "modes", "bearings-only"),
     "run los-two-sensors --set options.scenarios=[]": ("options of study los", "the 5 of the paper"),

@@ -520,7 +520,7 @@ def test_a_tracker_is_diagnosed_and_tuned_in_a_sentence() -> None:
     log = fl.record("crossing", seed=1, duration_s=10.0)
     notes = fl.diagnose(log, "tracker").notes
     assert any("states no likelihood of its innovations" in each for each in notes)
-    with pytest.raises(fl.BadInput, match="tracker has no innovations with a likelihood there"):
+    with pytest.raises(fl.BadInput, match="tracker has no innovations with a likelihood on this log"):
         fl.tune(log, "tracker", "acceleration_density")
 
 

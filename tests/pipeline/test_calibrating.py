@@ -145,7 +145,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
     log = recorded(drive(None, duration_s=3.0))
     with pytest.raises(fl.BadInput, match="--fixed lever_z_m: is not a calibration parameter: forward_"):
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
-    with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
+    with pytest.raises(fl.BadInput, match="calibrate: by is an option of tune only"):
         fl.calibrate(log, "ekf", by="rmse")
     bounds = {"lever_x_m": (0.1, 2.0)}
     with pytest.raises(
@@ -195,7 +195,7 @@ def test_the_next_manoeuvre_is_the_sheets() -> None:
     assert varied.sigmas * USEFUL == pytest.approx(
         [0.000883, 0.012926, 0.00118, 0.29077, 0.11701, 0.02947, 0.00118], rel=0.02
     )
-    said = [each for each in found.notes if "record turns at changing speed: of 6 manoeuvres" in each]
+    said = [each for each in found.notes if "record turns at changing speed: among 6 manoeuvres" in each]
     assert said
     assert any("by the determinant" in each for each in found.notes)
 
@@ -413,5 +413,5 @@ def test_ctrl_c_in_the_second_search_ends_with_the_best_of_the_first(
 
     monkeypatch.setattr(Objective, "correct", noting)
     found = fl.tune(late_fixes(0.0, first=5), "ekf", "fix_delay_s", on_best=stop)
-    assert found.notes[0].startswith("stopped after ")
+    assert found.notes[0].startswith("the search was stopped after ")
     assert found.parameters["value"].tolist() == first

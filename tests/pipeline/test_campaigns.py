@@ -187,7 +187,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
     (half / "fuselog.lock").touch()
     (half / "new.bin").write_bytes(b"half a ce")
     assert run(place) == files
-    assert "has 1 of 3 cells" in caplog.text
+    assert "1 of 3 cells are already done" in caplog.text
     assert worked_off == [0, CELL, 2 * CELL]
     assert not unfinished(place).exists()
 
@@ -354,7 +354,9 @@ def test_what_is_not_ours_stays(tmp_path):
     unfinished(place).mkdir()
     note = unfinished(place) / "thesis.txt"
     note.write_text("years of work")
-    with pytest.raises(BadInput, match=r"holds thesis\.txt, which fuselog did not write; move it away"):
+    with pytest.raises(
+        BadInput, match=r"contains thesis\.txt, which fuselog did not write; move it away"
+    ):
         run(place, runs=CELL + 2)
     assert note.read_text() == "years of work"
     note.unlink()
@@ -404,7 +406,7 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     capsys.readouterr()
     assert main(["run", "ispace", "--workers", "2", *out]) == 2
     assert (
-        "networks, replays all runs together, in one process; leave out --workers"
+        "networks replays all runs together, in one process; leave out --workers"
         in capsys.readouterr().err
     )
     pytest.importorskip("distributed")

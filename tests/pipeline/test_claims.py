@@ -131,7 +131,7 @@ def claim(**values: object) -> StatedClaim:
 def test_what_chance_may_have_made_is_not_shown(value: str, verdict: str) -> None:
     [found] = decide([claim(value=value, holds="value > 0")], METRICS, INTERVALS, {})
     assert found.verdict == verdict
-    assert ("which takes 5" in found.why) == ("few" in value)
+    assert ("which needs 5" in found.why) == ("few" in value)
     left = decide([claim(value=value, holds="value > 0", optional=True)], METRICS, INTERVALS, {})
     assert len(left) == ("nobody" not in value)
 

@@ -215,7 +215,7 @@ def test_info_says_that_no_model_fits(
     fl.write("own.mcap", [fl.make_stream("/p/camera", fl.schemas.VECTOR_MEASUREMENT, [10**9], **seen)])
     said = fuselog("info", "own.mcap").out.splitlines()[-1]
     assert said == (
-        "No registered model fits this log: it has nothing that a registered model needs; use a model "
+        "No registered model fits this log: it has no topic that a registered model needs; use a model "
         'of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the '
         "documentation"
     )
@@ -931,7 +931,7 @@ def test_errors_beyond_any_covariance_are_called_divergence(
         assert said.code == 0
         lines = [line for line in said.out.splitlines() if "NIS is" in line or "NEES is" in line]
         found = [
-            (why, line.count(" is within ")) for line in lines for why in (small, far) if why in line
+            (why, line.count(" is between ")) for line in lines for why in (small, far) if why in line
         ]
         assert found == told, said.out
 

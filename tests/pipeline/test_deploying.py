@@ -361,7 +361,7 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
         fl.deploy(reactor, "analytic", out)
     model = replace(REACTOR, motion=fl.Motion(by_float))
     with pytest.raises(
-        BadInput, match=r"by_float \(test_deploying.py, line \d+\): it uses float\(\) of"
+        BadInput, match=r"by_float \(test_deploying.py, line \d+\): it uses float\(\) on"
     ):
         fl.deploy(reactor, fl.modelled(model, "ekf"), out)
     assert not out.exists()

@@ -412,7 +412,7 @@ def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> No
     locked = well & ~((np.arange(400) >= 100) & (np.arange(400) < 160))
     told = list(of_innovations(innovations(rng.chisquare(1, 400), locked), 0.999, 0, has_outliers=True))
     assert [each.kind for each in told] == ["gate"]
-    assert "keeps out all 60 measurements from 100 s to 159 s" in told[0].sentence
+    assert "rejects all 60 measurements from 100 s to 159 s" in told[0].sentence
     rare = np.arange(400) % 10 > 0
     told = list(of_innovations(innovations(rng.chisquare(1, 400), rare), 0.999, 0, has_outliers=False))
     assert "keeps out 10 % of the measurements, where 0.1 % are expected" in told[0].sentence
@@ -440,7 +440,7 @@ def test_what_is_wrong_with_messages_is_said() -> None:
         return found.sentence
 
     twice = np.repeat(np.arange(300), 1 + (np.arange(300) % 30 == 0))
-    assert "10 of its 310 messages are there twice" in told(fixes(place).take(twice))
+    assert "10 of its 310 messages are duplicates" in told(fixes(place).take(twice))
     clipped = np.minimum(place, [np.quantile(place[:, 0], 0.9), 99.0])
     assert "position_m x is saturated: 30 of 300 messages are at" in told(fixes(clipped))
     rounded = np.cumsum(rng.normal(size=(3000, 2)), axis=0)

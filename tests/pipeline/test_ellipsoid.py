@@ -94,7 +94,7 @@ def test_the_command(fuselog: Callable[..., Said], tmp_path: Path) -> None:
     for field, words in (
         ("/imu", "expected TOPIC.FIELD"),
         ("/imu.turn", "has no vector turn"),
-        ("/imu.turn_rate_radps", "has 6000 readings that are all alike"),
+        ("/imu.turn_rate_radps", "its 6000 readings are all equal"),
     ):
         refused = fuselog("ellipsoid", str(log), "--field", field)
         assert (refused.code, words in refused.err) == (2, True), refused.err

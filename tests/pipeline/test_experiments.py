@@ -471,14 +471,16 @@ def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
     assert landmarks.record is not None
     assert landmarks.record.parameters["forward_noise_density"] == 0.1
     assert landmarks.estimators["ekf"] == {"gate_probability": 1.0, "sigma_range_m": 1}
-    with pytest.raises(BadInput, match=r"--set gate_probabilty: no such entry.*gate_probability"):
+    with pytest.raises(
+        BadInput, match=r"--set gate_probabilty: not an entry of the experiment.*'gate_probability'"
+    ):
         load_experiment("landmarks", {"gate_probabilty": 1}, {})
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["drive-1.mcap"], "name the estimators to replay it with, such as -e ekf"),
+        (["drive-1.mcap"], "name the estimators to replay, such as -e ekf"),
         (["drive-1.mcap", "landmarks", "-e", "ekf"], "give only logs and -e"),
         (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give only logs and -e"),
         (["drive-9.mcap", "-e", "ekf"], "no log matches drive-9.mcap"),

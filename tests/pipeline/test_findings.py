@@ -55,7 +55,7 @@ PLANTED: dict[str, tuple[str, Change | str, str, str]] = {
         "lost messages",
         "loses 19 % of its messages",
     ),
-    "repeated": (FIX, rows(lambda n: np.sort([*range(n), 40, 90])), "stamps", "there twice"),
+    "repeated": (FIX, rows(lambda n: np.sort([*range(n), 40, 90])), "stamps", "are duplicates"),
     "a gap": (FIX, rows(lambda n: np.r_[0:120, 160:n]), "gap", "is silent for 20.5 s"),
     "a sign": (ODOMETRY, "turn rate's sign", "sign", "turn_radps has the wrong sign"),
     "a unit": (ODOMETRY, "speed x 3.6", "unit", "3.6 times too large, as when km/h are read as m/s"),
@@ -126,7 +126,7 @@ def test_wheels_that_turn_backwards_are_named_beside_the_compass() -> None:
     assert found.where == "/car/heading"
     assert "or of a wrong sign of speeds" in found.evidence
     assert "or change the sign of the speeds by factors" in found.fix
-    with pytest.warns(FutureWarning, match="Finding: 'words' is called 'sentence' now"):
+    with pytest.warns(FutureWarning, match="Finding: 'words' was renamed to 'sentence'"):
         assert found.words == found.sentence  # what scripts of the release before ask for
 
 

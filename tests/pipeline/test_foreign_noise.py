@@ -15,8 +15,8 @@ DEVIATION_RADPS = 1e-4  # at 1 s
     [
         (1.0, "equals it: N in rad/s/sqrt(Hz), continuous"),
         (1.2, "equals it"),
-        (20.0, "is 20 times that, sqrt of a rate of 400 Hz: divide by 20 for N"),
-        (0.05, "is 0.05 times that, sqrt of a rate of 0.0025 Hz"),
+        (20.0, "is 20 times this, the root of a rate of 400 Hz: divide by 20 for N"),
+        (0.05, "is 0.05 times this, the root of a rate of 0.0025 Hz"),
     ],
 )
 def test_the_convention_of_imu_utils_is_told_by_its_curves(
@@ -44,7 +44,7 @@ def test_the_convention_of_imu_utils_is_told_by_its_curves(
 def test_other_files_are_told_apart(tmp_path: Path) -> None:
     kalibr = tmp_path / "imu.yaml"
     kalibr.write_text("accelerometer_noise_density: 1\ngyroscope_random_walk: 2\n")
-    assert "is Kalibr's imu.yaml" in explained(kalibr)[0]
+    assert "a Kalibr imu.yaml" in explained(kalibr)[0]
     for name, what in (("data_unit_acc_t", "averaging times in s"), ("data_unit_gyr_x", "in deg/h")):
         (tmp_path / f"{name}.txt").write_text("1\n")
         assert what in explained(tmp_path / f"{name}.txt")[0]
