@@ -179,7 +179,7 @@ def replay_parts(
         connect: the viewer for the timeline; see `Drawing`.
         on_errors: called with the errors of every block.
         block_messages: approximate number of messages of a run in memory at a time.
-        companions: makes the Foxglove mirror for other viewers, written next to the estimates.
+        mirrors: makes the Foxglove mirror for other viewers, written next to the estimates.
         progress: reports progress after every block.
 
     An estimator that cannot replay any run is reported by `Pass.check`.

@@ -54,7 +54,10 @@ def test_every_parameter_says_what_it_means() -> None:
         ("check a.mcap --against a.golden.xz -e ekf --set topics=?", ["empty name"]),
         ("compare a b -e smoother:iterated -e ekf --set loss=?", ["square, huber, cauchy"]),
         ("diagnose a.mcap -e ekf --set bias_range_m=?", ["ekf of robot", "measured minus true"]),
-        ("diagnose a.mcap -e ekf --set /fix.delay_s=?", ["/fix.delay_s", "delay of the stamps, which is subtracted"]),
+        (
+            "diagnose a.mcap -e ekf --set /fix.delay_s=?",
+            ["/fix.delay_s", "delay of the stamps, which is subtracted"],
+        ),
         ("replay a.mcap -e ekf --set /fix=?", ["/fix.FIELD_scale", "/fix.exchanged"]),
         ("observability a.mcap --set window_s=?", ["whole run"]),
         (
