@@ -155,7 +155,7 @@ HOW = "where its differences fit best"
 MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
 REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
 SOUND_SOURCE = Model(
-    "position of a sound source, from differences of arrival times at microphones",
+    "position of a sound source from arrival-time differences at microphones",
     {"x_m": "linear", "y_m": "linear", "z_m": "linear", "reference_s": "linear"},
     SoundSourceParameters,
     (
