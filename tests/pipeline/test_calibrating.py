@@ -150,7 +150,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
     bounds = {"lever_x_m": (0.1, 2.0)}
     with pytest.raises(
         fl.BadInput,
-        match=r"--bound lever_x_m=0.1:2: expected bounds above zero on both sides of the start "
+        match=r"--bound lever_x_m=0.1:2: expected bounds on both sides of the start "
         r"value, 0; give other bounds, or --set lever_x_m=...",
     ):
         fl.calibrate(log, "ekf", bounds=bounds)

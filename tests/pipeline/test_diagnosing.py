@@ -415,7 +415,7 @@ def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> No
     assert "rejects all 60 measurements from 100 s to 159 s" in told[0].sentence
     rare = np.arange(400) % 10 > 0
     told = list(of_innovations(innovations(rng.chisquare(1, 400), rare), 0.999, 0, has_outliers=False))
-    assert "keeps out 10 % of the measurements, where 0.1 % are expected" in told[0].sentence
+    assert "rejects 10 % of the measurements (0.1 % expected)" in told[0].sentence
 
 
 def fixes(position: np.ndarray, **stamps: Any) -> fl.Stream:
