@@ -84,10 +84,10 @@ class CarParameters(Parameters):
         fix_sigma_m: standard deviation of a fix, per axis.
         compass_sigma_rad: standard deviation of a heading.
         forward_factor, turn_factor: ratio of the wheels' readings to the motion.
-        turn_error_radps: bias of the wheels' turn rate.
+        turn_error_radps: bias of the wheels' turn rate, measured minus true.
         lever_x_m, lever_y_m: position of the antenna, forward and left of the car's reference point.
         fix_delay_s: how long before its stamp a fix was measured.
-        compass_error_rad: bias of the compass.
+        compass_error_rad: bias of the compass, measured minus true.
     """
 
     duration_s: PositiveFloat = 120.0

@@ -36,8 +36,8 @@ class Sensor(Parameters):
         stamp_offset_s: offset of the stamps of its messages, positive if ahead.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
-        bias_range_m: bias of ranges.
-        bias_bearing_rad: bias of bearings.
+        bias_range_m: bias of ranges, measured minus true.
+        bias_bearing_rad: bias of bearings, measured minus true.
     """
 
     rate_hz: NonNegativeFloat = 0.0

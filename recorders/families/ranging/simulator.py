@@ -56,7 +56,7 @@ class RangingParameters(Parameters):
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
         sigma_range_m: standard deviation of a range's white noise.
-        bias_range_m: bias of all ranges.
+        bias_range_m: bias of all ranges, measured minus true.
         error_sigma_m: standard deviation of the slowly varying error of every anchor.
         error_time_s: correlation time of such an error.
         blocked: blocked lines of sight.

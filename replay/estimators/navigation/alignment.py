@@ -61,9 +61,8 @@ class AlignmentParameters(ModelParameters):
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: relative scale error of the force, per axis.
-        axis.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative scale error of the turn rate, per axis.
+        force_scale_x, force_scale_y, force_scale_z: relative excess of the measured force, per axis.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative excess of the measured rate, per axis.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
         velocity_delay_s: delay of velocities: time from the measurement to the stamp.
         inertial_delay_s: delay of inertial samples: time from the measurement to the stamp.

@@ -63,7 +63,7 @@ class NavigationParameters(AlignmentParameters):
         the body (forward, left, up).
         axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit along this axis
         of the body (forward, left, up).
-        wheel_scale: relative scale error of the wheels' speed.
+        wheel_scale: relative excess of the speed that the wheels measure.
         field_east_ut, field_north_ut, field_up_ut: local magnetic field in this direction.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
         standing_delay_s: delay of messages that the body stands still: time from the measurement to the

@@ -38,7 +38,7 @@ class RangingParameters(ModelParameters):
     Attributes:
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
         sigma_range_m: standard deviation of a range.
-        bias_range_m: bias of measured ranges.
+        bias_range_m: bias of measured ranges, measured minus true.
         height_m: height at which the tag moves.
         range_delay_s: delay of a range's stamp after its measurement.
         start_s: duration of the ranges in which the start is found.

@@ -122,9 +122,9 @@ class TrackerParameters(Parameters):
         sigma_across_rad: additional standard deviation of a position across the line of sight, per m of
             range.
         lag_s: delay of detections, which show where a target was this long before.
-        bias_x_m: bias of measured positions along x.
-        bias_y_m: bias of measured positions along y.
-        bias_range_m: bias of measured ranges.
+        bias_x_m: bias of measured positions along x, measured minus true.
+        bias_y_m: bias of measured positions along y, measured minus true.
+        bias_range_m: bias of measured ranges, measured minus true.
         near_range_m: range up to which a target is near; beyond it, detection and clutter change
             linearly.
         far_range_m: range beyond which detection and clutter stay constant.
@@ -139,7 +139,7 @@ class TrackerParameters(Parameters):
         joined_within_m: distance within which detections are joined and count as one target.
         sigma_rad: standard deviation of a bearing.
         sigma_across_m: additional standard deviation of a bearing across the line of sight, in m.
-        bias_rad: bias of measured bearings.
+        bias_rad: bias of measured bearings, measured minus true.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         detection_probability: probability that a near target is detected.
         blind_from_rad: beginning of the sector in which a sensor detects nothing, anticlockwise from the
