@@ -779,9 +779,10 @@ def test_a_page_is_served_to_this_machine_alone_and_ends_with_the_command(
             children = psutil.Process(running.pid).children(recursive=True)
             sockets = [each for child in children for each in child.net_connections("inet")]
             listening = [each.laddr for each in sockets if each.status == psutil.CONN_LISTEN]
-        finally:
             running.send_signal(signal.SIGINT)
             running.wait(30)
+        finally:
+            running.kill()
     assert {address.ip for address in listening} == {"127.0.0.1"}
     assert urlsplit(url).port in {address.port for address in listening}
     assert not any(child.is_running() for child in children)
