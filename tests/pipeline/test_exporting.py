@@ -162,5 +162,5 @@ def test_nothing_is_replaced(world: Path, fuselog: Fuselog) -> None:
         assert said.err.count("\n") == 1
         assert all(word in said.err for word in words), said.err
     said = fuselog("export", world / "no-truth.mcap", "--to", "tum")
-    assert (said.code, "no estimates, truth or poses" in said.err) == (2, True)
+    assert (said.code, "no estimates, truths or poses" in said.err) == (2, True)
     assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before

@@ -305,7 +305,7 @@ def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: P
         assert file is not None
         turn_radps = np.radians(np.load(io.BytesIO(file.read()))[:, 1].astype(float))
     found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
-    assert any("yours: 1.28 (" in note for note in found.notes)
+    assert any("yours is 1.28 (" in note for note in found.notes)
     assert len(found.densities.doubts) == 1
 
 
