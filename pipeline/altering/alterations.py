@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Reorder the entries of a vector and of its covariance, whatever the number."""
+    """Reorder the entries of a vector and of its covariance; the number of the alteration is ignored."""
     return partial(_permuted, field, tuple(order))
 
 

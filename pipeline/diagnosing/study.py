@@ -2,8 +2,8 @@
 
 Faults that cannot be distinguished count as one kind: a bearing's bias and its sensor's rotated frame. A
 rotation or a drift is only visible between two frames or clocks, so that either may be named. The gain
-in log-likelihood from removing a fault shows whether it is visible at all: some of ten faults in three
-scenarios are not, such as a delay of the only sensor of a vehicle without controls.
+in log-likelihood from removing a fault shows whether it is visible at all. Some are not: for example, a
+delay of the only sensor of a vehicle without controls.
 """
 
 from collections.abc import Callable, Collection, Mapping

@@ -219,7 +219,7 @@ def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb
 
 
 def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[rrb.Container]:
-    """Draw each sensor's measurements around it, and plot all of their numbers except covariances."""
+    """Draw measurements at the position of their sensor, and plot their values except covariances."""
     for stream in sensed:
         if stream.schema.full_name in NOT_SENSED:
             continue

@@ -152,7 +152,7 @@ def size_of(at: float) -> str:
 def in_sense(
     at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
 ) -> tuple[str, float, float, float]:
-    """Return the word for a number's sign, the number's size, and its interval in that direction.
+    """Describe a number as a direction, such as "too small", with its size and the interval of the size.
 
     >>> in_sense(-0.3, -0.4, -0.2)
     ('too small', 0.3, 0.2, 0.4)
