@@ -145,8 +145,8 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     Candidates are all points where the muzzle blasts of two sensors meet, with every direction of the
     bullet in the reports. A least-squares fit with Cauchy loss starts from the candidate with the
-    smallest residuals, which are clipped at three standard deviations. It suppresses wrong reports if most are
-    right. Raises BadInput if the reports do not determine a shot.
+    smallest residuals, which are clipped at three standard deviations. It suppresses wrong reports if
+    most are right. Raises BadInput if the reports do not determine a shot.
     """
     reports, sensors = streams["reports"], streams[SENSORS.topic]
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))
