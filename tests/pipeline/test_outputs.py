@@ -383,7 +383,7 @@ with open(os.environ["SHADOWED"], "a") as told:
     print(__file__, *sys.argv, file=told)
 """
 # Starts workers as `--workers 2` and `--scheduler local:1` do, then runs commands one after another,
-# with the path that the console script has, to which none may add.
+# with the path that the console script has.
 DRIVER = """
 import json, sys
 from matplotlib.figure import Figure
@@ -391,29 +391,41 @@ from fuselog.pipeline.command_line import main
 from fuselog.pipeline.runs.executors import dask, processes
 if __name__ == "__main__":
     Figure.draw = lambda *_: None
-    before = list(sys.path)
     for workers in (processes(2), dask("local:1")):
         with workers() as pool:
             assert pool.executor.submit(abs, -1).result() == 1
-    codes = [main(words) for words in json.load(sys.stdin)]
-    assert sys.path == before
-    print(json.dumps(codes))
+    print(json.dumps([main(words) for words in json.load(sys.stdin)]))
 """
-# Commands that start processes: filters of others, the viewer, and a browser's page.
-STARTERS = """
+# Commands without an output, and further ones that start processes: filters of others, and the viewer.
+OTHERS = """
+cache
+estimators
+experiments
+header
+info run.mcap
+lint run.mcap
+metrics
+models
+scenarios
+observability run.mcap
 replay run.mcap -e exec:/bin/true -o a.mcap
 replay run.mcap -e lib:./junk.so -o b.mcap
 report result --viewer --out viewer.html
-view run.mcap --screenshot view.png
 """
+# The viewer where there is no graphics driver, and filters that are none.
+MAY_FAIL = {"view", "report", "replay"}
 
 
-def test_no_process_imports_a_module_of_the_current_folder(here: Path, tmp_path: Path) -> None:
-    """Workers, the viewer, filters of others, the explorer, and the command that starts them."""
+def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path: Path) -> None:
+    """Nor do the processes that commands start."""
     for name in SHADOWS:
         (here / f"{name}.py").write_text(SHADOW)
     (here / "junk.so").write_bytes(b"no library")
-    lines = [line.split() for line in STARTERS.strip().splitlines()]
+    by_name = {
+        each.words[0]: each.to(Path(f"{each.words[0]}{each.suffix}")) for each in COMMANDS.values()
+    }
+    lines = [*by_name.values(), *map(str.split, OTHERS.strip().splitlines())]
+    assert {words[0] for words in lines} == fuselog.commands.keys() - {"explore"}
     driver, told = tmp_path / "driver.py", tmp_path / "told"
     driver.write_text(DRIVER)
     environment = os.environ | {"SHADOWED": str(told)}
@@ -425,7 +437,8 @@ def test_no_process_imports_a_module_of_the_current_folder(here: Path, tmp_path:
         capture_output=True,
         text=True,
     )
-    assert len(json.loads(done.stdout.splitlines()[-1])) == len(lines), done.stderr
+    failed = zip(lines, json.loads(done.stdout.splitlines()[-1]), strict=True)
+    assert {words[0] for words, code in failed if code} <= MAY_FAIL, done.stderr
     script = Path(sys.executable).with_name("fuselog")
     command = [script, "explore", "run.mcap", "-e", "ekf", "--no-browser"]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as exploring:
