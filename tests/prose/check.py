@@ -7,12 +7,12 @@ import sys
 import tokenize
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).parents[2]
-ROOMS = ("fuselog", "recorders", "replay", "pipeline")
+from tests.house.sources import PATHS, ROOT
+
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
 CODE = re.compile(
     r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|>>> [^\n]*|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+",
@@ -87,12 +87,12 @@ def faults_of(text: Text, listed: Iterable[Habit]) -> Iterator[tuple[int, str, H
                 yield text.line + words.count("\n", 0, found.start()), found[0].strip(), habit
 
 
-def paths(names: Iterable[str]) -> Iterator[Path]:
-    """Yield the files of prose: those of the given files and folders, or of all."""
-    given = [ROOT / name for name in names]
-    for each in given or [ROOT / room for room in ROOMS]:
+def paths(names: Sequence[str]) -> Iterator[Path]:
+    """Yield the given files and those below the given folders, or the product's code and all pages."""
+    for each in (ROOT / name for name in names):
         yield from sorted(each.rglob("*.py")) if each.is_dir() else [each]
-    if not given:
+    if not names:
+        yield from (ROOT / path for path in PATHS)
         for pattern in PAGES:
             yield from sorted(ROOT.glob(pattern))
 
