@@ -242,7 +242,7 @@ class _Search:
             peaks = []
             alike, doubtful = _likeliest(self.likelihood, look.now, look.ranked, self.count)
             if not alike and np.isfinite(target):  # the parts may agree once other causes are corrected
-                alike = [each for each in doubtful if _is_physical(each[1])][:1]
+                alike = doubtful[:1]
             noises = [each for each in (*alike[:1], *doubtful) if _takes_all(*each)]
             if self._is_gross(look, noises):
                 look, alike, noises = self._beside_gross(look, alike, noises)

@@ -52,7 +52,7 @@ class LogWriter:
         run: metadata of the run; if it is known only at the end, use `describe`.
         compression: "zstd", "lz4" or "none".
         chunk_bytes: approximate size of an uncompressed chunk.
-        companions: function that makes the messages for viewers that are written next to each stream.
+        mirrors: function that makes the messages for viewers that are written next to each stream.
 
     Raises BadInput if the file cannot be written.
     """
