@@ -1,5 +1,6 @@
 """Opened logs: their topics, and what is missing."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -61,6 +62,17 @@ class Log:
     def mirrors(self) -> dict[str, Topic]:
         """Return the topics that are only for viewers, by name, sorted."""
         return {name: topic for name, topic in self._all.items() if MIRROR_OF in topic.metadata}
+
+    @property
+    def companions(self) -> dict[str, Topic]:
+        """Return `mirrors` under the name of the previous release."""
+        warnings.warn(
+            "Log: 'companions' was renamed to 'mirrors'; the old name will be removed in the next "
+            "release",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return self.mirrors
 
     @cached_property
     def _all(self) -> dict[str, Topic]:

@@ -80,6 +80,9 @@ def test_a_recorded_log_has_its_truth_and_map_beside_the_same_streams(fuselog: F
     assert [each.texts[0].text for each in scene.entities] == [
         str(number) for number in streams["/landmarks"]["landmark_id"]
     ]
+    log = open_log("both.mcap")
+    with pytest.warns(FutureWarning, match="'companions' was renamed to 'mirrors'"):
+        assert log.companions == log.mirrors != {}
     said = fuselog("info", "both.mcap")
     assert "Foxglove mirror, for viewers: " in said.out
     assert "/foxglove/" not in said.out
