@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.finding import Finding, Severity
 from fuselog.recorders.checks.losses import FEWEST, REGULARS, is_measured
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
@@ -24,6 +24,7 @@ CLIPPED, MORE_OFTEN, MANY_LEVELS, RUNS, MEASURED = 5e-3, 5.0, 20, 3, 0.9
 # For a code among values: its step in usual steps, the share of it by which others differ, and its
 # count.
 ALONE, ALIKE, OFTEN = 20.0, 0.2, 3
+FAR = 0.1  # distance of a code from all other values, as a share of their range
 RANGES = {
     "turn_rate_radps": np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0]),
     "specific_force_mps2": 9.80665 * np.array([2.0, 4.0, 8.0, 16.0, 32.0]),
@@ -102,6 +103,37 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         )
 
 
+def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find negative distances: one number is a code for a missing value, others may be noise."""
+    if "range_m" not in stream.columns:
+        return
+    ranges_m = stream["range_m"]
+    is_there = ranges_m < 0.0
+    if not is_there.any():
+        return
+    least_m = float(ranges_m[is_there].min())
+    is_code = int(is_there.sum()) >= OFTEN and bool((ranges_m[is_there] == least_m).all())
+    first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
+    first_s = 1e-9 * float(first_ns - int(stream.publish_time_ns[0]))
+    yield Finding(
+        "values",
+        stream.topic,
+        "range_m",
+        float(is_there.sum()),
+        f"{stream.topic}: range_m is {least_m:.6g} in {int(is_there.sum())} of {len(stream)} messages, "
+        f"the first {first_s:.4g} s after its first stamp: a code for a missing value, which is used as "
+        "a distance"
+        if is_code
+        else f"{stream.topic}: range_m is negative in {int(is_there.sum())} of {len(stream)} messages, "
+        f"down to {least_m:.3g} m, the first {first_s:.4g} s after its first stamp",
+        otherwise="missing = { COLUMN = [...] } in the table of the mapping"
+        if is_code
+        else "correct the offset of the sensor, for example by range_m under `offsets` in the mapping",
+        severity="likely" if is_code else "hint",
+        time_ns=first_ns,
+    )
+
+
 def _apart(steps: Floats, half_turn: float) -> Floats:
     """Return the sizes of steps; for angles, the shorter way round."""
     sizes = np.abs(steps)
@@ -140,32 +172,58 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     for field, name, column in entries:
         known = column[np.isfinite(column)]
         levels, counts = np.unique(known, return_counts=True)
+        ends: list[float] = []
+        severity: Severity = "hint"
+        is_range = False
         for at in (-1, 0) if len(levels) > 1 else ():
             end, count = float(levels[at]), int(counts[at])
             if count < max(ROWS, SHARE * len(column)) or end == 0.0:
                 continue
             is_there = column == end
             others = [other for of, which, other in entries if (of, which) != (field, name)]
+            varying = [other for other in others if np.nanmax(other) > np.nanmin(other)]
             is_end = _is_end_of_range(stream, field, known, end)
             usual = max(len(known) / len(levels), counts[-2 if at else 1])
-            if not is_end and not _is_clipped(is_there, len(levels), usual, others):
+            is_clipped = _is_clipped(is_there, len(levels), usual, varying)
+            if not is_end and (not is_clipped or _is_code(levels, at)):
                 continue
-            is_sure = stream.schema.full_name in REGULARS and _changes(known[known != end]) > MEASURED
-            first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
-            first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
-            what = "the end of a range" if is_end else f"its {'greatest' if at else 'least'} value"
-            yield Finding(
-                "values",
-                stream.topic,
-                field,
-                float(count),
-                f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
-                f"{end:.6g}, {what}, the first {first_s:.4g} s after its first stamp",
-                otherwise="set the sensor to a larger range, or cut out these messages",
-                severity="likely" if is_end or is_sure else "hint",
-                time_ns=first_ns,
-            )
-            break
+            is_noisy = _changes(known[known != end]) > MEASURED
+            is_sure = stream.schema.full_name in REGULARS and is_noisy
+            ends.append(end)
+            is_range |= is_end
+            if is_end or (is_sure and (varying or not others)):
+                severity = "likely"
+        if not ends:
+            continue
+        is_there = np.isin(column, ends)
+        first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
+        first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
+        which = "greatest" if ends == [levels[-1]] else "least"
+        what = "the end of a range" if is_range else f"its {which} value"
+        if len(ends) == 2:
+            what = "the ends of a range" if is_range else "its greatest and its least value"
+        yield Finding(
+            "values",
+            stream.topic,
+            field,
+            float(is_there.sum()),
+            f"{stream.topic}: {name} is saturated: {int(is_there.sum())} of {len(column)} messages are "
+            f"at {' or '.join(f'{end:.6g}' for end in ends)}, {what}, the first {first_s:.4g} s after "
+            "its first stamp",
+            otherwise="set the sensor to a larger range"
+            if is_range
+            else "if the sensor ends there, set it to a larger range; if the vehicle is limited there, "
+            "nothing is wrong",
+            severity=severity,
+            time_ns=first_ns,
+        )
+
+
+def _is_code(levels: Floats, at: int) -> bool:
+    """Test whether an end of sorted values is far from all others, like a code for a missing value."""
+    step = abs(levels[at] - levels[-2 if at else 1])
+    others = np.ptp(levels[:-1] if at else levels[1:])
+    return bool(len(levels) > 2 and step > FAR * others)
 
 
 def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> bool:

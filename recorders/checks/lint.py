@@ -70,6 +70,7 @@ OF_TOPIC: tuple[OfTopic, ...] = (
     magnetic.units,
     magnetic.iron,
     columns.codes,
+    columns.negative,
     columns.saturated,
     columns.frozen,
     columns.rounded,

@@ -53,7 +53,9 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             largest[0],
             f"latitude and longitude {what}: a latitude is {largest[0]:.6g} deg",
-            "in the mapping swap the sources of latitude_deg and longitude_deg",
+            "in the mapping swap the sources of latitude_deg and longitude_deg"
+            if is_exchanged
+            else "`units` of latitude_deg and longitude_deg in the mapping",
         )
     elif largest[1] > 180.0:
         yield _place(

@@ -304,7 +304,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         column(IMU, "turn_rate_radps", lambda w: np.clip(w, -0.015, 0.015)),
         IMU,
         "values",
-        "its greatest value",
+        "its greatest and its least value",
     ),
     "silent": (rows(IMU, lambda n: np.r_[0:3000, 3100:n]), IMU, "gap", "is silent for 1.0"),
     "clock 1e-4 fast": (drifting, FIX, "clock drift", "gains 100 us a second"),
@@ -407,6 +407,34 @@ def test_what_rests_or_is_skewed_is_not_saturated() -> None:
             turn_radps=turn,
         )
         assert not [each for each in lint([{"/odometry": wheels}]) if "saturated" in each.evidence]
+
+
+LANDMARKS = fl.record("landmarks", seed=5)
+WHEELS, RANGES = "/robot1/odometry", "/robot1/range_bearing"
+
+
+@pytest.mark.parametrize(
+    ("topic", "name", "change", "severity", "words"),
+    [
+        (
+            WHEELS,
+            "turn_radps",
+            lambda w: np.clip(w, *np.quantile(w, [0.1, 0.9])),
+            "hint",
+            "is saturated: 240 of 1200 messages are at 0.",
+        ),
+        (RANGES, "range_m", lambda r: np.where(np.arange(len(r)) % 50, r, -1.0), "likely", "a code"),
+        (RANGES, "range_m", lambda r: r - np.quantile(r, 0.001), "hint", "is negative in 3 of 2813"),
+    ],
+)
+def test_clipped_turns_and_negative_ranges_are_one_finding(
+    topic: str, name: str, change: Callable[[Any], Any], severity: str, words: str
+) -> None:
+    """The robot's speed is constant, so that no other column shows that it moves."""
+    assert lint([LANDMARKS.streams]) == []
+    [found] = lint([column(topic, name, change)({**LANDMARKS.streams})])
+    assert (found.kind, found.where, found.severity) == ("values", topic, severity)
+    assert words in found.evidence
 
 
 def test_rows_that_are_there_twice_are_counted() -> None:
