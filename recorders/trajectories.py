@@ -85,7 +85,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """The layout of a line: a description, the numbers it may have, and where position and time are."""
+    """The layout of a line: a description, the numbers it may have, and the columns of its parts."""
 
     columns: str
     least: int
@@ -121,14 +121,14 @@ LAYOUTS: dict[Format, _Layout] = {
 
 
 def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory:  # noqa: A002
-    """Read a trajectory file; poses that are not in the order of time are sorted, and a note says so.
+    """Read a trajectory file; poses that are not in the order of time are sorted, and a note reports it.
 
     Args:
         path: the file; empty lines and lines that begin with # are skipped.
         format: one of `Format`; by default it is recognised from the content.
 
     Returns:
-        The poses in the order of time; their `notes` say which format was read, and what was corrected.
+        The poses in the order of time; their `notes` state the format that was read, and corrections.
 
     Raises BadInput that names the line if the file is not a trajectory, or could have two formats.
     """

@@ -39,9 +39,9 @@ class Field:
     Attributes:
         name: name, with its unit.
         kind: type of the values.
-        may_be_nan: whether NaN stands for a missing value.
+        may_be_nan: whether NaN may mark a missing value.
         may_be_absent: whether older logs lack the field, so that readers must test for the column.
-        may_be_partial: whether NaN stands for a component of a measurement that was not measured.
+        may_be_partial: whether NaN may mark a single component that was not measured.
     """
 
     name: str

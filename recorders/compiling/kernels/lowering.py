@@ -1,7 +1,7 @@
 """Lowering of a function: its source is traversed once and written as LLVM IR.
 
 Statements are lowered here, expressions in `expressions`. A name with a single assignment before all of
-its uses stands for that value; other names are variables in memory, which LLVM turns into registers.
+its uses is replaced by the value; other names are variables in memory, which LLVM turns into registers.
 Known values are evaluated: an `if` with a known condition has one branch, and a loop over a tuple is
 unrolled.
 """
@@ -173,7 +173,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Lower `return`; the value may stay known outside of branches, otherwise it is in memory."""
+        """Lower `return`; outside of branches the value may remain known, otherwise it is in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it has made; pass one that it fills")

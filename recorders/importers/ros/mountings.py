@@ -69,7 +69,7 @@ class Mountings:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 
     def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
-        """Write that a frame moves on the body; empty if none of the bases carries it."""
+        """Write that a frame moves on the body; empty if it is connected to none of the bases."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:

@@ -1,4 +1,4 @@
-"""Guesses of a mapping to start from: the messages that columns hold, by their names and numbers.
+"""Guesses of a mapping to start from: the messages in columns, by their names and numbers.
 
 The mapping gives the reason for each guess in a comment; columns that fit no message become a vector of
 plain numbers. A person reads and corrects the mapping: the text is the result, not the import.
@@ -404,7 +404,7 @@ def _split(name: str, cells: pa.Array) -> list[str]:
 
 
 def _numbers(cells: pa.Array) -> NDArray | None:
-    """Read a column's numbers, NaN for empty cells; None if it holds anything else, or is empty."""
+    """Read a column's numbers, NaN for empty cells; None if it contains anything else, or is empty."""
     if pa.types.is_timestamp(cells.type):
         return None
     try:
@@ -415,7 +415,7 @@ def _numbers(cells: pa.Array) -> NDArray | None:
 
 
 def _sided(name: str, cells: pa.Array) -> NDArray | None:
-    """Read a column of positions such as 48.1N as signed numbers; None if it holds anything else."""
+    """Read a column of positions such as 48.1N as signed numbers; None if it contains anything else."""
     if not (re.search(_PLACE, parted(name)[0]) and pa.types.is_string(cells.type)):
         return None
     numbers, letters = sided(cells)

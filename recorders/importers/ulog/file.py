@@ -85,7 +85,7 @@ class UlogFile:
         texts: messages of the autopilot.
         dropouts: stamp and length in us of losses that the logger reported.
         rows: number of rows of each topic and instance so far.
-        losses: what could not be read, and how often.
+        losses: unreadable parts in words, with their numbers.
     """
 
     def __init__(self, path: Path) -> None:
