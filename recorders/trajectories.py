@@ -29,7 +29,7 @@ TOLERANCE = 1e-3
 NEARLY = 0.1
 # Stamps in s end in 2262. Steps in s are below the second of these, steps in ns above the third.
 MOST_S, SLOWEST_S, FASTEST_NS = 9.2e9, 1e4, 1e6
-_NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
+_NO_NS = "has a stamp that is not a whole number of ns; --format tum reads seconds"
 # Squares of larger positions, and sums of them, may overflow.
 FARTHEST_M = 1e100
 # For the last line of a text: a number that is cut off is still a number.

@@ -66,7 +66,7 @@ def _faults(
     size = isqrt(width)
     is_matrix = width > 3 and size * size == width
     diagonal = values[:, :: size + 1] if is_matrix else values
-    yield "-1, which stands for unknown", np.equal(diagonal[:, 0], -1.0)
+    yield "-1, which means unknown", np.equal(diagonal[:, 0], -1.0)
     yield "negative on its diagonal", np.less(diagonal.min(axis=1), 0.0)
     zero = np.equal(diagonal, 0.0)
     if not is_exact:  # for a position that is stated once, zero means exact

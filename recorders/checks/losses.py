@@ -70,8 +70,8 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         lost,
         f"{stream.topic}: loses {share} of its messages: steps are multiples of {usual_s:.3g} s, and "
         f"{int(is_gap.sum())} are longer than one, the first {_since(stream, first_ns)}; "
-        "a delay or noise that is found besides may come of it",
-        otherwise="look for them where the log is recorded",
+        "the losses may also explain a delay or a noise that is found",
+        otherwise="find the cause where the log is recorded",
         severity="likely" if is_sure else "hint",
         time_ns=first_ns,
     )

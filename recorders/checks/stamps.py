@@ -35,9 +35,9 @@ _CLOCKED = {
     schemas.ODOMETRY.full_name,
 }
 _USES = {
-    schemas.INERTIAL_SAMPLE.full_name: "estimators use the mean of both; deployed and foreign filters "
+    schemas.INERTIAL_SAMPLE.full_name: "estimators use the mean of both; deployed and external filters "
     "use them one by one, and one of the two may have no effect",
-    schemas.ODOMETRY.full_name: "the first of the two holds for no time, so it has no effect",
+    schemas.ODOMETRY.full_name: "the first of the two is valid for no time, so it has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 

@@ -43,9 +43,7 @@ def is_private(folder: Path) -> bool:
                 f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to your own"
             )
         else:
-            say_once(
-                f"the cache {place} is not used: other users may write to it; chmod go-w forbids them"
-            )
+            say_once(f"the cache {place} is not used: other users may write to it; run chmod go-w on it")
         return False
     return True
 

@@ -53,7 +53,7 @@ def read(folder: Path, parameters: MrclamParameters) -> Recording:
     Raises BadInput that names the file and line if a file is missing or malformed.
     """
     if not folder.is_dir():
-        raise BadInput(f"{folder}: not a folder; give the folder that holds Barcodes.dat")
+        raise BadInput(f"{folder}: not a folder; give the folder that contains Barcodes.dat")
     barcodes = _table(folder / "Barcodes.dat", 2, identifiers=(0, 1))
     landmarks = _table(folder / "Landmark_Groundtruth.dat", 5, identifiers=(0,))
     robots = _robots(folder)

@@ -267,7 +267,7 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
     if not is_kept:
         lost = given[np.argmax(column != given)]
         raise BadInput(
-            f"{what} holds {lost}, which {dtype.name} cannot hold; round the values, or scale them "
+            f"{what} contains {lost}, which {dtype.name} cannot store; round the values, or scale them "
             "into its range"
         )
     return column

@@ -50,7 +50,7 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
     known: dict[tuple, Reader | str] = {}
     for each in connections:
         if parameters.topics and each.topic not in parameters.topics:
-            found.not_taken[each.topic] = f"{each.type_name}, not asked for"
+            found.not_taken[each.topic] = f"{each.type_name}, not requested"
             continue
         key = (each.type_name, each.encoding, each.definition, each.topic.endswith("_static"))
         if key not in known:

@@ -64,7 +64,7 @@ class Mountings:
                 mounting = _settings([f"mounting_{each}_rad" for each in turns], angles)
                 uses = [f"{mounting} for the model inertial"] * bool(mounting)
                 where = "{:.4g}, {:.4g}, {:.4g} deg".format(*np.degrees(angles))
-                what = f"{frame} is turned by roll, pitch, yaw {where} in {base}"
+                what = f"{frame} is rotated by roll, pitch, yaw {where} in {base}"
             if uses:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 

@@ -121,8 +121,8 @@ def _warnings(text: str) -> Iterator[str]:
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
         yield f"# The topics are in {len(namespaces)} namespaces, {', '.join(namespaces)}."
-        yield "# They are taken as one vehicle's unless a kind of topic occurs twice; better give all"
-        yield "# topics of a vehicle one namespace, such as /car/odometry, /car/fix and /car/truth."
+        yield "# They are treated as those of one vehicle unless a kind of topic occurs twice. Better"
+        yield "# use one namespace for a vehicle, as in /car/odometry, /car/fix and /car/truth."
     becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
     if {"GeodeticFix", "TruthState"} <= {*becomes}:
         yield "# The truth is in a local tangent plane, but fixes are latitudes and longitudes."
