@@ -7,8 +7,8 @@ While something is being written, it is in a working folder next to its destinat
         new.SUFFIX         the file or folder being written, renamed to NAME when it is complete
         old                the folder that NAME replaces, between the two renames
 
-Two writers of one destination never touch each other's working folder. The next writer removes what a
-killed writer left, but only if the lock is free and the folder contains nothing else.
+Two writers of one destination never touch each other's working folder. The next writer removes the
+leftovers of a killed writer, but only if the lock is free and the folder contains nothing else.
 """
 
 import logging
@@ -111,7 +111,7 @@ def _working_folder(place: Path) -> Iterator[Path]:
 
 
 def is_being_written(file: Path) -> bool:
-    """Test whether a file is in a working folder: a partial output, or the lock."""
+    """Test whether a file is in a working folder, as a partial output or the lock."""
     return any(
         each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
         for each in file.parents
@@ -131,7 +131,7 @@ def _make(place: Path) -> tuple[Path, FileLock]:
 
 
 def _clear_leftovers(place: Path) -> bool:
-    """Remove what killed writers of a destination left; return whether a writer is active."""
+    """Remove leftovers of killed writers of a destination; return whether a writer is active."""
     at_work = False
     for work in place.parent.glob(f".{escape(place.name)}.*.part"):
         if "." in work.name.removeprefix(f".{place.name}.").removesuffix(".part"):
@@ -155,7 +155,7 @@ def _clear_leftovers(place: Path) -> bool:
 
 
 def _is_ours(work: Path) -> bool:
-    """Test whether a folder belongs to this user and contains only what working folders contain."""
+    """Test whether a folder belongs to this user and has only the entries of a working folder."""
     try:
         state = work.lstat()
         if not stat.S_ISDIR(state.st_mode) or (hasattr(os, "geteuid") and state.st_uid != os.geteuid()):

@@ -80,7 +80,7 @@ def outage_stream(topic: str, spans_ns: NDArray[np.int64]) -> Stream:
 
     Args:
         topic: name of the topic.
-        spans_ns: (n, 2) begins and ends, in ns.
+        spans_ns: (n, 2) starts and ends, in ns.
     """
     return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
 

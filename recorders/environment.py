@@ -12,7 +12,7 @@ CORES = "NUMBA_NUM_THREADS"
 
 
 def is_on(name: str) -> bool:
-    """Test whether a switch is 1."""
+    """Test whether a variable is 1."""
     return os.environ.get(name) == "1"
 
 
@@ -22,7 +22,7 @@ def is_set(name: str) -> bool:
 
 
 def core_count() -> int | None:
-    """Return the number of cores that kernels may use, or None if the variable does not state it."""
+    """Return the number of cores that kernels may use, or None if the variable is not set."""
     stated = os.environ.get(CORES, "")
     return int(stated) if _is_count(stated) and int(stated) > 0 else None
 
@@ -49,7 +49,7 @@ def check() -> None:
     """Raise BadInput if a variable has an invalid value.
 
     Variables that would disturb commands are removed: MPLBACKEND selects a window system, RERUN disables
-    drawings that a command was asked for, and RERUN_FLUSH_... controls how rows are batched.
+    drawings that the user requested, and RERUN_FLUSH_... controls how rows are batched.
     """
     for name, (is_valid, expected) in _EXPECTED.items():
         stated = os.environ.get(name)

@@ -172,7 +172,7 @@ def in_few_words(meaning: str) -> str:
 
 
 def _prose(kind: type[BaseModel]) -> str:
-    """Join what the docstrings of a type and its bases say apart from `Attributes:`."""
+    """Join the docstrings of a type and its bases, without `Attributes:`."""
     texts = [
         _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
         for each in reversed(kind.__mro__)
@@ -193,7 +193,7 @@ class Parameter(NamedTuple):
         low, high: bounds of a number, or of the range in which it is varied.
         is_log: whether the logarithm is varied.
         is_assumed: whether the value comes neither from a setting nor from the log.
-        useful: standard error that a calibration aims at; zero if there is none.
+        useful: standard error that is sufficient for a calibration; zero if there is none.
         group: heading under which it is shown, such as a topic.
     """
 
@@ -256,7 +256,7 @@ def _tables(
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
 ) -> Iterator[Parameter]:
-    """Walk a JSON schema; `given` holds defaults that the enclosing table states for this one."""
+    """Walk a JSON schema; `given` contains the defaults that the enclosing table states for this one."""
     for name, entry in table["properties"].items():
         value = given.get(name, entry.get("default"))
         below = next(_below(entry, definitions, f"{prefix}{name}"), None)
@@ -329,7 +329,7 @@ _SIGNS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "ma
 
 
 def field_of(key: str) -> str:
-    """Return the field that holds a number; numbers of a topic are set as TOPIC.NAME.
+    """Return the name of the field for a number; numbers of a topic are set as TOPIC.NAME.
 
     >>> field_of("/gps2/fix.lever_x_m"), field_of("lever_x_m")
     ('gps2_fix_lever_x_m', 'lever_x_m')
@@ -354,7 +354,7 @@ def numbers_of(kind: type[Parameters]) -> dict[str, Parameter]:
 
 
 def number_of(kind: type[BaseModel], name: str) -> Parameter:
-    """Describe one number of a type by its full name; `NAME` may stand for the user's name of a table.
+    """Describe one number of a type by its full name, in which `NAME` may replace a table's own name.
 
     Raises BadInput if the type has no number of this name.
     """
@@ -386,7 +386,7 @@ _OTHERS = "additionalProperties"  # the key of JSON schemas for tables with user
 
 
 def nested(name: str, value: Any) -> dict[str, Any]:
-    """Build the nested tables that hold a value of this full name.
+    """Build the nested tables that contain a value of this full name.
 
     >>> nested("range.rate_hz", 5.0)
     {'range': {'rate_hz': 5.0}}

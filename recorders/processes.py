@@ -1,6 +1,6 @@
 """Start of further Python processes that import nothing from the current folder.
 
-`python -m` and `python -c` put the current folder first on Python's path. In a folder of somebody else,
+`python -m` and `python -c` put the current folder first on Python's path. In another user's folder,
 a file such as `random.py` would then replace the module of the standard library.
 """
 
@@ -67,7 +67,7 @@ def keep_off_settings_here() -> None:
 
     matplotlib reads its file once, on import, so it is imported from another folder.
 
-    Raises BadInput if the folder holds settings that numba would use.
+    Raises BadInput if the folder contains settings that numba would use.
     """
     if os.path.lexists(_OF_NUMBA):
         raise BadInput(

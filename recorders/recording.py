@@ -29,7 +29,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     Returns:
         Stamps of the same shape, in ns.
 
-    Raises BadInput if a log cannot hold one of the stamps.
+    Raises BadInput if a log cannot store one of the stamps.
     """
     with np.errstate(over="ignore"):
         elapsed_ns = np.rint(np.asarray(elapsed_s, float) * 1e9)

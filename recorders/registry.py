@@ -1,9 +1,9 @@
 """Lookup of recorders, estimators, metrics and studies by name.
 
-Ours and those of third parties register in the same way: as entry points of an installed distribution
-(groups `fuselog.recorders`, `fuselog.models`, `fuselog.estimators`, `fuselog.judges`, `fuselog.metrics`,
-`fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`). Listing names does not
-import anything.
+Those of fuselog and of third parties register in the same way: as entry points of an installed
+distribution (groups `fuselog.recorders`, `fuselog.models`, `fuselog.estimators`, `fuselog.judges`,
+`fuselog.metrics`, `fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`).
+Listing names does not import anything.
 """
 
 from collections.abc import Iterator

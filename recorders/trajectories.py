@@ -29,7 +29,7 @@ TOLERANCE = 1e-3
 NEARLY = 0.1
 # Stamps in s end in 2262. Steps in s are below the second of these, steps in ns above the third.
 MOST_S, SLOWEST_S, FASTEST_NS = 9.2e9, 1e4, 1e6
-_NO_NS = "has a stamp that is no whole number of ns; --format tum reads seconds"
+_NO_NS = "has a stamp that is not a whole number of ns; --format tum reads seconds"
 # Squares of larger positions, and sums of them, may overflow.
 FARTHEST_M = 1e100
 # For the last line of a text: a number that is cut off is still a number.
@@ -85,7 +85,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """The layout of a line: a description, the numbers it may have, and where position and time are."""
+    """The layout of a line: a description, the numbers it may have, and the columns of its parts."""
 
     columns: str
     least: int
@@ -121,14 +121,14 @@ LAYOUTS: dict[Format, _Layout] = {
 
 
 def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory:  # noqa: A002
-    """Read a trajectory file; poses that are not in the order of time are sorted, and a note says so.
+    """Read a trajectory file; poses that are not in the order of time are sorted, and a note reports it.
 
     Args:
         path: the file; empty lines and lines that begin with # are skipped.
         format: one of `Format`; by default it is recognised from the content.
 
     Returns:
-        The poses in the order of time; their `notes` say which format was read, and what was corrected.
+        The poses in the order of time; their `notes` state the format that was read, and corrections.
 
     Raises BadInput that names the line if the file is not a trajectory, or could have two formats.
     """

@@ -120,7 +120,7 @@ def mistaken(unit_: str) -> dict[str, float]:
 def conversion(given: str, name: str, *, is_root: bool = False) -> float:
     """Compute the factor that converts numbers in a unit to the unit of the field or component `name`.
 
-    `is_root` says that the numbers are square roots, such as the standard deviations for a covariance.
+    With `is_root` the numbers are square roots, such as the standard deviations for a covariance.
 
     Raises BadInput if the text is not a unit, or measures another quantity.
 

@@ -1,8 +1,7 @@
 """The motion of a body according to its topics: positions, velocities, wheels, turns.
 
-All values are columns over time in seconds since the log's first stamp. Values are integrated, whether
-they hold until the next message or are samples, so the distance and turn of a window need no common
-stamps.
+All values are columns over time in seconds since the log's first stamp. Both held values and samples
+are integrated over time, so distances and turns can be compared over windows without common stamps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +25,7 @@ class Series:
         topic, field: where the quantity comes from.
         times_s: stamps (n,), which increase.
         values: (n,) or (n, m).
-        holds: whether a value holds until the next one; otherwise it is a sample.
+        holds: whether a value is valid until the next one; otherwise it is a sample.
     """
 
     topic: str
@@ -57,7 +56,7 @@ class Series:
 class PlaceSeries(Series):
     """Positions (n, 2) east and north, or along x and y, with their stated variances (n,).
 
-    `is_flat` says that they are in metres and not latitudes, so they may have a scale error.
+    If `is_flat`, they are in metres and not latitudes and longitudes, so they may have a scale error.
     """
 
     variances_m2: Floats = field(default_factory=lambda: np.empty(0))
@@ -90,7 +89,7 @@ class Body:
 
     @property
     def roles(self) -> list[Sequence[Series]]:
-        """Return all lists."""
+        """Return the topics of every role."""
         measured = self.rates, self.forces, self.orientations, self.references
         return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
 
@@ -98,8 +97,8 @@ class Body:
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
     """Group topics by body: one per namespace, or a single one if no role occurs twice.
 
-    A namespace within another also has the topics of that one: a unit `/imu2/inertial` moves as `/fix`
-    says.
+    A namespace within another also has the topics of that one: the body of `/imu2/inertial` also has
+    the positions of `/fix`.
     """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0

@@ -11,7 +11,10 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
 
 Floats = NDArray[np.float64]
-LONG, TIMES = 10, 10.0  # rows, and times the usual run, for which a value may stay the same
+LONG, TIMES = (
+    10,
+    10.0,
+)  # number of rows, and multiple of the usual run, for which a value may stay the same
 NEXT = 2.5  # grid steps within which a value is a neighbour
 MOVING = 0.5  # share of the rows of a span in which another column changes
 LOOKED_AT = 20_000  # rows from which a resolution is determined
@@ -34,7 +37,7 @@ _DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # where exact z
 
 
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a value that stays far longer than usual in its column, while other columns change.
+    """Find a value that stays the same far longer than usual, while other columns change.
 
     A rounded column that continues within two grid steps of the value was at rest, and not frozen.
     """
@@ -68,7 +71,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a number that recurs, far from the messages before and after it."""
+    """Find a number that recurs although it is far from the values before and after it."""
     entries = [(*each, np.inf) for each in _entries(stream) if each[0] not in RANGES]
     if stream.schema.full_name == schemas.ORIENTATION.full_name:
         entries = [("quaternion", "the heading in rad", heading(stream["quaternion"]), np.pi)]
@@ -135,13 +138,13 @@ def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _apart(steps: Floats, half_turn: float) -> Floats:
-    """Return the sizes of steps; for angles, the shorter way round."""
+    """Return the sizes of steps; for angles, the smaller of both directions."""
     sizes = np.abs(steps)
     return sizes if half_turn == np.inf else np.minimum(sizes, 2 * half_turn - sizes)
 
 
 def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find columns on a grid that is wider than their noise."""
+    """Find columns that are rounded to a grid coarser than their noise."""
     for field, name, column in _entries(stream):
         known = column[:LOOKED_AT][np.isfinite(column[:LOOKED_AT])]
         step = resolution(known)
@@ -164,7 +167,7 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find columns at the end of a usual range, or clipped at a value of their own.
+    """Find columns that are clipped at the end of a common sensor range, or at another value.
 
     A body at rest has constant values in all of its columns; exact zeros are standstills.
     """
@@ -248,7 +251,7 @@ def _is_clipped(
 
 
 def resolution(values: Floats) -> float:
-    """Determine the grid on which all values are; zero if there is none."""
+    """Determine the spacing of the grid on which all values are; zero if there is none."""
     levels = np.unique(values)
     if len(levels) < LEVELS or len(levels) > len(values) / 2:
         return 0.0
@@ -279,7 +282,7 @@ def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, 
 
 
 def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Test which runs of equal values are due to a grid, with neighbours within its next steps."""
+    """Test which runs of equal values result from rounding, by the grid steps to their neighbours."""
     steps = np.abs(np.diff(column[edges]))
     farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
     levels = np.unique(column[np.isfinite(column)])

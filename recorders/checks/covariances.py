@@ -1,4 +1,4 @@
-"""Checks of covariances: impossible matrices, and numbers that stand for unknown."""
+"""Checks of covariances: impossible matrices, and numbers that mean "unknown"."""
 
 from collections.abc import Iterator, Mapping
 from math import isqrt
@@ -57,16 +57,16 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def _faults(
     values: NDArray[np.float64], *, is_partial: bool, is_exact: bool
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each fault with the rows (n,) that have it, the plainest first.
+    """Yield each fault with the rows (n,) that have it, the most obvious first.
 
-    `is_partial` says that zero may stand for a component that does not exist or is known exactly,
-    `is_exact` that it may do so for all.
+    With `is_partial`, zero may mean that a component does not exist or is known exactly. With
+    `is_exact`, it may mean this for all components.
     """
     width = values.shape[1]
     size = isqrt(width)
     is_matrix = width > 3 and size * size == width
     diagonal = values[:, :: size + 1] if is_matrix else values
-    yield "-1, which stands for unknown", np.equal(diagonal[:, 0], -1.0)
+    yield "-1, which means unknown", np.equal(diagonal[:, 0], -1.0)
     yield "negative on its diagonal", np.less(diagonal.min(axis=1), 0.0)
     zero = np.equal(diagonal, 0.0)
     if not is_exact:  # for a position that is stated once, zero means exact

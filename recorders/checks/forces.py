@@ -45,7 +45,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose z axis is not up at rest, in logs without orientations to explain it."""
+    """Find units whose z axis is not up at rest, unless orientations in the log explain it."""
     if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
         return
     if any(_turns(each) for each in streams.values()):
@@ -86,5 +86,5 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _turns(stream: Stream) -> bool:
-    """Test whether a topic states how a body is oriented in space."""
+    """Test whether a topic states the orientation of a body in space."""
     return "quaternion" in stream.columns or "quaternion" in stream.metadata.get("kinds", "")

@@ -164,7 +164,7 @@ def _speed(stream: Stream) -> float:
 
 
 def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps before 2000 that do not count from 1970, days in steps of months, and zones."""
+    """Find stamps before 2000 that do not count from 1970, swapped days and months, and time zones."""
     first_ns, last_ns = int(stream.publish_time_ns.min()), int(stream.publish_time_ns.max())
     if EARLIEST_NS < first_ns < LATEST_NS:
         yield _stamps(

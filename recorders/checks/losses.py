@@ -70,15 +70,15 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         lost,
         f"{stream.topic}: loses {share} of its messages: steps are multiples of {usual_s:.3g} s, and "
         f"{int(is_gap.sum())} are longer than one, the first {_since(stream, first_ns)}; "
-        "a delay or noise that is found besides may come of it",
-        otherwise="look for them where the log is recorded",
+        "the losses may also explain a delay or a noise that is found",
+        otherwise="find the cause where the log is recorded",
         severity="likely" if is_sure else "hint",
         time_ns=first_ns,
     )
 
 
 def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find the longest silence, except of sensors of targets and in outages that the log states."""
+    """Find the longest silence of a topic, except of sensors of targets and in stated outages."""
     begin_ns, steps_s = _steps(stream, streams)
     if len(steps_s) < FEWEST or "target_id" in stream.columns:
         return
@@ -159,7 +159,7 @@ def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find clocks of topics that differ from the recorder's: all alike, as in simulations, or one."""
+    """Find clocks at another rate than the recorder's: of all topics, as in simulations, or of one."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }

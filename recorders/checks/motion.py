@@ -119,7 +119,7 @@ def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 class Lag(NamedTuple):
-    """A topic, another one that it was compared with, and how much later that one is."""
+    """The delay of the topic `against` relative to the topic `source`."""
 
     source: str
     against: str
@@ -218,7 +218,7 @@ class BodyMotion:
         return source.moved(self.delays_s.get(source.topic, 0.0))
 
     def likened(self, source: Series) -> Series:
-        """Shift a turn rate to the clock at which it agrees best with the course, delay or not."""
+        """Shift a turn rate to the time at which it agrees best with the course."""
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
@@ -248,8 +248,9 @@ class BodyMotion:
     def turn(self, source: Series) -> Slope | None:
         """Compute how much the course turns for each radian of a turn rate.
 
-        If it correlates with the course as it is, no lag is needed: half a period of a winding road is
-        not a lag. If several lags fit better, some with opposite signs, the sign is unknown.
+        If it correlates with the course without a lag, no lag is used, since half a period of a
+        winding road would look like a lag. If several lags fit better, some with opposite signs, the
+        sign is unknown.
         """
         if self.courses is None:
             return None
@@ -332,9 +333,9 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 
 
 class Forces(NamedTuple):
-    """The angle (rad) that rotates horizontal forces to those of the course.
+    """The angle (rad) by which horizontal forces have to be rotated to match the course.
 
-    `fit` is how well they then match, up to 1, and `mirrored` how well their mirror image would.
+    `fit` states how well the rotated forces match, up to 1, `mirrored` the same for their mirror image.
     """
 
     angle_rad: float

@@ -22,11 +22,11 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 stream.topic,
                 "",
                 0.0,
-                f"{stream.topic}: its {key} {stream.metadata[key]} says {kind}, but REP 103 and fuselog "
-                f"have {ours}",
+                f"{stream.topic}: its {key} {stream.metadata[key]} means {kind}, but REP 103 and "
+                f"fuselog use {ours}",
                 otherwise="mounting_deg = [180, 0, 0] in the mapping"
                 if kind == "FRD"
-                else "in the mapping swap north and east, and give down the factor -1",
+                else "in the mapping swap north and east, and use the factor -1 for down",
                 severity="hint",
             )
 
@@ -50,7 +50,7 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a topic alone in its namespace that duplicates another one, so that replay may ignore it."""
+    """Find a topic alone in its namespace that duplicates another one, so a replay may ignore it."""
     sensed = [each for each in streams.values() if each.schema.full_name in REGULARS]
     alike = [each for each in sensed if each.schema.full_name == stream.schema.full_name]
     if stream.schema.full_name not in REGULARS or len(alike) != 2:

@@ -105,7 +105,7 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
 
 
 def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find altitudes that leap faster than anything climbs, as when their reference changes."""
+    """Find altitudes that change faster than any vehicle climbs, as when their reference changes."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     rows = np.flatnonzero(np.isfinite(stream["altitude_m"]))

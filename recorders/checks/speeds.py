@@ -24,7 +24,7 @@ LEAST_RATIO = 1.5  # of variances: a difference that matters
 
 
 def leaps(motion: BodyMotion) -> Iterator[Finding]:
-    """Find positions that jump while a speed says that the body moves as usual."""
+    """Find positions that jump while a speed shows that the body moves as usual."""
     sources = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         steps_m = np.linalg.norm(np.diff(fixes.values, axis=0), axis=1)
@@ -161,7 +161,7 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def scatter(fixes: PlaceSeries, source: Series) -> tuple[float, int, float] | None:
-    """Compute the scatter of fixes while a speed says that the body is at rest.
+    """Compute the scatter of fixes while a speed shows that the body is at rest.
 
     Returns the variance as a multiple of the stated one, its degrees of freedom, and the correlation of
     successive errors; None if the body does not rest, or no variance is stated.

@@ -15,7 +15,7 @@ SLOWEST_HZ, FASTEST_HZ = 0.5, 2e4  # for inertial units
 FASTEST_FIX_HZ = 500.0
 LEAP_TOLERANCE_S, ZONE_TOLERANCE_S = 0.6, 1.0
 FAR_H = 14  # the largest difference of local clocks from UTC
-# How many seconds GPS time is ahead of UTC, by Unix time in s since when.
+# Seconds by which GPS time is ahead of UTC, by the Unix time in s from which this is valid.
 GPS_LEAPS = {
     915148800: 13,
     1136073600: 14,
@@ -35,9 +35,9 @@ _CLOCKED = {
     schemas.ODOMETRY.full_name,
 }
 _USES = {
-    schemas.INERTIAL_SAMPLE.full_name: "estimators use the mean of both; deployed and foreign filters "
+    schemas.INERTIAL_SAMPLE.full_name: "estimators use the mean of both; deployed and external filters "
     "use them one by one, and one of the two may have no effect",
-    schemas.ODOMETRY.full_name: "the first of the two holds for no time, so it has no effect",
+    schemas.ODOMETRY.full_name: "the first of the two is valid for no time, so it has no effect",
 }
 _FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
 
@@ -196,7 +196,7 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:
-    """Return the thing (n,) of every message, if another topic states it by row; else zeros."""
+    """Return the `thing_id` (n,) of every message, if another topic states it row by row; else zeros."""
     for each in streams.values():
         is_named = each.schema.full_name == schemas.IDENTITY.full_name
         if is_named and np.array_equal(each.publish_time_ns, stream.publish_time_ns):

@@ -30,11 +30,11 @@ class Timing(NamedTuple):
         gain: gain of the source's clock, in s/s.
         likeness: correlation at this lag and gain, -1 to 1.
         evidence: log-likelihood minus that without lag and gain.
-        is_needed: whether without a lag more than a misfit of the motion is left unexplained.
+        is_needed: whether, without a lag, more of the motion than a misfit remains unexplained.
         tolerance_s: lags up to this size are ignored.
         spread_s: largest difference of equally likely lags, plus the tolerance.
-        is_alone: whether only neighbouring lags explain the motion as well, and none a period of the
-            motion away.
+        is_alone: whether only neighbouring lags explain the motion equally well, and no lag that is a
+            period of the motion away.
     """
 
     lag_s: float

@@ -67,7 +67,7 @@ def _by_forces(motion: BodyMotion, source: Series) -> int:
 
 
 def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """Report which of a rate and a frame is mirrored; a witness that agrees with the rate clears it."""
+    """Report that a rate or a frame is mirrored: the frame, if a witness confirms the rate."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"

@@ -1,4 +1,4 @@
-"""Windows of a motion: how far and by what angle positions move, and what another topic says."""
+"""Windows of a motion: the distance and angle by which positions or other topics move in each."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ CLEAR = 12.0  # times the noise of a position: the least length of a clear move
 WANDERS = 3.0  # stated standard deviations, within which a body counts as at rest
 JUMP = 5.0  # times the noise of a position, and times the length of nearly all steps
 JUMP_STEPS = 2.0
-JUMPS = 0.05  # share of the steps; if there are more, the body moves so
+JUMPS = 0.05  # share of the steps; if there are more, they are the body's motion
 ASTRAY_S = 10.0  # before and after a jump
 NEAR = 4  # steps on either side, with whose median velocity a step is compared
 MOST = 2000  # windows; more are thinned
@@ -22,7 +22,7 @@ MOST = 2000  # windows; more are thinned
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows (k,) from one stamp to a later one, and what was measured in each."""
+    """Windows (k,) from one stamp to a later one, and the values measured in each."""
 
     begin_s: Floats
     end_s: Floats
@@ -73,7 +73,7 @@ def jumps(fixes: Series) -> NDArray[np.bool_]:
     """Find the steps (n - 1,) between positions that are jumps of the receiver.
 
     A jump is a single step that differs from its neighbours by more than the noise, and is longer than
-    nearly all steps. Several in one direction are a motion, and so are many.
+    nearly all steps. Several long steps in one direction, or many of them, are motion and not jumps.
     """
     steps, step_s = np.diff(fixes.values, axis=0), np.diff(fixes.times_s)
     if len(steps) < FEWEST:

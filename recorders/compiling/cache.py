@@ -43,9 +43,7 @@ def is_private(folder: Path) -> bool:
                 f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to your own"
             )
         else:
-            say_once(
-                f"the cache {place} is not used: other users may write to it; chmod go-w forbids them"
-            )
+            say_once(f"the cache {place} is not used: other users may write to it; run chmod go-w on it")
         return False
     return True
 
@@ -114,7 +112,7 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
 
 @contextmanager
 def in_turn(path: Path) -> Iterator[bool]:
-    """Wait until no other process makes this file; yield whether one did, so that it may exist now.
+    """Wait until no other process makes this file; yield whether one did, so the file may exist now.
 
     The lock is released when its process ends. If a process keeps the lock for very long, or the disk
     does not support locks, the work is done twice, which is harmless.

@@ -118,7 +118,7 @@ class OverRuns:
         scratch: Callable[[], KernelArgument] | None = None,
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
-        """Process all runs; in plain Python, NaN and infinity raise no errors either."""
+        """Process all runs; NaN and infinity raise no errors, in plain Python either."""
         if self.compiled_loop is not None and not is_uncompiled():
             with done_once():
                 loop = self.compiled_loop()  # imports modules at first use
@@ -214,7 +214,7 @@ def core_count() -> int:
 
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Make the threads besides the calling one; a forked process gets its own."""
+    """Make the threads in addition to the calling one; a forked process gets its own."""
     return ThreadPoolExecutor(max(1, core_count() - 1))
 
 

@@ -1,7 +1,7 @@
 """Description of a function as text: its code, its constants, and all functions that it calls.
 
-Functions with the same description do the same. It is made from bytecode, closures and the globals that
-the function names, without reading sources.
+Functions with the same description behave identically. The description is made from bytecode, closures
+and the globals that the function names, without reading sources.
 """
 
 import sys

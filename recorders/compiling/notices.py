@@ -1,4 +1,4 @@
-"""Notices about long compilations, and measurement of the time that a thread spends only once."""
+"""Notices about long compilations, and measurement of a thread's time for one-time work."""
 
 import logging
 import sys

@@ -88,7 +88,7 @@ class StreamMapping(Parameters):
             2, 1 and 3, 2 and 3.
         inflated: conditions under which standard deviations are larger than stated.
         where: for each source the values that a row must have to be imported.
-        missing: numbers that stand for a missing value.
+        missing: numbers that mark a missing value.
         each: makes one message for each of these entries from every row, with further fields.
         mounting_deg: roll, pitch, yaw that rotate the sensor's axes into the body's (Rz Ry Rx); vectors
             are rotated, and orientations become the body's.
@@ -142,7 +142,7 @@ class StreamMapping(Parameters):
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:
-    """Return the message that a mapping makes; raise BadInput if the message or a field is unknown."""
+    """Return the schema of a mapping's messages; raise BadInput if the message or a field is unknown."""
     known = {schema.name: schema for schema in schemas.SCHEMAS.values()}
     if mapping.becomes not in known:
         raise BadInput(
@@ -308,7 +308,7 @@ def _all_hold(where: Mapping[str, OneOrMore[Source]], size: int, holds: Holds) -
 
 
 def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, where: str) -> None:
-    """Turn what is in the sensor's axes into the body's."""
+    """Rotate vectors and orientations from the sensor's axes to the body's."""
     turn = Rotation.from_euler("xyz", mapping.mounting_deg, degrees=True)
     vectors, covariance = _IN_BODY.get(schema.name, ((), ""))
     for name in vectors:

@@ -1,7 +1,7 @@
 """Importer of UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
 
 K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011. A
-folder holds Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and
+folder contains Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and
 measurements as text columns.
 """
 
@@ -53,7 +53,7 @@ def read(folder: Path, parameters: MrclamParameters) -> Recording:
     Raises BadInput that names the file and line if a file is missing or malformed.
     """
     if not folder.is_dir():
-        raise BadInput(f"{folder}: not a folder; give the folder that holds Barcodes.dat")
+        raise BadInput(f"{folder}: not a folder; give the folder that contains Barcodes.dat")
     barcodes = _table(folder / "Barcodes.dat", 2, identifiers=(0, 1))
     landmarks = _table(folder / "Landmark_Groundtruth.dat", 5, identifiers=(0,))
     robots = _robots(folder)
@@ -127,7 +127,7 @@ def _robot_streams(
 
 
 def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """Read the numbers of one file, (rows, columns); some columns hold whole numbers of 32 bits."""
+    """Read the numbers of one file, (rows, columns); some columns contain whole numbers of 32 bits."""
     try:
         table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
     except FileNotFoundError:

@@ -1,6 +1,6 @@
 """The log format: schemas, columns, and the reading and writing of MCAP files.
 
-Begin with `streams`, which holds a topic in memory, then `reader` and `writer`.
+Begin with `streams`, which defines a topic in memory, then `reader` and `writer`.
 """
 
 from fuselog.recorders.log.container.reading import NotMcap

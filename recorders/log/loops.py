@@ -29,8 +29,8 @@ class Scan(NamedTuple):
     """The result of a walk over a chunk's records; offsets in bytes, times in ns.
 
     `messages` are grouped by channel, each group in file order, and `counts` has the number of each
-    channel's messages. `end` is where the walk stopped: the chunk's length, or the first incomplete
-    record.
+    channel's messages. `end` is the position at which the walk stopped: the chunk's length, or the first
+    incomplete record.
     """
 
     messages: NDArray[np.int64]

@@ -94,7 +94,7 @@ def in_frame(frame: str) -> dict[str, str]:
 
 
 def body_of(topic: str, metadata: Mapping[str, str]) -> str:
-    """Name the frame whose pose the states of a topic are: as stated, or the topic's namespace.
+    """Return the frame whose pose a topic's states describe: as stated, or the topic's namespace.
 
     >>> body_of("/radar/truth", {})
     'radar'

@@ -1,4 +1,4 @@
-"""Reader of logs as columns, block by block in time order; memory holds a few blocks."""
+"""Reader of logs as columns, block by block in time order, with only a few blocks in memory."""
 
 import sys
 from collections import Counter
@@ -19,7 +19,7 @@ from fuselog.recorders.log.decoding import Decoder
 from fuselog.recorders.log.opening import Log
 from fuselog.recorders.log.streams import Clock, Stream, check_stream, concatenate
 
-# Contains every stamp that MCAP can hold.
+# Contains every stamp that MCAP can store.
 _ALWAYS = Span(-1, 1 << 64)
 
 
@@ -91,7 +91,7 @@ def read_blocks(
 ) -> Iterator[dict[str, Stream]]:
     """Read topics in blocks that follow one another in time.
 
-    Every block holds all messages of its span, sorted by the clock `order`, with equal stamps in file
+    Every block contains all messages of its span, sorted by the clock `order`, with equal stamps in file
     order; messages with equal stamps are in one block. Topics without messages in a block are absent
     from it.
 
@@ -149,7 +149,7 @@ def _reading(log: Log) -> Iterator[BinaryIO]:
 
 
 def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) -> list[_Ranked]:
-    """Choose the regions that may hold requested messages, in the order of their beginnings in time."""
+    """Choose the regions that may contain requested messages, in the order of their start times."""
     wanted = {identifier for topic in topics for identifier in log.topics[topic].channel_ids}
     chosen = []
     for rank, region in enumerate(log.container.regions):

@@ -16,7 +16,7 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class RunMetadata:
-    """How one run was recorded.
+    """The facts from which one run can be recorded again.
 
     Attributes:
         scenario: name of the scenario or importer.

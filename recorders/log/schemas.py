@@ -39,9 +39,9 @@ class Field:
     Attributes:
         name: name, with its unit.
         kind: type of the values.
-        may_be_nan: whether NaN stands for a missing value.
+        may_be_nan: whether NaN may mark a missing value.
         may_be_absent: whether older logs lack the field, so that readers must test for the column.
-        may_be_partial: whether NaN stands for a component of a measurement that was not measured.
+        may_be_partial: whether NaN may mark a single component that was not measured.
     """
 
     name: str
@@ -205,7 +205,7 @@ LINE_OF_SIGHT = _declare(
 )
 MOVING_LINE_OF_SIGHT = _declare(
     "MovingLineOfSight",
-    "Azimuth and elevation of one target in the frame of a sensor that moves, and its pose then.",
+    "Azimuth and elevation of one target in the frame of a moving sensor, and the sensor's pose.",
     _identifier("target_id"),
     _real("azimuth_rad"),
     _real("elevation_rad"),
@@ -214,7 +214,7 @@ MOVING_LINE_OF_SIGHT = _declare(
 )
 SHOT_DETECTION = _declare(
     "ShotDetection",
-    "One shot heard by one sensor; the shockwave is missing where it cannot be heard.",
+    "One shot heard by one sensor; the shockwave is missing if the sensor cannot hear it.",
     _identifier("shot_id"),
     _real("muzzle_blast_azimuth_rad"),
     _real("shockwave_azimuth_rad", may_be_nan=True),
@@ -223,8 +223,8 @@ SHOT_DETECTION = _declare(
 SHOT_REPORT = _declare(
     "ShotReport",
     "Report of one of several sensors on a shot: the direction of the muzzle blast, the direction of "
-    "the shockwave, and the time by which the shockwave arrived earlier. Which of the two times is set "
-    "shows from which side of the muzzle blast the shockwave came.",
+    "the bullet, and the time by which the shockwave arrived earlier. This time is in `left_lead_s` or "
+    "`right_lead_s`, by the side of the muzzle blast from which the shockwave came.",
     _identifier("sensor_id"),
     _real("muzzle_blast_azimuth_rad"),
     _real("trajectory_rad", may_be_nan=True),
@@ -233,8 +233,8 @@ SHOT_REPORT = _declare(
 )
 ARRIVAL_DIFFERENCE = _declare(
     "ArrivalDifference",
-    "By how much later a sound came at one microphone (a Landmark) than at a reference, and the "
-    "variances of both arrivals; all differences of one stamp share the error of the reference's.",
+    "The time by which a sound arrived later at one microphone (a Landmark) than at a reference, and "
+    "the variances of both arrivals. All differences with one stamp share the error of the reference.",
     _identifier("microphone_id"),
     _identifier("reference_id"),
     _real("difference_s"),
@@ -267,9 +267,9 @@ GEODETIC_FIX = _declare(
 )
 POSE = _declare(
     "Pose",
-    "Where a body is in a frame: its position, and the rotation from the body's frame to it as a unit "
-    "quaternion w, x, y, z. The covariance, row-major, is of x, y, z in m and of small rotations about "
-    "the frame's x, y, z in rad. The channel's metadata names the frames.",
+    "The pose of a body in a frame: its position, and the rotation from the body's frame to this frame "
+    "as a unit quaternion w, x, y, z. The covariance, row-major, is that of x, y, z in m and of small "
+    "rotations about the frame's x, y, z in rad. The channel's metadata names the frames.",
     _vector("position_m", may_be_partial=True),
     _vector("quaternion"),
     _vector("covariance", may_be_nan=True),
@@ -295,7 +295,7 @@ SCAN_BEARING = _declare(
 )
 SCAN_RANGE_BEARING = _declare(
     "ScanRangeBearing",
-    "One distance and angle of an unordered scan, in the sensor's frame, as those of a radar.",
+    "One distance and angle of an unordered scan, in the sensor's frame, as measured by a radar.",
     _identifier("scan_id"),
     _real("range_m"),
     _real("bearing_rad"),
@@ -327,7 +327,7 @@ MAGNETIC_FIELD = _declare(
 )
 ODOMETRY = _declare(
     "Odometry",
-    "Forward velocity and turn rate that hold from this message to the next.",
+    "Forward velocity and turn rate that are valid from this message to the next.",
     _real("forward_mps"),
     _real("turn_radps"),
 )
@@ -356,7 +356,7 @@ LANDMARK = _declare(
 )
 BODY_POINT = _declare(
     "BodyPoint",
-    "Where a sensor, antenna or tag sits in the body's frame: its lever arm.",
+    "The position of a sensor, antenna or tag in the body's frame: its lever arm.",
     _identifier("point_id"),
     _vector("position_m"),
 )
@@ -372,7 +372,7 @@ OUTAGE = _declare(
 )
 LINK_EVENT = _declare(
     "LinkEvent",
-    "One message of a network link; arrival is the time it was lost or arrived.",
+    "One message of a network link; `arrival_time_ns` is the time at which it arrived or was lost.",
     _identifier("sender_id"),
     _identifier("receiver_id"),
     Field("arrival_time_ns", "time_ns"),
@@ -380,7 +380,7 @@ LINK_EVENT = _declare(
 )
 IDENTITY = _declare(
     "Identity",
-    "Which target the message of the same row of another topic is of, if that does not state it.",
+    "The target of the message in the same row of another topic, if that message does not state it.",
     _identifier("thing_id"),
 )
 
@@ -402,8 +402,8 @@ SET_ESTIMATE = _declare(
 )
 SET_STEP = _declare(
     "SetStep",
-    "How the set of this time came about: from which earlier one it was moved, in which interval the "
-    "heading lies, and how many times larger a simpler form made it.",
+    "The origin of the set at this time: the time of the earlier set that was moved, the interval of "
+    "the heading, and the factor by which a simpler form enlarged the set.",
     Field("anchor_time_ns", "time_ns"),
     _real("heading_rad"),
     _real("heading_half_width_rad"),
@@ -411,20 +411,20 @@ SET_STEP = _declare(
 )
 DENSITY_ESTIMATE = _declare(
     "DensityEstimate",
-    "One component of a mixture, or one weighted sample where the covariance is zero.",
+    "One component of a mixture, or one weighted sample if the covariance is zero.",
     _real("weight"),
     _vector("mean"),
     _vector("covariance"),
 )
 EFFECTIVE_PARTICLES = _declare(
     "EffectiveParticles",
-    "The number of particles of an estimate, and the number of equal weight that is worth as much.",
+    "The number of particles of an estimate, and their effective number.",
     _identifier("particles"),
     _real("effective"),
 )
 INNOVATION = _declare(
     "Innovation",
-    "How one measurement differs from its prediction, and whether the gate accepted it.",
+    "The difference of one measurement from its prediction, and whether the gate accepted it.",
     _identifier("target_id"),
     _identifier("accepted"),
     _vector("innovation", may_be_nan=True),
@@ -444,14 +444,14 @@ SKIPPED = _declare(
 )
 STARTED = _declare(
     "Started",
-    "The estimator assumed something that the log does not say, such as where to begin; the channel's "
-    "metadata lists what by number, as JSON.",
+    "The estimator assumed a fact that the log does not state, such as the initial state; the channel's "
+    "metadata lists the assumptions by number, as JSON.",
     _identifier("reason"),
 )
 DIAGNOSED = _declare(
     "Diagnosed",
-    "A diagnosis found that something is wrong from here on; the channel's metadata lists what by "
-    "number, as JSON.",
+    "A diagnosis found a fault that begins here; the channel's metadata lists the faults by number, as "
+    "JSON.",
     _identifier("reason"),
 )
 REWOUND = _declare(
@@ -461,19 +461,19 @@ REWOUND = _declare(
 )
 WAITED = _declare(
     "Waited",
-    "A late measurement was used in its order, because newer ones waited for it; by how much they are "
-    "newer.",
+    "A late measurement was used in its order, because newer ones waited for it. `behind_s` states how "
+    "much newer they are.",
     _real("behind_s"),
 )
 COVERAGE = _declare(
     "Coverage",
-    "For how much of a run, from this stamp to the end, there are estimates.",
+    "The span from this stamp to the end of a run, and the part of it with estimates.",
     Field("end_time_ns", "time_ns"),
     _real("estimated_s"),
 )
 SOLUTION = _declare(
     "Solution",
-    "How one batch solution ended.",
+    "The outcome of one batch solution.",
     _identifier("iterations"),
     _identifier("converged"),
     _identifier("rank"),
@@ -481,19 +481,20 @@ SOLUTION = _declare(
 )
 MODE_PROBABILITIES = _declare(
     "ModeProbabilities",
-    "How probable each mode of motion is; the channel's metadata names the modes as components.",
+    "The probability of each mode of motion; the channel's metadata names the modes as components.",
     _vector("probability"),
 )
 BOUND_STEP = _declare(
     "BoundStep",
-    "How the true state came from that of the message before, and what was measured of it; row-major.",
+    "The linearised motion from the previous true state to this one, its noise, and the information of "
+    "the measurements; row-major.",
     _vector("transition"),
     _vector("noise"),
     _vector("information", may_be_nan=True),
 )
 ITERATION = _declare(
     "Iteration",
-    "One step of an iterated solution: the cost before it, how it was damped, how far it went.",
+    "One step of an iterated solution: the cost before it, its damping, and its largest step.",
     _identifier("iteration"),
     _real("cost"),
     _real("damping"),
@@ -502,7 +503,7 @@ ITERATION = _declare(
 OBSERVABILITY = _declare(
     "Observability",
     "Information of the measurements since an earlier stamp about the state at that stamp: rank and "
-    "eigenvalues, ascending, of the local Gramian in units of the prior, and the least one's direction.",
+    "eigenvalues, ascending, of the local Gramian in units of the prior, and the weakest direction.",
     Field("begin_time_ns", "time_ns"),
     _identifier("rank"),
     _identifier("measurements"),
@@ -511,7 +512,7 @@ OBSERVABILITY = _declare(
 )
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
-    "Mean and covariance of one of several states, known by its number.",
+    "Mean and covariance of one of several states, identified by its number.",
     _identifier("track_id"),
     _vector("mean"),
     _vector("covariance"),
@@ -519,14 +520,13 @@ TRACK_ESTIMATE = _declare(
 
 EXISTENCE = _declare(
     "Existence",
-    "How probable it is that the track of the same row of another topic is that of a target.",
+    "The probability that the track in the same row of another topic is that of a target.",
     _real("existence"),
 )
 ASSOCIATION = _declare(
     "Association",
-    "How probable it is that a detection is a track's; the metadata lists the sensors by number. "
-    "Detections "
-    "of a scan that were joined, being of one hull, count as one.",
+    "The probability that a detection belongs to a track; the metadata lists the sensors by number. "
+    "Detections of a scan that were merged, because they are of one hull, count as one.",
     _identifier("track_id"),
     _identifier("sensor_id"),
     _identifier("scan_id"),

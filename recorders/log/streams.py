@@ -140,7 +140,7 @@ def make_stream(
     """Make a stream; clocks that are not given equal `publish_time_ns`.
 
     A vector that may be absent can be omitted. Raises BadInput if another column is missing, unknown, or
-    has the wrong length or number of axes; if it holds NaN that its field does not allow, or a number
+    has the wrong length or number of axes; if it contains NaN that its field does not allow, or a number
     that its type cannot represent (such as a fraction of a nanosecond); or if a time is negative.
 
     Args:
@@ -184,7 +184,7 @@ def stream_of(
         given: columns by field, (n,), or (n, width) for a vector; one that may be absent can be omitted.
         log_time_ns: (n,), when it reached the recorder; by default when it was measured.
         metadata: metadata of the channel, as text.
-        allow_nan: whether any column may hold NaN.
+        allow_nan: whether any column may contain NaN.
 
     Raises BadInput like `make_stream`.
     """
@@ -267,7 +267,7 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
     if not is_kept:
         lost = given[np.argmax(column != given)]
         raise BadInput(
-            f"{what} holds {lost}, which {dtype.name} cannot hold; round the values, or scale them "
+            f"{what} contains {lost}, which {dtype.name} cannot store; round the values, or scale them "
             "into its range"
         )
     return column

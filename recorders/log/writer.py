@@ -90,8 +90,8 @@ class LogWriter:
     def write(self, streams: Iterable[Stream]) -> None:
         """Write a block of streams, merged in log-time order; ties keep the order given.
 
-        The block is in the file when the call returns, so memory holds one block, and a truncated file
-        holds the earlier blocks.
+        The block is in the file when the call returns, so only one block is in memory, and a truncated
+        file contains the earlier blocks.
 
         Raises BadInput if a stream violates its schema (see `check_stream`), a topic occurs twice, or a
         topic changes its schema, the widths of its vectors or its metadata between blocks.

@@ -25,7 +25,7 @@ SPEED_MPS, TURN_RADPS, CIRCLE_S = 8.0, 0.4, 15.708
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Return speeds and turn rates (n,) at times (n,) of a straight drive; other motions are alike."""
+    """Return speeds and turn rates (n,) at times (n,) of a straight drive; so do the other motions."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
@@ -67,7 +67,7 @@ MOTIONS: dict[str, Motion] = {
 
 
 class CarParameters(Parameters):
-    """How the car drives, and how its sensors measure; by default without errors.
+    """The motion of the car, and the noise and errors of its sensors; errors are zero by default.
 
     Attributes:
         duration_s: length of the drive.
@@ -86,7 +86,7 @@ class CarParameters(Parameters):
         forward_factor, turn_factor: ratio of the wheels' readings to the motion.
         turn_error_radps: bias of the wheels' turn rate, measured minus true.
         lever_x_m, lever_y_m: position of the antenna, forward and left of the car's reference point.
-        fix_delay_s: how long before its stamp a fix was measured.
+        fix_delay_s: time from the measurement of a fix to its stamp.
         compass_error_rad: bias of the compass, measured minus true.
     """
 
@@ -143,7 +143,7 @@ class Car(NamedTuple):
     Attributes:
         truth: motion of the car.
         odometry_s, speed_mps, turn_radps, fix_s, fix_m, compass_s, compass_rad: measurements.
-        forward_density, turn_density, fix_variance_m2, compass_sigma_rad: what the sensors state.
+        forward_density, turn_density, fix_variance_m2, compass_sigma_rad: values that the sensors state.
         prior, prior_sigmas: mean (3,) of the first pose, and its standard deviations.
         fix_late_s, lever_m: delay of fixes, and position of the antenna.
         seed: seed for further random numbers.

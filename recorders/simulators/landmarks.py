@@ -256,7 +256,7 @@ def _dead(
     duration_s: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Draw a sensor's outages (k, 2), from and to, and test which times (n,) are in one."""
+    """Draw a sensor's outages (k, 2), start and end, and test which times (n,) are in one."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
     starts_s = np.sort(rng.uniform(0, duration_s, count))
     outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)

@@ -45,7 +45,7 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """The output of a GNSS receiver, and its disturbances: spans [begin, end] in s since the epoch.
+    """The output of a GNSS receiver, and its disturbances: spans [start, end] in s since the epoch.
 
     Attributes:
         rate_hz: positions per second.

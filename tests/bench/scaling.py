@@ -130,13 +130,13 @@ def table(measured: Measured) -> str:
     one, two = measured.runs_per_s
     said = f"""\
 Measured on two cores, {RUNS} runs of `landmarks` with the start of processes and figures:
-{one:.0f} runs/s with one worker, {two:.0f} with two. A cell takes a worker {measured.cell_s:.2f} s
-and leaves {measured.cell_bytes / 1e6:.1f} MB, which the driver keeps and merges in \
-{1e3 * measured.driver_s:.0f} ms. Simulated
-from these, with a gigabit network, the driver is the limit from {measured.limit_workers} workers on,
-at {measured.limit_runs_per_s:.0f} runs/s:
+{one:.0f} runs/s with one worker, {two:.0f} with two.
+A worker computes a cell in {measured.cell_s:.2f} s. Its result has {measured.cell_bytes / 1e6:.1f} MB, which the driver keeps and merges in \
+{1e3 * measured.driver_s:.0f} ms. In a simulation
+with these numbers and a gigabit network, the driver is the limit from {measured.limit_workers} workers
+on, at {measured.limit_runs_per_s:.0f} runs/s:
 
-| workers | runs/s, simulated | of what they could do |
+| workers | runs/s, simulated | share of the ideal rate |
 |---|---|---|
 """
     return said + "\n".join(rows) + "\n"
@@ -147,7 +147,10 @@ def chart(measured: Measured) -> Chart:
     rates = [simulated(measured, workers) for workers in WORKERS]
     series = [
         curve(
-            "as many times one worker", WORKERS, [rates[0] * workers for workers in WORKERS], "dashed"
+            "ideal: one worker's rate times the workers",
+            WORKERS,
+            [rates[0] * workers for workers in WORKERS],
+            "dashed",
         ),
         level("the driver's limit", WORKERS, measured.limit_runs_per_s),
         curve("simulated", WORKERS, rates, "line+markers"),

@@ -34,91 +34,96 @@ _TABLE = re.compile(r"(<!-- stressed -->\n).*?(<!-- end -->)", re.DOTALL)
 # in proportion to the change is measured: by what is decided in both copies, by other seeds, by
 # the NEES of the unchanged replay or by smaller changes; what is in proportion is said of the change.
 JUMPS = (
-    ("*", "rukf-*", "*", "its samples are random: another seed moves it as far as an ulp"),
+    ("*", "rukf-*", "*", "its samples are random: another seed has the same effect as one ulp"),
     (
         "acoustic-sequence",
         "mixture",
         "*",
-        "its 4000 particles are random: another seed moves it as far as an ulp, by up to 0.5 sigma",
+        "its 4000 particles are random: another seed has the same effect as one ulp, up to 0.5 sigma",
     ),
     (
         "bingham-2d",
         "kalman",
         DROPPED,
-        "a Gaussian of a direction is overconfident: NEES 2.1, expected 1",
+        "a Gaussian of a direction is overconfident: NEES is 2.1 instead of 1",
     ),
     (
         "ispace*",
         "*",
         "stamps",
-        "what is sent a microsecond before a measurement lacks it: 18 to 938 sigma; after it, below 1",
+        "a message sent 1 us before a measurement lacks it: 18 to 938 sigma; sent after it, below 1",
     ),
     (
         "los-moving",
         "*",
         DROPPED,
-        "takes attitudes as stated and is overconfident: NEES above 10000; its study estimates them",
+        "it trusts the stated attitudes and is overconfident: NEES over 10000; its study estimates them",
     ),
     (
         "los-t*-sensors",
         "scheme-3",
         DROPPED,
-        "a pass has hardly more measurements than unknowns: without one it fails, and the others stay",
+        "a pass has hardly more measurements than unknowns: without one, only this pass fails",
     ),
     (
         "manoeuvres",
         "stand",
         DROPPED,
-        "a model for standing still, used while driving, is overconfident: NEES 330000",
+        "a model for standing still, used while driving, is overconfident: NEES is 330000",
     ),
     (
         "navigation-unknown-heading",
         "*",
         "start",
-        "no heading is known for 5 s: the likeliest of 45 has 0.03, and another leads",
+        "the heading is unknown for 5 s: the likeliest of 45 members changes; its probability is 0.03",
     ),
     (
         "reactor",
         "*",
         DROPPED,
-        "its covariance follows the state: without the message its sigmas are half to two thirds",
+        "its covariance depends on the state: without the message its sigmas fall to 1/2 to 2/3",
     ),
     (
         "set-filter",
         "ekf",
         PARAMETERS,
-        "its gate of 13.82: it takes a measurement at a NIS of 13.6, and leaves it at 14.6",
+        "its gate is at 13.82: it accepts a measurement at a NIS of 13.6 and rejects it at 14.6",
     ),
     (
         "torus-filter",
         "ukf-naive",
         DROPPED,
-        "takes angles as numbers on a line: the copies are on both sides of pi",
+        "it treats angles as numbers on a line: the two copies are on different sides of pi",
     ),
     (
         "torus-filter",
         "*",
         DROPPED,
-        "far from linear: the message moves it by more than a sigma, and its sigmas by 3 % at most",
+        "far from linear: the message moves it by over a sigma, but changes its sigmas by at most 3 %",
     ),
     (
         "vehicles-scaling",
         "powers",
         "*",
-        "rounding grows thirtyfold a step, to sigmas in ten; in one run of two looked at it diverges",
+        "rounding errors grow thirtyfold per step, to sigmas in ten steps; one of two runs diverges",
     ),
-    ("vehicles-scaling", "products", "*", "rounding grows thirtyfold a step, to sigmas in ten"),
+    (
+        "vehicles-scaling",
+        "products",
+        "*",
+        "rounding errors grow thirtyfold per step, to sigmas in ten steps",
+    ),
     (
         "vehicles-scaling",
         "particles-set",
         "*",
-        "200 particles collapse: another seed moves it as far; of 20000, by 30 sigma",
+        "200 particles collapse: another seed has the same effect; with 20000 particles, 30 sigma",
     ),
 )
 MOVES = {
-    DROPPED: "a lost message moves it less than a sigma, or as its covariance says",
+    DROPPED: "a lost message moves it by less than a sigma, or as far as its covariance explains",
     PARAMETERS: "in proportion to its parameters",
-    "start": "little is measured of the start",
+    "start": "the measurements contain little information about the start",
     "stamps": "in proportion to the shift",
 }
 NOT_TRIED = "tracks or sets, with no Gaussian to compare"
@@ -220,7 +225,7 @@ def table(rows: Sequence[Row]) -> str:
         lines.append(f"| `{experiment}` | {labels} | {said} | {by} | {sizes} | {why} |")
     verdicts = pd.Series([row.verdict for row in rows]).value_counts()
     counted = ", ".join(f"{verdicts[each]} {each}" for each in verdicts.index)
-    return "\n".join([*lines, "", f"Of {len(rows)}: {counted}.", ""])
+    return "\n".join([*lines, "", f"Of {len(rows)} estimators: {counted}.", ""])
 
 
 def rendered(page: str, rows: Sequence[Row]) -> str:

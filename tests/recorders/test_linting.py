@@ -327,7 +327,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "sign",
         "its z axis points down (NED)",
     ),
-    "a frame's name": (framed, IMU, "name", "says FRD"),
+    "a frame's name": (framed, IMU, "name", "means FRD"),
     "raw and again": (
         lambda s: renamed(IMU, "/imu/data", keeps=False)(renamed(IMU, "/imu/data_raw", keeps=True)(s)),
         "/imu/data",
@@ -448,7 +448,7 @@ def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
     """Ten samples get one stamp: they repeat, and their unit is right."""
     [found] = lint([stamps(IMU, lambda t: t // 10**8 * 10**8)(clean(1))])
     assert "have the same stamp as the previous one" in found.evidence
-    assert "estimators use the mean of both; deployed and foreign filters" in found.evidence
+    assert "estimators use the mean of both; deployed and external filters" in found.evidence
     unit = clean(1)[IMU]
     stamps_ns = unit.publish_time_ns // 10**8 * 10**8
     wheels = make_stream(
@@ -459,7 +459,7 @@ def test_stamps_of_bursts_have_no_rate_of_their_own() -> None:
         turn_radps=unit["turn_rate_radps"][:, 1],
     )
     [found] = lint([{"/odometry": wheels}])
-    assert "the first of the two holds for no time, so it has no effect" in found.evidence
+    assert "the first of the two is valid for no time, so it has no effect" in found.evidence
 
 
 def test_what_is_missing_is_not_frozen() -> None:
@@ -479,7 +479,7 @@ def test_a_frames_name_says_how_its_axes_are_turned() -> None:
         ("odom_ned", "east, north, up", "swap north and east"),
     ):
         [found] = frames(replace(clean(1)[IMU], metadata={"frame_id": frame}), {})
-        assert found.evidence.endswith(f"fuselog have {ours}"), frame
+        assert found.evidence.endswith(f"fuselog use {ours}"), frame
         assert remedy in found.otherwise, frame
 
 

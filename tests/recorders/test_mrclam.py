@@ -105,7 +105,7 @@ def test_missing_and_malformed_files_are_told_by_name(
 
 
 def test_folders_that_are_no_set_are_told(small: Path, tmp_path: Path):
-    with pytest.raises(BadInput, match=r"not a folder; give the folder that holds Barcodes\.dat"):
+    with pytest.raises(BadInput, match=r"not a folder; give the folder that contains Barcodes\.dat"):
         imported(small / "Barcodes.dat")
     with pytest.raises(BadInput, match="no such file or folder"):
         imported(tmp_path / "nowhere")

@@ -129,7 +129,11 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         (TUM + "1305031104000000 4 5 6 0 0 0 1\n", None, ("line 5", "beyond the year 2262", "in s")),
         (KITTI + "1 0 0 4 0 2 0 5 0 0 1 6\n", None, ("line 3", "matrix that is not a rotation")),
         (KITTI + "1 0 0 4 0 1 0 5 0 0 -1 6\n", None, ("line 3", "matrix that is not a rotation")),
-        (TUM.replace("\n1305031103 ", "\n1305031103.5 "), "euroc", ("line 2", "no whole number of ns")),
+        (
+            TUM.replace("\n1305031103 ", "\n1305031103.5 "),
+            "euroc",
+            ("line 2", "not a whole number of ns"),
+        ),
         ("# t px py pz qw qx qy qz\n" + TUM.partition("\n")[2], None, ("header has", "w first")),
         (f"0.5,1,2,3,0,0,{HALF},{HALF},9\n", None, ("line 1 is not a pose", "9 columns")),
         (TUM + "1305031104 4 5 6 0 0 0 3\n", None, ("line 5", "check what it is", "x y z w")),

@@ -607,7 +607,7 @@ def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
         each.removeprefix("--set ").split("=") for each in settings
     ))  # fmt: skip
     assert not replayed.failures  # the model has them all
-    assert notes["EKF2_HDG_GATE"].startswith("test each component by itself")
+    assert notes["EKF2_HDG_GATE"].startswith("test single components")
     assert notes["EKF2_TAU_POS"] == "have no counterpart in the model inertial"
     assert notes["CAL_ACC0_XOFF"].startswith("had their effect before")
     many = carried({f"EKF2_OTHER_{number}": 0.0 for number in range(200)})

@@ -116,7 +116,7 @@ class Expressions(Scope, ABC):
             return list(parts)
         if isinstance(found, range | zip | enumerate | reversed | str):
             return [from_python(each) for each in found]
-        raise TypeError("a loop goes over a range, or over a tuple")
+        raise TypeError("a loop needs a range or a tuple")
 
     def of_BinOp(self, node: ast.BinOp) -> Value:  # noqa: N802
         """Lower `a + b` and similar."""
@@ -203,7 +203,7 @@ class Expressions(Scope, ABC):
         if parts is None or others is None:
             return compare(self.emitter, operation, self.scalar(left), self.scalar(right))
         if operation not in (operator.eq, operator.ne) or len(parts) != len(others):
-            raise TypeError("tuples are compared by == and !=, and of one length")
+            raise TypeError("tuples are compared only by == and !=, and need the same length")
         found: Value = operation is operator.eq
         joined = operator.and_ if operation is operator.eq else operator.or_
         for part, other in zip(parts, others, strict=True):
@@ -261,7 +261,7 @@ class Expressions(Scope, ABC):
     def entry(self, parts: tuple[Value, ...], index: Number) -> Number:
         """Select an entry of a tuple of numbers by an index at run time."""
         if not all(isinstance(each, Number) or is_static(each) for each in parts):
-            raise TypeError("an entry of this tuple is found by an index that is known")
+            raise TypeError("an index of this tuple has to be a known number")
         if all(map(is_static, parts)):
             kept = self.program.table(np.array(parts))
         else:
@@ -278,7 +278,7 @@ class Expressions(Scope, ABC):
         if isinstance(owner, np.ndarray):
             owner = self.constant_array(owner)
         if not isinstance(owner, Array):
-            raise TypeError(f"{ast.unparse(node.value)} is no array")
+            raise TypeError(f"{ast.unparse(node.value)} is not an array")
         index = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(index) > len(owner.shape):
             raise TypeError(f"{ast.unparse(node)}: {len(index)} indices for {len(owner.shape)} axes")
@@ -287,14 +287,14 @@ class Expressions(Scope, ABC):
     def constant_array(self, array: AnyArray) -> Array:
         """Return an array from outside, which must not be writeable."""
         if array.flags.writeable:
-            raise TypeError("an array that could change is part of a kernel; pass it as an argument")
+            raise TypeError("a kernel uses an outside array that could change; pass it as an argument")
         return self.program.table(array)
 
     def _index(self, node: ast.expr) -> Value:
         if not isinstance(node, ast.Slice):
             return self.scalar(self.value(node))
         if node.step is not None:
-            raise TypeError("slices have no steps here")
+            raise TypeError("slices cannot have steps here")
         return slice(
             *(
                 None if each is None else self.scalar(self.value(each))
@@ -349,13 +349,15 @@ class Expressions(Scope, ABC):
         if isinstance(function, FunctionType) and not str(function.__module__).startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
         name = getattr(function, "__name__", function)
-        raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
+        raise TypeError(
+            f"a kernel that creates no arrays cannot call {name}; others have allocates=True"
+        )
 
     def new_array(self, like: Value, dtype: Value = float, *, is_zero: bool) -> Array:
         """Lower `np.empty` and similar for known sizes; the memory lasts until the function returns."""
         shape = like.shape if isinstance(like, Array) else like if isinstance(like, tuple) else (like,)
         if not all(is_static(size) for size in shape):
-            raise TypeError("an array that is made here has sizes that are known; pass it as scratch")
+            raise TypeError("an array that is created here needs known sizes; pass it as scratch")
         kept = like.dtype if isinstance(like, Array) else np.dtype(dtype).str
         array = made(self.emitter, tuple(map(int, shape)), kept)
         if is_zero:

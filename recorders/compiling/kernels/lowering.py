@@ -1,7 +1,7 @@
 """Lowering of a function: its source is traversed once and written as LLVM IR.
 
 Statements are lowered here, expressions in `expressions`. A name with a single assignment before all of
-its uses stands for that value; other names are variables in memory, which LLVM turns into registers.
+its uses is replaced by the value; other names are variables in memory, which LLVM turns into registers.
 Known values are evaluated: an `if` with a known condition has one branch, and a loop over a tuple is
 unrolled.
 """
@@ -81,7 +81,7 @@ class _Lowering(Frame):
         if self._exit:
             if not self.ended:
                 if signature(self._returned) != signature(None):
-                    raise TypeError("not every way through it returns something")
+                    raise TypeError("not every path through it returns a value")
                 self.go(self._exit)
             self.begin(self._exit)
             return self.read(self._returned)
@@ -173,10 +173,10 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Lower `return`; the value may stay known outside of branches, otherwise it is in memory."""
+        """Lower `return`; outside of branches the value may remain known, otherwise it is in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
-            raise TypeError("it returns an array that it has made; pass one that it fills")
+            raise TypeError("it returns an array that it created; pass an array that it fills")
         if self._depth == 0 and not self._exit:
             self._returned, self.ended = value, True
             return
@@ -251,7 +251,7 @@ class _Lowering(Frame):
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range":
             bounds = [self.value(each) for each in call.args]
             if any(kind_of(each) == REAL for each in bounds):
-                raise TypeError(f"{ast.unparse(call)} is of integers only; convert by int()")
+                raise TypeError(f"{ast.unparse(call)} accepts only integers; convert them with int()")
             start, stop = (0, bounds[0]) if len(bounds) == 1 else bounds[:2]
             step = bounds[2] if len(bounds) == 3 else 1
             first, end = (self.emitter.as_kind(each, WHOLE) for each in (start, stop))
@@ -271,7 +271,7 @@ class _Lowering(Frame):
     def counted(self, start: Number, stop: Number, step: int) -> Iterator[Number]:
         """Write the head of a counted loop, yield its index once for the body, and write its end."""
         if not is_static(step) or step == 0:
-            raise TypeError("the step of a range is a number that is known")
+            raise TypeError("the step of a range has to be a known number")
         head, inner, following, after = (self.label(name) for name in ("for", "body", "next", "after"))
         place = self.place(start)
         self.write(place, start)

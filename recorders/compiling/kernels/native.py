@@ -47,7 +47,7 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class _Layout:
-    """The kinds of a core's working memory, as one object for equal kinds, for a fast lookup."""
+    """The kinds of a core's working memory; equal kinds are one object, which makes lookup fast."""
 
     def __init__(self, kinds: tuple[Value, ...]) -> None:
         self.kinds = kinds
@@ -135,7 +135,7 @@ def function_of(function: KernelFunction) -> KernelFunction:
     returned = stated if isinstance(stated, str) else getattr(stated, "__name__", str(stated))
     if returned not in ("float", "int", "bool", "None"):
         raise BadInput(
-            f"{function.__qualname__} does not say what it returns; annotate it with '-> float', "
+            f"{function.__qualname__} does not state the type of its result; annotate it by '-> float', "
             "'-> int', '-> bool' or '-> None'"
         )
 
@@ -246,7 +246,7 @@ def _keep(path: Path, code: bytes) -> None:
         write_checked(path, code, _MADE_BY)
     except BadInput as error:
         why = str(error).removeprefix(f"{path}: ")
-        say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
+        say_once(f"the cache {path.parent} {why}: newly compiled code is not stored")
 
 
 def _named(kinds: Value) -> Value:

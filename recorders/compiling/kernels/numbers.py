@@ -134,7 +134,7 @@ class Emitter:
         return Number(kind, value.code)
 
     def truth(self, value: Scalar) -> Number:
-        """Convert a number to whether it is not zero."""
+        """Lower the test whether a number is not zero."""
         if not isinstance(value, Number):
             return constant(bool(value))
         if value.kind == TRUTH:

@@ -88,7 +88,9 @@ class Program:
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
             if id(function) in self._open:
-                raise DoesNotCompile(f"{function.__qualname__} calls itself, which a kernel cannot")
+                raise DoesNotCompile(
+                    f"{function.__qualname__} calls itself, which kernels do not support"
+                )
             self._open.append(id(function))
             self._kept.append((function, arguments))
             parameters = [self._parameter(index, each) for index, each in enumerate(arguments)]
@@ -174,8 +176,7 @@ def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
     definition = tree.body[0]
     if not isinstance(definition, ast.FunctionDef):
         raise BadInput(
-            f"{function.__qualname__} is not a `def` function, of which kernels are made; write it as "
-            "one"
+            f"{function.__qualname__} is not a `def` function, as kernels have to be; write it as one"
         )
     first = min([definition.lineno, *(each.lineno for each in definition.decorator_list)])
     return definition, function.__code__.co_filename, function.__code__.co_firstlineno - first

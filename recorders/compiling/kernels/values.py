@@ -47,7 +47,7 @@ STORED = {
 class Array:
     """An array: its element type, its address, its sizes, and its strides in elements.
 
-    `is_local` says whether its memory ends when the function that made it returns.
+    `is_local` is True if its memory is released when the function that made it returns.
     """
 
     dtype: str

@@ -108,7 +108,7 @@ def require_time_to_hear(interval_s: float, longest_s: float) -> None:
 
 
 def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> Stream:
-    """Make the true state of the shot and the sensors, when a shot is fired and whenever it is heard."""
+    """Make the true states of shot and sensors, for the times at which shots are fired and heard."""
     places = np.ravel(parameters.sensor_position_m)
     numbers = range(1, len(travel_s) + 1)
     components = [*SHOT_COMPONENTS, *(name for s in numbers for name in sensor_components(s))]

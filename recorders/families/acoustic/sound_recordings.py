@@ -70,7 +70,7 @@ class Recorded(NamedTuple):
 
 
 class Sound(NamedTuple):
-    """One sound: the files that may contain it, its begin and end, ns since 1970."""
+    """One sound: the files that may contain it, its start and end, ns since 1970."""
 
     name: str
     files: list[str]
@@ -242,7 +242,7 @@ def _begin_ns(path: Path) -> int | None:
 
 
 def _span_ns(recorded: Recorded, epoch_ns: int) -> tuple[int, int]:
-    """Return begin and end of a recording; it begins at the epoch if the file does not state a time."""
+    """Return start and end of a recording; it starts at the epoch if the file does not state a time."""
     begin_ns = epoch_ns if recorded.begin_ns is None else recorded.begin_ns
     return begin_ns, begin_ns + round(len(recorded.samples) / recorded.rate_hz * 1e9)
 
@@ -290,7 +290,7 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """Yield the differences of one sound, and the truth if known; nothing if too few microphones hear.
+    """Yield the differences of one sound, and the truth if known; nothing if too few hear it.
 
     The search window is longer than the sound on both sides by the sound's travel time between the
     microphones. Files that do not cover the sound, or are silent during it, are skipped.

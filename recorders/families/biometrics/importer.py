@@ -64,7 +64,7 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     """Read one matrix per matcher; users are numbered in the order of the files.
 
     Raises BadInput with the name of the file if it is missing or malformed, has other users than the
-    first file, or contradicts the declared sense of its scores.
+    first file, or if its scores are not similarities or distances as declared.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: not a folder; give the folder with one CSV per matcher")
@@ -125,7 +125,7 @@ def _matrix(path: Path) -> Matrix:
 
 
 def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> None:
-    """Raise BadInput if a matcher's scores are uninformative or contradict their declared sense."""
+    """Raise BadInput if scores are uninformative, or are not similarities or distances as declared."""
     valid = scores != matcher.failure if matcher.failure is not None else np.ones(scores.shape, bool)
     genuine = np.eye(len(scores), dtype=bool)
     if not valid.any() or np.ptp(scores[valid]) == 0:

@@ -181,7 +181,7 @@ def _user_correlation() -> Floats:
 
 
 def _rest_correlation() -> Floats:
-    """Find the correlation (4, 4) of both parts of the remainder that gives their sum the stated one."""
+    """Find the correlation (4, 4) of both parts of the remainder that leads to that of their sum."""
     correlation = np.full((4, 4), OTHER_REST_CORRELATION)
     for pair, value in REST_CORRELATION.items():
         row, column = ("CGLR".index(name) for name in pair)

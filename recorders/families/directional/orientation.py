@@ -28,7 +28,7 @@ class AxisParameters(Parameters):
         start: true orientation at the start, a unit vector.
         prior: distribution of the orientation at the start, as filters assume it.
         system: distribution of the rotation in a step.
-        measurement: distribution of the rotation by which a measurement is wrong.
+        measurement: distribution of the rotation error of a measurement.
     """
 
     steps: PositiveInt = 100

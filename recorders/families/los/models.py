@@ -81,7 +81,7 @@ def direction(azimuth: Component, elevation: Component, attitude: Components) ->
 
 
 def turning_vector(attitude: Components, change: Components) -> Triple:
-    """Compute the small rotation of the scene, in the common frame, that a change of attitude hides.
+    """Compute the small rotation of the scene, in the common frame, that cancels a change of attitude.
 
     If the scene rotates by it about the sensor while the attitude changes by `change` (yaw, pitch,
     roll), the sensor's measurements stay the same.

@@ -2,8 +2,8 @@
 
 Sensors fly at known poses, straight or weaving, and see the targets in turn, each sensor at its own
 times. The frame is that of `fuselog.recorders.families.los.models`: y points up, and a sensor looks
-ahead, along its own z. The white noise that drives targets and biases is continuous, so that they are
-exact at any time.
+ahead, along its own z. The white noise that drives targets and biases is continuous, so the simulated
+values are exact at any time.
 """
 
 from typing import Annotated, NamedTuple
@@ -87,7 +87,7 @@ class Course(NamedTuple):
     bias_rad: Floats
 
     def rows(self, times_s: Floats) -> NDArray[np.int64]:
-        """Return the rows of some of its times."""
+        """Return the rows that belong to given times."""
         return np.searchsorted(self.times_s, times_s)
 
 

@@ -30,7 +30,7 @@ class Node(Parameters):
     Attributes:
         components: measured components of the state.
         sigmas: standard deviations of these components, in their units.
-        every_steps: number of steps between measurements, the first of which is at the first step.
+        every_steps: number of steps between measurements; the first measurement is at the first step.
         acceleration_density: power spectral density of the acceleration in the node's own motion model,
             in m^2/s^3; the true density if not set.
     """
@@ -54,7 +54,7 @@ class NodeOutage(Parameters):
 
     Attributes:
         node: number of the node, from 1.
-        start_s: begin of the span, since the run's epoch.
+        start_s: start of the span, since the run's epoch.
         end_s: end of the span, since the run's epoch.
     """
 

@@ -1,4 +1,4 @@
-"""Importer of Autoferry: lidar, radar and camera detections of vessels from a moving one, GPS as truth.
+"""Importer of Autoferry: lidar, radar and camera detections from a moving vessel, and GPS as truth.
 
 Helgesen et al., "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a littoral
 environment", Ocean Engineering 252, 2022; data CC0 1.0. A scenario is a folder with a list of scans,

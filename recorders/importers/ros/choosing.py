@@ -1,8 +1,9 @@
-"""Choice of what is imported from a bag: how each topic is read, and the names of its streams.
+"""Choice of the topics to import from a bag, of how each is read, and of the names of its streams.
 
 A stream is named by the namespace of its topic and by its kind: /odom gives /odometry, /robot1/imu gives
 /robot1/inertial. If two topics would give the same name, both include the topic: /odom/odometry,
-/wheels/odometry. So do poses without a covariance, which may be goals: /goal_pose/pose.
+/wheels/odometry. Names of poses without a covariance always include the topic, since these may be
+goals: /goal_pose/pose.
 """
 
 import re
@@ -49,7 +50,7 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
     known: dict[tuple, Reader | str] = {}
     for each in connections:
         if parameters.topics and each.topic not in parameters.topics:
-            found.not_taken[each.topic] = f"{each.type_name}, not asked for"
+            found.not_taken[each.topic] = f"{each.type_name}, not requested"
             continue
         key = (each.type_name, each.encoding, each.definition, each.topic.endswith("_static"))
         if key not in known:

@@ -173,7 +173,7 @@ class _Import:
         for pair, transforms in self._transforms(topic, messages, log_time_ns, tell):
             self._mountings.add(pair, transforms)
             if is_static:
-                what = "what named transforms and mountings are composed with"
+                what = "a part of named transforms and mountings"
                 self._streams.came_of[topic][what] = None
                 continue
             self._clocks.note(topic, transforms.stamp_ns, transforms.log_time_ns)

@@ -66,7 +66,7 @@ class Taken(NamedTuple):
     Attributes:
         kinds: kinds of the streams made from them.
         parts: function that reads the messages.
-        is_doubtful: whether the type does not say if they are a measurement, a goal or the truth; then
+        is_doubtful: whether they may be a measurement, a goal or the truth according to the type; then
             streams are named after the whole topic, and no model uses them by default.
     """
 
@@ -111,7 +111,7 @@ def has_none(messages: Messages, path: str) -> NDArray[np.bool_]:
 
 
 def _denied(messages: Messages, what: str, path: str) -> dict[str, NDArray[np.bool_]]:
-    """Return the messages to drop since their covariance says that there is no such data; see `Part`."""
+    """Return the messages to drop because their covariance marks the data as missing; see `Part`."""
     return {f"without {what}: {path}[0] is -1": has_none(messages, path)} if path else {}
 
 

@@ -64,12 +64,12 @@ class Mountings:
                 mounting = _settings([f"mounting_{each}_rad" for each in turns], angles)
                 uses = [f"{mounting} for the model inertial"] * bool(mounting)
                 where = "{:.4g}, {:.4g}, {:.4g} deg".format(*np.degrees(angles))
-                what = f"{frame} is turned by roll, pitch, yaw {where} in {base}"
+                what = f"{frame} is rotated by roll, pitch, yaw {where} in {base}"
             if uses:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 
     def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
-        """Write that a frame moves on the body; empty if none of the bases carries it."""
+        """Write that a frame moves on the body; empty if it is connected to none of the bases."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:

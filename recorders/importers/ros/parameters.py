@@ -22,7 +22,7 @@ Names = Annotated[list[str], BeforeValidator(_as_list)]
 
 
 class RosParameters(Parameters):
-    """Which topics are imported, and by which clock.
+    """The topics to import, and the clock to use.
 
     Attributes:
         clock: source of the publish time: the message's header, or the bag.

@@ -65,7 +65,7 @@ class StreamMaker:
 
     Attributes:
         counts: counts by subject and fact.
-        came_of: what was made from a topic, in the order in which it came.
+        came_of: names of the streams made from each topic, in the order of their first messages.
         first_ns: first publish time of all streams.
         noise: the noise stated for a topic, or the reason why it states no noise.
     """

@@ -15,8 +15,7 @@ COMMENTS = (b"%", b"#")
 def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
     """Yield blocks of as many whole lines as fit; raise ValueError if a line is too long.
 
-    The last line, which may lack its end, never is a block of its own; if it lacks its end, `doubts`
-    says so.
+    The last line is never a block of its own. If it lacks a newline, this is added to `doubts`.
     """
     lines = rest = b""
     while block := file.read(BLOCK_BYTES):
@@ -66,7 +65,7 @@ class Chunks(io.RawIOBase):
 
 
 def utf8(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Replace invalid UTF-8 in blocks, since Arrow's handler of invalid rows accepts no other bytes."""
+    """Replace invalid UTF-8 in blocks, since Arrow's handler of invalid rows accepts only UTF-8."""
     for block in blocks:
         yield block.decode("utf-8", "replace").encode()
 

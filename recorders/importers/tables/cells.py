@@ -20,7 +20,7 @@ _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 def read_ns(
     cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, remedy: str
 ) -> Stamps:
-    """Convert cells (n,) to stamps; texts keep all digits, while a double of today has steps of 200 ns.
+    """Convert cells (n,) to stamps; texts keep all digits, whereas doubles have steps of 200 ns today.
 
     Args:
         cells: whole numbers, floats, texts of numbers, or timestamps or durations, which have their own
@@ -91,7 +91,7 @@ def _plain(texts: pa.Array, digits: int) -> Stamps | None:
 
 
 def _to_the_last_digit(texts: pa.Array, digits: int, rough: Stamps) -> Stamps:
-    """Convert texts (n,) to nanoseconds, which fit 64 bits; odd notations keep the `rough` values."""
+    """Convert texts (n,) to nanoseconds, which fit 64 bits; other notations keep the `rough` values."""
     parts = pc.extract_regex(texts, _PARTS)
     powers = pc.replace_substring_regex(pc.struct_field(parts, "power"), r"[eE+]", "")
     power = pc.if_else(pc.equal(powers, ""), "0", powers).cast(pa.int32())

@@ -310,7 +310,7 @@ def _position(
 def _along_axes(
     found: list[GuessedColumn], steps: Sequence[NDArray], places: Sequence[GuessedColumn]
 ) -> tuple[list[GuessedColumn], list[int], list[str]]:
-    """Order x, y and z as east, north and up: by their frame, by the motion of positions, or assumed.
+    """Order x, y and z as east, north and up: by their frame, by the motion, or by assumption.
 
     Args:
         found: the columns.
@@ -372,7 +372,7 @@ def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[Gu
 
 
 def truth_lines(table: GuessedTable) -> Iterator[str]:
-    """Write the stream of a table's true columns; nothing that filters could read is made."""
+    """Write the stream of a table's true columns, and no stream that filters could read."""
     columns = table.columns
     place, factors, said = _position(columns, table.places)
     if not place and (geodetic := take(columns, *_GEODETIC, usual="deg")):

@@ -122,7 +122,7 @@ def stated_unit(column: GuessedColumn, usual: str) -> str:
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """Choose the unit that gives a vector its expected length, else the first; return it and why."""
+    """Choose the unit that gives a vector its expected length, else the first; return the reason too."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"

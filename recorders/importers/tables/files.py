@@ -1,8 +1,8 @@
-"""Uniform access to files that hold tables: names of columns, and batches of rows.
+"""Uniform access to files that contain tables: names of columns, and batches of rows.
 
 Formats are CSV and similar texts, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), logs of
 a VBOX (.vbo), of a FlySight and of NovAtel (ASCII), and trajectories of benchmarks. A batch has an Arrow
-array for each requested column; memory holds one batch at a time.
+array for each requested column; one batch at a time is in memory.
 """
 
 import bz2
@@ -80,7 +80,7 @@ class Table:
         path: the file.
         columns: names of the columns.
         left_out: number of rows that were left out, by reason.
-        mended: what was corrected.
+        mended: corrections that were made.
         units: units from a row of units, by column.
         doubts: doubtful facts about the rows.
         is_text: whether cells are texts; cells that say NaN are null.
@@ -146,14 +146,14 @@ def open_table(
     more: Sequence[Path] = (),
     split: Mapping[str, Sequence[str]] | None = None,
 ) -> Table:
-    """Open a file that holds a table.
+    """Open a file that contains a table.
 
     Args:
         path: the file; .gz, .bz2 and .xz are decompressed.
         format: format of the file; by default it follows from the suffix, and is CSV for unknown ones.
-        options: what a text does not say itself.
+        options: facts that a text does not state.
         more: text files whose lines follow those of the first.
-        split: columns whose cells hold several numbers, with the names of these numbers.
+        split: columns whose cells contain several numbers, with the names of these numbers.
 
     Raises BadInput if the file cannot be read, or has no rows.
     """
@@ -551,7 +551,7 @@ _PLAIN: tuple[tuple[Callable[[pa.DataType], bool], pa.DataType], ...] = (
 def floats(cells: pa.Array) -> NDArray[np.float64]:
     """Convert cells (n,) to floats, NaN for empty cells; whole numbers beyond 2^53 are rounded.
 
-    Raises pa.ArrowException if a cell holds anything else.
+    Raises pa.ArrowException if a cell contains anything else.
     """
     if pa.types.is_string(cells.type):
         cells = pc.utf8_trim_whitespace(cells)

@@ -10,7 +10,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
 from fuselog.recorders.importers.tables.files import open_text
 
-# The fewest one-row files that are taken as one table.
+# The smallest number of one-row files that are treated as one table.
 _FEWEST = 3
 _TEXTS = {".txt", ".csv", ".tsv", ".dat"}
 

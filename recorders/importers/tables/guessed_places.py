@@ -314,7 +314,7 @@ def _speed_sizes(table: GuessedTable) -> list[float]:
 
 
 def is_ais(table: GuessedTable) -> bool:
-    """Test by the names of columns whether a table holds AIS reports."""
+    """Test by the names of columns whether a table contains AIS reports."""
     plain = {column.plain for column in table.whole}
     return any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
 

@@ -512,7 +512,7 @@ def _first_cells(table: _Table, names: Sequence[str]) -> str:
 
 
 def _dated(table: _Table, names: Sequence[str]) -> tuple[TimeMapping, list[str]] | None:
-    """Find the format of times in text columns; return None if they hold no times."""
+    """Find the format of times in text columns; return None if they contain no times."""
     cell = _first_cells(table, names)
     if not re.search(r"\d", cell):
         return None

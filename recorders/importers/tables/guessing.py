@@ -1,4 +1,4 @@
-"""Guesses of a mapping to start from: the messages that columns hold, by their names and numbers.
+"""Guesses of a mapping to start from: the messages in columns, by their names and numbers.
 
 The mapping gives the reason for each guess in a comment; columns that fit no message become a vector of
 plain numbers. A person reads and corrects the mapping: the text is the result, not the import.
@@ -121,8 +121,8 @@ def _warnings(text: str) -> Iterator[str]:
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
         yield f"# The topics are in {len(namespaces)} namespaces, {', '.join(namespaces)}."
-        yield "# They are taken as one vehicle's unless a kind of topic occurs twice; better give all"
-        yield "# topics of a vehicle one namespace, such as /car/odometry, /car/fix and /car/truth."
+        yield "# They are treated as those of one vehicle unless a kind of topic occurs twice. Better"
+        yield "# use one namespace for a vehicle, as in /car/odometry, /car/fix and /car/truth."
     becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
     if {"GeodeticFix", "TruthState"} <= {*becomes}:
         yield "# The truth is in a local tangent plane, but fixes are latitudes and longitudes."
@@ -404,7 +404,7 @@ def _split(name: str, cells: pa.Array) -> list[str]:
 
 
 def _numbers(cells: pa.Array) -> NDArray | None:
-    """Read a column's numbers, NaN for empty cells; None if it holds anything else, or is empty."""
+    """Read a column's numbers, NaN for empty cells; None if it contains anything else, or is empty."""
     if pa.types.is_timestamp(cells.type):
         return None
     try:
@@ -415,7 +415,7 @@ def _numbers(cells: pa.Array) -> NDArray | None:
 
 
 def _sided(name: str, cells: pa.Array) -> NDArray | None:
-    """Read a column of positions such as 48.1N as signed numbers; None if it holds anything else."""
+    """Read a column of positions such as 48.1N as signed numbers; None if it contains anything else."""
     if not (re.search(_PLACE, parted(name)[0]) and pa.types.is_string(cells.type)):
         return None
     numbers, letters = sided(cells)

@@ -44,8 +44,8 @@ class TableParameters(Parameters):
         mapping: the mapping, by its name (walk) or file (own.toml).
         more: further files and folders.
         mounting_deg: roll, pitch, yaw that replace those of the mapping.
-        delays_s: by topic, how long before its stamp a message was measured, in s; replaces the delays
-            of the mapping.
+        delays_s: by topic, the time from a message's measurement to its stamp, in s; replaces the
+            delays of the mapping.
         seed: seed of the noise that a mapping adds.
         origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
             plane; replaces that of the mapping.

@@ -104,9 +104,9 @@ class TableStream(StreamMapping):
 
     Attributes:
         topic: name of the topic.
-        delay_s: how long before its stamp a message was measured.
+        delay_s: time from a message's measurement to its stamp.
         only_first: whether only the first row is used, as for a prior.
-        every: number of rows of which the first is used.
+        every: only the first of each group of this many rows is used.
         noise: standard deviation of white Gaussian noise to add, by field; this makes fixes from a known
             path.
     """
@@ -144,11 +144,11 @@ class TableMapping(Parameters):
         delimiter: delimiter of cells, " " for any white space; by default it is recognised.
         decimal: the decimal mark.
         skip: number of lines at the start of the file that are not part of the table.
-        split: columns whose cells hold several numbers, such as "47.5 8.7", and the names of these.
-        missing: numbers that stand for a missing value, by column, in all that is made from it.
+        split: columns whose cells contain several numbers, such as "47.5 8.7", and the names of these.
+        missing: numbers that mark a missing value, by column, in every stream that uses the column.
         degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as in
             NMEA.
-        hemispheres: for columns of latitudes and longitudes the columns that say N or S, E or W.
+        hemispheres: for columns of latitudes and longitudes the columns that state N or S, E or W.
         vehicle: the column that identifies the vehicle of a row; its value is {vehicle} in topics.
         joined: whether the files are the rows of one table, in the order of their names.
         time: when a row was measured.
@@ -318,7 +318,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
 class FileMatch(NamedTuple):
     """A file, its mapping, the texts that match the names in braces, and files that belong to it.
 
-    `more` holds the files whose rows follow, and `stamps` is the file with the times of all rows.
+    `more` lists the files whose rows follow, and `stamps` is the file with the times of all rows.
     """
 
     path: Path

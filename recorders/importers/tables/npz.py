@@ -1,4 +1,4 @@
-"""Reader of NumPy archives (.npz) as columns, block by block, so that memory holds no whole array."""
+"""Reader of NumPy archives (.npz) as columns, block by block, so that no whole array is in memory."""
 
 import zipfile
 from collections.abc import Callable, Collection, Iterator

@@ -66,7 +66,7 @@ _STAMP = "\0stamp"
 class Rows:
     """The importer of one file, which reads one batch ahead and counts what is left out.
 
-    `generator` draws the noise that the mapping asks for; `quaternions` says what to do with quaternions
+    `generator` draws the noise that the mapping requests; `quaternions` states how to treat quaternions
     that are not of unit length. Raises BadInput if the file cannot be read, or lacks a column that its
     mapping names.
     """
@@ -281,7 +281,7 @@ class Rows:
         return found
 
     def _parts(self, batch: Batch, rows: NDArray[np.int64]) -> Iterator[tuple[Batch, NDArray[np.int64]]]:
-        """Yield the rows of a batch by vehicle; meanwhile {vehicle} stands for its name."""
+        """Yield the rows of a batch by vehicle; meanwhile {vehicle} is replaced by its name."""
         if self._vehicle is None:
             self._numbers_of.clear()
             yield batch, rows

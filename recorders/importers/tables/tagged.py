@@ -29,7 +29,7 @@ _INSPVA_UNITS = {
 class Tagged(NamedTuple):
     """Rows of one kind: their beginnings, the marks around the cells, the columns and their units.
 
-    `invalid` matches rows that report that there is no solution.
+    `invalid` matches rows that report no solution.
     """
 
     what: str

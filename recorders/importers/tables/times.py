@@ -27,7 +27,7 @@ DIGITS = {"s": 9, "ms": 6, "0.1 ms": 5, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
 _WEEKS = 1024  # after which receivers with ten bits roll over to 0
 _WEEK_NS = 7 * 86400 * 10**9
-# Settings that do not go with a column of frames.
+# Settings that cannot be combined with a column of frames.
 _UNCOUNTED = {"unit", "week", "rollover"}
 REMEDY = "check `unit`, and give in `zero` the date that the times count from"
 ISO = "ISO8601"
@@ -250,10 +250,10 @@ def _date_ns(text: str) -> int:
 
 
 class Reading:
-    """The state that is carried from one block of a file to the next while its times are read.
+    """The state that is kept from one block of a file to the next while its times are read.
 
     Attributes:
-        facts: decisions made on the way, with the number of rows.
+        facts: decisions made while reading, with the number of rows.
     """
 
     def __init__(self) -> None:
@@ -298,7 +298,7 @@ def stamps_ns(
         where: beginning of error messages.
         reading: state from earlier rows.
 
-    Raises BadInput if a cell holds no time, or a time beyond what a log can hold.
+    Raises BadInput if a cell contains no time, or a time that a log cannot store.
     """
     reading = reading or Reading()
     if mapping.rate_hz is not None:
@@ -404,7 +404,7 @@ def _dates_ns(
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
-    """Convert cells to texts; a date that is a part of a time loses its midnight."""
+    """Convert cells to texts; the midnight of a date that is only a part of a time is removed."""
     if is_part and pa.types.is_timestamp(cells.type):
         return pc.strftime(cells, format="%Y-%m-%d")
     return pc.utf8_trim_whitespace(cells.cast(pa.string()))

@@ -36,8 +36,8 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 class _Sensor(NamedTuple):
     """The innovations of a sensor: their fields, our names, and the factors to our sign.
 
-    `bits` has, for each component, the bits of the filter's status that say that it is in use: one of
-    them is set. It is empty if no bit says so.
+    `bits` has, for each component, the bits of the filter's status of which at least one is set if the
+    component is in use. It is empty if there are no such bits.
     """
 
     fields: tuple[str, ...]
@@ -47,7 +47,7 @@ class _Sensor(NamedTuple):
 
 
 def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
-    """Make a sensor of north, east, down; `fields` and `bits` are horizontal, vertical."""
+    """Make a sensor of north, east, down; `fields` and `bits` are (horizontal, vertical)."""
     (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
     every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)

@@ -37,7 +37,7 @@ _SYNC = bytes.fromhex("080053") + bytes.fromhex("2f731320250cbb12")
 _PIECE_BYTES = 1 << 23
 _NUMBER_BYTES = 2
 _NEVER = 1 << 62
-_PASSED_OVER = "bytes that are no messages, and were passed over"
+_PASSED_OVER = "bytes that are not messages, skipped"
 _RECENT_US = 1_000_000
 _MONTH_US = 30 * 86_400_000_000
 _LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
@@ -85,7 +85,7 @@ class UlogFile:
         texts: messages of the autopilot.
         dropouts: stamp and length in us of losses that the logger reported.
         rows: number of rows of each topic and instance so far.
-        losses: what could not be read, and how often.
+        losses: unreadable parts in words, with their numbers.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,7 +146,7 @@ class UlogFile:
                 break
             if not size or not 65 <= kind <= 90:
                 raise BadInput(
-                    f"{self.path}: byte {position} begins no message: the definitions are damaged, "
+                    f"{self.path}: no message begins at byte {position}: the definitions are damaged, "
                     "and nothing after them can be read; copy the file again"
                 )
             try:

@@ -58,7 +58,7 @@ def _field(of: str, text: str) -> FormatField:
 
 
 def layout_of(name: str, formats: Mapping[str, list[FormatField]]) -> Layout:
-    """Lay out a topic; raise Damaged if its format is unknown, too long or contains itself."""
+    """Determine a topic's layout; raise Damaged if its format is unknown, too long or recursive."""
     entries: list[tuple[str, str]] = []
     size = 0
     for entry, kind in _flat(name, formats, ()):

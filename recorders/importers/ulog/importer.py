@@ -24,7 +24,7 @@ _PLACED = ("vehicle_local_position", "vehicle_gps_position", "sensor_gps")
 
 
 class UlogParameters(Parameters):
-    """No parameters: everything that can be imported is."""
+    """The empty set of parameters: everything that can be imported is imported."""
 
 
 class _Surroundings(NamedTuple):
@@ -32,7 +32,7 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         origin: origin of the filter's local tangent plane; None if the log does not state it.
-        separation_m: how far the ellipsoid is below the sea; 0 if unknown.
+        separation_m: height of the sea level above the ellipsoid; 0 if unknown.
         first: the first instance of every topic.
     """
 

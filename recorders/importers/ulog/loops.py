@@ -18,8 +18,8 @@ NUMBERS = 1 << 16
 class Walk(NamedTuple):
     """The positions of the messages in a piece of a file, in bytes.
 
-    `data` are messages with a topic's rows, `others` all other messages. `end` is where the walk
-    stopped: at an incomplete message, or at an invalid one if `is_broken`.
+    `data` are messages with a topic's rows, `others` all other messages. `end` is the position at
+    which the walk stopped: at an incomplete message, or at an invalid one if `is_broken`.
     """
 
     data: NDArray[np.int64]
@@ -47,7 +47,7 @@ class Sorted(NamedTuple):
 
     `order` has the rows number by number, each in file order, and `counts` (NUMBERS + 1,) their numbers
     of rows; rows without a topic come last. `stamps` are in us, 0 for rows without a topic; `is_timed`
-    says which are between two times, and `reached` is the latest of these before every row, and at the
+    marks those between two times, and `reached` is the latest of these before every row, and at the
     end. Rows stop before one whose length does not match its format.
     """
 

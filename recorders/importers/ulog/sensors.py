@@ -48,8 +48,8 @@ class Part:
 class Fields(NamedTuple):
     """The fields of a topic's rows, as numbers.
 
-    `is_first` says whether the rows belong to the first instance of the topic, and `separation_m` how
-    far the ellipsoid is below the sea at the place of recording; 0 if unknown.
+    `is_first` states whether the rows belong to the first instance of the topic. `separation_m` is the
+    height of the sea level above the ellipsoid where the log was recorded; 0 if unknown.
     """
 
     rows: Rows
@@ -169,7 +169,7 @@ def gyro(fields: Fields) -> Iterator[Part]:
 def magnetometer(fields: Fields) -> Iterator[Part]:
     """Yield the magnetometer that the filter uses, under a name that no model reads by default.
 
-    A model has to be told the local field: `--set topics.magnetic_field=/vehicle/magnetometer`.
+    `--set topics.magnetic_field=/vehicle/magnetometer` selects it; the model then needs the local field.
     """
     field_ut = _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
     yield _magnetic(fields, fields.named("magnetometer"), field_ut)

@@ -1,4 +1,4 @@
-"""Meaning of the parameters of PX4's EKF2 for the model `inertial`, and why others have none."""
+"""Counterparts of PX4's EKF2 parameters in the model `inertial`, and reasons why others have none."""
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -21,13 +21,13 @@ _SETTINGS = {
     "EKF2_ANGERR_INIT": (("tilt_sigma_rad",), 1.0),
 }
 _LEVERS = {"X": ("lever_x_m", 1.0), "Y": ("lever_y_m", -1.0), "Z": ("lever_z_m", -1.0)}
-# Reasons why parameters do not carry over, by their names; the first pattern that matches counts.
+# Reasons why parameters are not used, by their names; the first pattern that matches counts.
 _REASONS = {
     "CAL_*": "had their effect before sensor_combined and vehicle_imu were logged; accelerometer_N, "
-    "gyro_N and magnetometer_N are as they were before",
-    "EKF2_*_GATE": "test each component by itself; ours all of a message together: gate_probability",
-    "EKF2_GPS_?_NOISE": "are the least that EKF2 believes; here fixes have the noise that they state",
-    "EKF2_MAG_NOISE": "is, in gauss, a hundredth of sigma_field_ut, where the magnetometer is taken",
+    "gyro_N and magnetometer_N are raw sensor readings",
+    "EKF2_*_GATE": "test single components; gate_probability tests all components of a message together",
+    "EKF2_GPS_?_NOISE": "are lower limits in EKF2; here fixes have the noise that they state",
+    "EKF2_MAG_NOISE": "is in gauss; with the magnetometer, set sigma_field_ut to 100 times this value",
     "EKF2_*": "have no counterpart in the model inertial",
 }
 
@@ -44,7 +44,7 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """Describe what becomes of parameters, by subject: metadata, settings, or why they are not used."""
+    """Describe the use of parameters, by subject: metadata, settings, or the reason for no use."""
     notes = {}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:

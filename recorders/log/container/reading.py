@@ -43,7 +43,7 @@ _DATA_END_BYTES = RECORD_HEAD.size + 4
 _ATTACHMENT_HEAD = struct.Struct("<QQI")
 # A run of records outside chunks is split at this size, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
-# No record has this opcode: it stands for bytes that are not a complete record.
+# No record has this opcode: it marks bytes that are not a complete record.
 _LOST = 0
 
 
@@ -127,7 +127,7 @@ class NotMcap(BadInput):
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
-    """Describe what `path` holds; without the index every region is opened, and intact ones are kept.
+    """Describe the contents of a file; without its index, all regions are opened, and intact ones kept.
 
     Raises BadInput if the file is missing, unreadable, or not MCAP.
     """

@@ -247,7 +247,7 @@ def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch
     assert list(kernels.iterdir()) == []
     assert caplog.messages == [
         f"the cache {kernels} cannot be written (No space left on device): "
-        "what is compiled now is not kept"
+        "newly compiled code is not stored"
     ]
 
 
@@ -275,8 +275,8 @@ def test_only_a_folder_of_this_user_alone_is_used(
     monkeypatch.delattr(os, "getuid")
     assert ours()
     assert caplog.messages == [
-        f"the cache {kernels} is not used: other users may write to it; chmod go-w forbids them",
-        f"the cache {kernels.parent} is not used: other users may write to it; chmod go-w forbids them",
+        f"the cache {kernels} is not used: other users may write to it; run chmod go-w on it",
+        f"the cache {kernels.parent} is not used: other users may write to it; run chmod go-w on it",
         f"the cache {kernels.parent} is not used: another user owns it; set FUSELOG_CACHE to your own",
     ]
 
@@ -427,7 +427,7 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
     exec("def typed(value): return value", typed)
     with pytest.raises(BadInput, match="the source of typed cannot be found"):
         compile_over_runs(kernel_of(typed["typed"]))(1, np.zeros(1))
-    with pytest.raises(BadInput, match="is not a `def` function, of which kernels are made"):
+    with pytest.raises(BadInput, match="is not a `def` function, as kernels have to be"):
         compile_over_runs(kernel_of(lambda value: value))(1, np.zeros(1))
     with pytest.raises(BadInput, match=r"uses the array 'scale', which could change: pass it as an arg"):
         numba_over_runs(kernel_of(scaled_by(np.ones(3))))(1, np.zeros(1))

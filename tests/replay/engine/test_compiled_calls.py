@@ -93,7 +93,7 @@ def test_the_language_of_kernels_is_pythons():
 
 
 def test_no_array_that_a_function_made_leaves_it_through_another():
-    with pytest.raises(BadInput, match="it returns an array that it has made"):
+    with pytest.raises(BadInput, match="it returns an array that it created"):
         compile_over_runs(escaping)(1, np.empty(1))
 
 

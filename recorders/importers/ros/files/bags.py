@@ -22,9 +22,9 @@ _MAGIC = zstandard.FRAME_HEADER
 
 @dataclass
 class Bag:
-    """The files of one bag, in the order of their splits, and what is known to be missing.
+    """The files of one bag, in the order of their splits, and sentences on missing parts.
 
-    `stated` has the number of messages of each topic according to metadata.yaml; `is_packed` says that
+    `stated` has the number of messages of each topic according to metadata.yaml; `is_packed` is True if
     every message is compressed separately.
     """
 
@@ -52,7 +52,7 @@ class Bag:
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, a sentence each; complete after reading."""
+        """Return a sentence for each part that cannot be read; complete after reading."""
         found = [*self.missing, *(loss for file in self.files for loss in file.losses)]
         return list(dict.fromkeys(found))  # a part that is read twice is reported twice
 
@@ -116,7 +116,7 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
 
 
 def _looks_packed(batch: Batch) -> bool:
-    """Test whether messages are compressed although no metadata.yaml says so: CDR never begins so."""
+    """Test by their first bytes whether messages are compressed although no metadata.yaml states it."""
     begin = int(batch.begins[0]) if len(batch.begins) else len(batch.data)
     return batch.connection.encoding == "cdr" and batch.data[begin : begin + 4].tobytes() == _MAGIC
 

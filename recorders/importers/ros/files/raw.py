@@ -1,4 +1,4 @@
-"""Messages as bytes with the stamps of the recorder, as files of a bag hold them."""
+"""Messages as bytes with the stamps of the recorder, as stored in the files of a bag."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -54,7 +54,7 @@ class BagFile(Protocol):
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, with a sentence for each loss."""
+        """Return a sentence for each part that cannot be read."""
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
         """Yield the messages of the wanted connections, a chunk of the file at a time."""

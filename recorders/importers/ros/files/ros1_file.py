@@ -48,7 +48,7 @@ class _Record(NamedTuple):
 class _Scanned(NamedTuple):
     """The records of a chunk (n,): kinds, connections, stamps, and positions of headers and data.
 
-    `end` is where the walk stopped: the chunk's length, or the first incomplete record.
+    `end` is the position at which the walk stopped: the chunk's length, or the first incomplete record.
     """
 
     kinds: NDArray[np.int64]

@@ -57,7 +57,7 @@ class SqliteFile:
 
     @property
     def losses(self) -> list[str]:
-        """Return what cannot be read, with a sentence for each loss."""
+        """Return a sentence for each part that cannot be read."""
         return [f"{self.path}: {loss}" for loss in self._losses.values()]
 
     def _open(self) -> sqlite3.Connection:

@@ -410,15 +410,15 @@ def with_a_measured_range(run: int, out: np.ndarray) -> None:
 
 REFUSED = {
     with_try: "a kernel has no try statements",
-    with_growth: "an array that is made here has sizes that are known; pass it as scratch",
-    with_returned_memory: "it returns an array that it has made; pass one that it fills",
+    with_growth: "an array that is created here needs known sizes; pass it as scratch",
+    with_returned_memory: "it returns an array that it created; pass an array that it fills",
     with_a_list: "a kernel has no List",
     with_itself: "with_itself calls itself",
-    with_what_could_change: "an array that could change is part of a kernel; pass it as an argument",
-    with_a_sum: "a kernel that makes no arrays cannot call sum; others have allocates=True",
+    with_what_could_change: "a kernel uses an outside array that could change; pass it as an argument",
+    with_a_sum: "a kernel that creates no arrays cannot call sum; others have allocates=True",
     with_two_kinds: "found is a tuple here and a Number before",
-    with_a_real_range: r"range\(2.7\) is of integers only; convert by int\(\)",
-    with_a_measured_range: r"range\(1, out\[run\]\) is of integers only",
+    with_a_real_range: r"range\(2.7\) accepts only integers; convert them with int\(\)",
+    with_a_measured_range: r"range\(1, out\[run\]\) accepts only integers",
     with_mixed_signs: "signed and unsigned integers together; convert one of them",
 }
 
