@@ -44,7 +44,7 @@ def stated(
     return np.nan
 
 
-# For a number, the name under which channels state a power of it, and the exponent that undoes this
+# For a number, the name under which channels state a power of it, and the exponent that inverts this
 # power.
 _POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
 
