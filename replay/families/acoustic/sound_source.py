@@ -55,7 +55,7 @@ def stay(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def hear(state: Components, reference: Components, parameters: Any) -> Components:
-    """Compute the arrival time at the first point minus that at the second, plus the reference's error."""
+    """Compute the arrival time at the first point minus that at the second, plus the shared error."""
     away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
     return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
 
