@@ -45,7 +45,7 @@ class JudgedSets:
 
     @property
     def outside_arena(self) -> int:
-        """Count the frames with the robot outside its assumed arena, where nothing is guaranteed."""
+        """Count the frames without a guarantee because the robot is outside its assumed arena."""
         return int((self.known & ~self.in_arena).sum())
 
 
