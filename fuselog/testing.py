@@ -17,7 +17,7 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
 __all__ = ["Golden", "Replayed", "assert_golden", "assert_same"]
 
-# Name of an environment variable: if it is set, goldens are written instead of compared.
+# Name of an environment variable; if it is set, golden files are written instead of compared.
 UPDATE = "FUSELOG_UPDATE_GOLDENS"
 
 
@@ -26,18 +26,18 @@ def assert_golden(
     golden: str | Path,
     estimators: str | Mapping[str, Kind] | list[str | Mapping[str, Kind]] | None = None,
 ) -> None:
-    """Replay estimators over logs and compare the estimates with a golden field by field.
+    """Replay estimators over logs and compare the estimates with a golden file, field by field.
 
-    If the environment variable FUSELOG_UPDATE_GOLDENS is set, the golden is written instead of
-    compared.
+    If the environment variable FUSELOG_UPDATE_GOLDENS is set, the golden file is written, not compared.
 
     Args:
         logs: a log, a folder of logs, or runs by name, such as `{"seed 7": fuselog.record(...)}`.
         golden: the golden file. Its name ends in .golden.xz; keep it next to the tests.
-        estimators: as for `fuselog.replay`; by default those that the golden names.
+        estimators: as for `fuselog.replay`; by default those that the golden file names.
 
-    Raises AssertionError with the first difference: topic, run, stamp, component, both values, and
-    the innovation there. Raises BadInput if the golden does not exist or was made from other runs.
+    Raises AssertionError with the first difference: topic, run, stamp, component, both values, and the
+    innovation at this stamp. Raises BadInput if the golden file does not exist or was made from other
+    runs.
     """
     runs = logs if isinstance(logs, Mapping) else runs_of(Path(logs))
     place = Path(golden)
@@ -51,7 +51,7 @@ def assert_golden(
 
 
 def assert_same(replayed: Replayed, golden: str | Path) -> None:
-    """Compare estimates that were made by other means with a golden; raise as `assert_golden` does."""
+    """Compare estimates from any source with a golden file; raise as `assert_golden` does."""
     _require(compared(read(Path(golden)), replayed), Path(golden))
 
 

@@ -25,7 +25,7 @@ _TINY = 1e-300
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
-    """Compute quantiles: the values below which a chi-squared variable is with given probabilities.
+    """Compute the quantiles of the chi-squared distribution for given probabilities.
 
     Args:
         probability: (...), from 0 to 1.
@@ -51,7 +51,7 @@ def isf(probability: ArrayLike, degrees: ArrayLike) -> Numbers:
 
 
 def sf(value: ArrayLike, degrees: ArrayLike) -> Numbers:
-    """Compute the probabilities with which a chi-squared variable exceeds given values.
+    """Compute the probabilities that a chi-squared variable exceeds given values.
 
     Args:
         value: (...), not negative.
@@ -68,7 +68,7 @@ def _quantile(below: ArrayLike, above: ArrayLike, degrees: ArrayLike) -> Numbers
 
 
 def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
-    """Apply a kernel to the elements of broadcast arrays, the last of which are degrees of freedom."""
+    """Apply a kernel to each element of broadcast arrays; the last array has the degrees of freedom."""
     same = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in numbers))
     columns = [np.ascontiguousarray(each).ravel() for each in same]
     shape = 0.5 * columns.pop()
@@ -115,7 +115,7 @@ def _log_of_rest(log_probability: float) -> float:
 
 
 def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floats) -> None:
-    """Compute the probability with which a value is exceeded."""
+    """Compute the probability that a value is exceeded."""
     half = 0.5 * value[run]
     if not 0.0 < shape[run] < math.inf or not half >= 0.0:
         found[run] = math.nan

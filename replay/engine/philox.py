@@ -1,9 +1,9 @@
-"""Random numbers inside kernels by Philox, whose state is a counter and the key of the run.
+"""Random numbers inside kernels by the generator Philox, with a counter and a key for each run.
 
-A kernel that creates no arrays cannot hold a NumPy generator; the state of this one is a few words per
-run. The words are those of `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random numbers:
-as easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method for
-generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
+A kernel that creates no arrays cannot use a NumPy generator; the state of this one is a few words per
+run. It generates the same words as `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random
+numbers: as easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method
+for generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
 """
 
 from collections.abc import Iterable
@@ -66,7 +66,7 @@ def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, n
 
 
 def unit(word: np.uint64) -> float:
-    """Map a word to the midpoint of one of 2^53 intervals of (0, 1), so that it is neither 0 nor 1."""
+    """Map a word to the midpoint of one of 2^53 intervals of (0, 1); the result is never 0 or 1."""
     return (float(word >> np.uint64(11)) + 0.5) * _UNIT
 
 
@@ -93,8 +93,8 @@ _ENDS, _HEIGHTS, _SHARES = _ziggurat()
 def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int:
     """Fill an array with draws from N(0, 1).
 
-    The blocks after number `counter` provide one word per draw. About one draw in 67 is not settled by
-    its word and uses further blocks after these.
+    The blocks after number `counter` provide one word per draw. About one draw in 67 needs more than its
+    word; it uses further blocks after these.
 
     Args:
         numbers: (n,), overwritten; n is a multiple of four.
@@ -127,7 +127,7 @@ def layer_of(word: np.uint64) -> tuple[int, float, float]:
 
 
 def settled(layer: int, share: float, sign: float, key: Words, counter: int) -> tuple[float, int]:
-    """Draw from a layer beyond its inner part by rejection sampling, and return the counter reached."""
+    """Draw from the outer part of a layer by rejection sampling, and return the new counter."""
     while True:
         counter += 1
         a, b, c, _ = philox(counter, key)

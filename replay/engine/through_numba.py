@@ -1,9 +1,9 @@
 """Compilation by numba of recursions that create arrays, including all functions that they call.
 
-numba caches what it compiles (`numba.njit(cache=True)`) but checks for changes only in the file of one
-function. A kernel is therefore cached under a name that contains a digest of everything it depends on:
+numba caches compiled functions (`numba.njit(cache=True)`) but checks only the file of the function
+itself for changes. The name of a cached kernel therefore contains a digest of everything it depends on:
 its code and the code of all functions that it calls, the constants, and the fields of the named tuples
-that it is given.
+among its arguments.
 """
 
 import dis
@@ -77,7 +77,7 @@ class _Loop:
         return lambda first, end: kernel(first, end, leaves)
 
     def _kernel(self, everything: tuple[Value, ...], leaves: tuple[Value, ...]) -> KernelFunction:
-        """Load or compile the loop; its arguments are flattened so that numba knows their types."""
+        """Load or compile the loop with flattened arguments, whose types numba can infer."""
         scope: dict[str, Value] = {"__name__": __name__, "run_once": self._called}
         text = (
             "def kernel(first, end, leaves):\n"
@@ -94,7 +94,7 @@ class _Loop:
             return self._first_called(kernel, leaves, is_kept=True)
 
     def _first_called(self, kernel: FunctionType, leaves: Value, *, is_kept: bool) -> KernelFunction:
-        """Return the kernel, compiled or loaded for such arguments; no run is processed."""
+        """Compile or load the kernel for the types of these arguments, without processing a run."""
         from numba.core.errors import NumbaError
 
         try:
@@ -133,7 +133,7 @@ class _Loop:
         return self._known[function]
 
     def _usable(self, name: str, value: Value) -> Value:
-        """Return the value of a name that a kernel uses, in the form that numba accepts."""
+        """Return the value of a name that a kernel uses, in a form that numba accepts."""
         if isinstance(value, np.ndarray) and value.flags.writeable:
             raise DoesNotCompile(
                 f"{self._function.__qualname__} uses the array '{name}', which could change: pass it as "
@@ -180,7 +180,7 @@ def _put_together(value: Value, places: Iterator[int], scope: dict[str, Value]) 
 
 
 def _steps(code: CodeType) -> Iterator[_Step]:
-    """Yield the instructions of a function, then those of the functions defined inside it."""
+    """Yield the instructions of a function, followed by those of its nested functions."""
     for each in dis.get_instructions(code):
         yield each.opname, each.argval, each.positions.lineno if each.positions else None
     for constant in code.co_consts:

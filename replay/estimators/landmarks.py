@@ -1,8 +1,8 @@
 """Localization of robots in the plane from odometry and other sensors.
 
-These are sightings of mapped landmarks, position fixes, poses and headings; a gyro can replace the turn
-rate of the wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the next
-message. Thrun, Burgard and Fox, Probabilistic Robotics, chapters 3 and 7.
+The other sensors measure mapped landmarks, positions, poses and headings; a gyro can replace the turn
+rate of the wheels. The state is (x_m, y_m, heading_rad); the velocity of an odometry message applies
+until the next message. Thrun, Burgard and Fox, Probabilistic Robotics, chapters 3 and 7.
 """
 
 from collections.abc import Mapping
@@ -55,17 +55,16 @@ class LocalizationParameters(DeadReckoningParameters):
     """Noise and biases of the sensors.
 
     Attributes:
-        sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state its
-            own.
+        sigma_heading_rad: standard deviation of the heading in messages that state no variance of it.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
         bias_range_m: bias of ranges: measured minus true.
         bias_bearing_rad: bias of bearings: measured minus true.
-        bias_heading_rad: bias of headings: measured minus true, such as of a compass that is mounted
-            rotated.
+        bias_heading_rad: bias of headings: measured minus true; for example, of a compass that is
+            mounted at an angle.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
-        lever_x_m, lever_y_m: position of the antenna on the robot, ahead of and to the left of the point
-        that it turns about.
+        lever_x_m, lever_y_m: position of the antenna on the robot: ahead of, and to the left of, the
+            point about which the robot turns.
     """
 
     sigma_heading_rad: PositiveFloat | None = None
@@ -91,7 +90,7 @@ def move(pose: Components, velocity: Components, duration_s: Any, parameters: An
 
 
 def velocity_noise(duration_s: Any, parameters: Any) -> Components:
-    """Return the variances of means of white noise over a time T: density^2 / T."""
+    """Return the variances of white noise averaged over a time T: density^2 / T."""
     return (
         parameters.forward_noise_density**2 / duration_s,
         parameters.turn_noise_density**2 / duration_s,
@@ -99,7 +98,7 @@ def velocity_noise(duration_s: Any, parameters: Any) -> Components:
 
 
 def sight(pose: Components, place: Components) -> Components:
-    """Return range and bearing of a position; NaN if the pose is there, without a derivative."""
+    """Return range and bearing of a position; NaN if the pose is at this position."""
     distance, bearing = range_bearing(pose, place)
     # 0, or NaN if the distance is 0: numba has no np.where for numbers
     defined = np.minimum(np.inf * (distance > 0.0), 0.0)
@@ -145,7 +144,7 @@ def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix that does not state its own."""
+    """Return the variances of a fix whose message states none."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
@@ -155,7 +154,7 @@ def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components
 
 
 def pose_noise(parameters: Any) -> Components:
-    """Return the variances of a pose that does not state its own."""
+    """Return the variances of a pose whose message states none."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
@@ -165,7 +164,7 @@ def heading_alone(pose: Components, reference: Any, parameters: Any) -> Componen
 
 
 def heading_noise(parameters: Any) -> Components:
-    """Return the variance of a heading that does not state its own."""
+    """Return the variance of a heading whose message states none."""
     return (parameters.sigma_heading_rad**2,)
 
 
@@ -192,14 +191,14 @@ def read_heading_covariance(stream: Stream) -> Floats:
 def align(
     path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
 ) -> tuple[Floats, Floats] | None:
-    """Find the pose at the last of several fixes by aligning the antenna's path with them.
+    """Find the pose at the last of several fixes by aligning the antenna's path with the fixes.
 
     The path is rotated and shifted by least squares. The error of the odometry is added to the
-    covariance: the mean of a random walk over a span, seen from its end, has a third of the variance
-    that the walk has reached.
+    covariance: relative to its end, the mean of a random walk over a span has a third of the walk's
+    final variance.
 
     Args:
-        path: poses (k, 3) at the fixes, where the odometry alone leads from zero.
+        path: poses (k, 3) at the fixes, from the odometry only, starting at zero.
         places, covariances: positions (k, 2) in m of the fixes, and covariances (k, 2, 2).
         span_s: time from the first to the last fix.
         parameters: parameters with the antenna's position and the odometry's noise densities.
@@ -234,11 +233,11 @@ def align(
 
 
 def read_turn_rate(stream: Stream) -> Floats:
-    """Return the turn rates about the vertical (n, 1) of a gyro that is mounted upright."""
+    """Return the turn rates (n, 1) about the vertical axis of a gyro that is mounted upright."""
     return stream["turn_rate_radps"][:, 2:]
 
 
-COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough to linearise at
+COURSE_SIGMA_RAD = 0.1  # of a heading that is accurate enough for linearisation
 PLANAR = [0, 1, 5]  # x, y and the rotation about z, among the six components of a pose
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
@@ -246,7 +245,7 @@ DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps"
 SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
 COMPASS_ERRORS: Mapping[str, Kind] = {"bias_heading_rad": "angle"}
 LEVER: Mapping[str, Kind] = {"lever_x_m": "linear", "lever_y_m": "linear"}
-# Standard deviation up to which each counts as determined: 1 %, 0.01 rad/s.
+# Each parameter counts as determined up to this standard deviation: 1 %, 0.01 rad/s.
 DRIVE_CALIBRATION: Mapping[str, float] = {
     "forward_scale": 0.01,
     "turn_scale": 0.01,

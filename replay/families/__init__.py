@@ -1,5 +1,5 @@
-"""Estimators, judges and drawings of single families of systems, a package for each family.
+"""Estimators, judges and drawings that are specific to a family of systems; one package per family.
 
-Nothing outside imports these packages: estimators, models, metrics, judges, drawings and timelines
+No module outside imports these packages: estimators, models, metrics, judges, drawings and timelines
 register themselves. One family may use another. Begin with a small one, `ranging`.
 """

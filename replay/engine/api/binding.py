@@ -21,7 +21,7 @@ def bindings_by_name(
     topics: Mapping[str, Topic],
     _values: Parameters,
 ) -> Iterator[Binding]:
-    """Find topics by their names, under every prefix that has all required ones."""
+    """Yield a binding for every prefix under which the log has all required topics."""
     for prefix, found in bindings(topics, {**streams, **static}, optional):
         followed, needed = (
             {name: found[name] for name in names if name in found} for names in (streams, static)
@@ -31,7 +31,7 @@ def bindings_by_name(
 
 
 def requirements_of(asked: Mapping[str, Schema], optional: Collection[str]) -> str:
-    """Describe what a log needs: the requested topics with their schemas."""
+    """Describe the topics that a log must have, with their schemas."""
     return ", ".join(
         f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
         for name, schema in asked.items()
@@ -47,7 +47,7 @@ def topics_of(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def priors_of(bound: Binding) -> dict[str, Components]:
-    """Return the components wanted from each prior, by topic."""
+    """Return the components to read from each prior, by topic."""
     return {bound.static[name].name: components for name, components in bound.priors.items()}
 
 
@@ -59,7 +59,7 @@ def estimator_of(
     find: Find,
     bind_one: Callable[[str, Binding, ParametersType], Bound],
 ) -> Estimator[ParametersType]:
-    """Make an estimator that binds everything that `find` finds, one by one."""
+    """Make an estimator that calls `bind_one` for every binding that `find` yields."""
 
     def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
         return [bind_one(f"{label}{each.suffix}", each, values) for each in find(label, topics, values)]

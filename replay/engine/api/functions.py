@@ -89,16 +89,16 @@ def recursive(
         static: topics that `start` needs as a whole, such as a map or a prior. Gaussian estimates among
             them are priors with the components of the estimate; see `Given.prior`.
         find: replaces `streams` and `static` if their names depend on the log or the parameters:
-            find(name, topics, parameters) returns a `Binding` for everything that can be estimated in
-            the log, and nothing if the log does not fit. The name is the estimator's, for error
-            messages.
+            find(name, topics, parameters) yields a `Binding` for each thing that can be estimated in the
+            log (for each robot, say), or nothing if the log does not fit. `name` is the name of the
+            estimator, for error messages.
         requirements: with `find`, a description of what the log must contain.
         variant: the parameter that is set by the second part of a name such as `shooter:bearings-only`.
         components: components of the estimate by name, with their kinds.
         truth: topic with the true values of the estimated quantities.
         measured: components of the innovations, if `follow` fills them.
-        vectors: by topic of `streams`, the vector components to read. A log that does not state them is
-            refused; without an entry here, vectors are read as they are in the log.
+        vectors: by topic of `streams`, the vector components to read. The log must state these
+            components. Vectors of topics without an entry are read as they are in the log.
         optional: topics of `streams` and `static` that a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
         draws: whether the estimator draws random numbers. `follow` then gets the generator of the run
@@ -110,8 +110,8 @@ def recursive(
             block: it updates the rows of `state` that belong to the run and fills `results`, both in
             place.
         follow_all: replaces `follow`: follow_all(settings, messages, state, results) processes all runs
-            in one call and is called as given, for NumPy code with an axis of runs or for a loop that
-            is already compiled.
+            in one call. It is not compiled: use NumPy code with an axis of runs, or a loop that is
+            already compiled.
         advance: replaces both if the output is not one Gaussian estimate: advance(settings, state,
             block) -> the state after the block and the output streams, whose topics begin with
             /estimates/ + `Given.name`. In that case there are no `components`; the state can be of any

@@ -33,8 +33,7 @@ class Binding(NamedTuple):
     Attributes:
         streams, static: the topics by the names that the functions use for them, see `recursive`.
         suffix: the end of the estimator's name, such as `/robot1`.
-        priors: components that are wanted of the static topics that are Gaussian priors, by the same
-            names.
+        priors: components to read from each static topic that is a Gaussian prior, by the same names.
         setup: further data for the functions, as `Given.setup`.
     """
 
@@ -49,8 +48,8 @@ class Binding(NamedTuple):
 class Given(Mapping[str, Ragged], Generic[ParametersType]):
     """Input of all runs, by the topic names that the estimator's functions use.
 
-    As a mapping, it maps the names of static topics to their streams: for a recursion those that it
-    starts from, for a batch estimator all topics. An optional topic that the log lacks is not a key.
+    As a mapping, it maps topic names to streams: the topics that a recursion starts from, or all topics
+    of a batch estimator. An optional topic that the log lacks is not a key.
 
     Attributes:
         parameters: the estimator's parameters.
@@ -112,7 +111,7 @@ class OneRun(Mapping[str, Stream]):
     run: int
 
     def stated(self, topic: str, name: str) -> float:
-        """Return the parameter `name`, or what `topic`'s channel states; see `Given.stated`."""
+        """Return the parameter `name`, or the number that the channel states; see `Given.stated`."""
         return self.given.stated(topic, name)
 
     def prior(self, topic: str) -> tuple[int, Floats, Floats]:
@@ -172,7 +171,7 @@ class Messages(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """Messages that were not used: offsets by run, stamps, and for each the index of its reason."""
+    """Skipped messages: the offsets of the runs, the stamps, and the indices of the reasons."""
 
     offsets: Integers
     time_ns: Integers
@@ -183,7 +182,7 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: AnyParameters
 ) -> tuple[Messages, Skipped]:
-    """Extract the messages of a block, their fields as numbers, and those that lack a covariance.
+    """Extract the messages of a block as numbers, and list the messages that lack a covariance.
 
     Args:
         block: messages of all runs.

@@ -144,7 +144,7 @@ class Outputs:
         return len(tangent_components(list(self.components), list(self.components.values())))
 
     def blank(self, rows: int) -> Results:
-        """Return results of `rows` rows that are all NaN, accepted and of target 0."""
+        """Make results with `rows` rows: accepted, of target 0, and NaN otherwise."""
         d, t, m = len(self.components), self.tangent, len(self.measured)
         width = sum(len(schema.fields) - 1 for schema in self.further.values())
         return Results(
@@ -159,7 +159,7 @@ class Outputs:
         )
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
-        """Make the output streams of one block; the last of several estimates at a stamp is kept."""
+        """Make the output streams of one block; of several estimates with one stamp, keep the last."""
         # invalid covariances are found and reported by the replay
         is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
         rows = np.flatnonzero(is_estimate)

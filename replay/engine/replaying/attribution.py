@@ -1,9 +1,9 @@
 """Assignment of innovations to topics by their stamps, for estimators that use several topics.
 
-Innovations do not state their topic. If messages of several topics have the same stamp, and the same
-number of innovations has it, the innovations belong to these messages in the order of the file. If the
-numbers differ, or innovations have other stamps, as from an estimator that shifts its messages by their
-delay, the topics are counted together.
+Innovations do not state their topic. If messages of several topics have the same stamp, and there is one
+innovation with this stamp for each of them, the innovations belong to these messages in the order of the
+file. If the numbers differ, or if innovations have other stamps (an estimator may shift its messages by
+their delay), the topics are counted together.
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ from fuselog.recorders.log import Clock
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 
 Integers = NDArray[np.int64]
-# The oldest blocks of waiting messages are dropped above this number, as at the end of a run.
+# If more messages than this wait for innovations, the oldest blocks are dropped, as at the end of a run.
 MOST_WAITING = 1 << 18
 
 

@@ -1,4 +1,4 @@
-"""Share of each run for which a case was estimated, computed from the stamps of its estimates."""
+"""Share of each run that the estimates of a case cover, computed from their stamps."""
 
 import math
 from functools import cached_property
@@ -60,7 +60,7 @@ class Coverage:
             self._last_block = ()
 
     def estimated_s(self) -> Floats:
-        """Compute for how long (runs,) there were estimates, excluding gaps."""
+        """Compute the time in s (runs,) that estimates cover, excluding gaps."""
         self._count()
         is_gap = np.arange(self.BINS)[:, None] > self._longest()
         seconds: Floats = np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9

@@ -2,8 +2,8 @@
 
 An estimator is bound to topics and turns ragged streams into ragged streams. A recursive estimator gets
 the blocks of its topics one after another and carries a state from block to block; a batch estimator
-gets whole streams. One run and many use the same call, so the results of an ensemble equal those of its
-runs replayed one by one, bit for bit.
+gets whole streams. A single run and an ensemble use the same call, so an ensemble gives exactly the same
+results, bit for bit, as its runs replayed one by one.
 """
 
 import re
@@ -38,15 +38,15 @@ class Initialized(NamedTuple):
 
 @dataclass(frozen=True)
 class Initialization:
-    """Method by which an estimator finds what a log does not state, such as the initial state.
+    """Method for finding values that a log does not state, such as the initial state.
 
     Attributes:
         topics: topics whose first messages it is given.
-        find: find(first messages, static topics, clock) -> what the estimator starts from; the clock is
-            the one by which the replay stamps estimates.
-        find_broad: find_broad(first messages, static topics, clock, a stamp for each run) -> the
-            equally likely starts of all runs there, so broad that parameters have no influence on them:
-            likelihoods with other parameters, or of a log without a fault, are compared from these
+        find: find(first messages, static topics, clock) -> the static topics to start from, and output
+            streams; the replay stamps estimates by this clock.
+        find_broad: find_broad(first messages, static topics, clock, a stamp for each run) -> equally
+            likely starts of all runs at these stamps, so broad that the parameters do not influence
+            them. Likelihoods with other parameters, or of a log without a fault, are compared from these
             starts. None if `find` is used instead.
     """
 
@@ -58,7 +58,7 @@ class Initialization:
     ) = None
 
 
-NEEDED_MESSAGES = 4096  # read at a time, until a message has a needed value
+NEEDED_MESSAGES = 4096  # to read at a time, until a message has a needed value
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,11 @@ Setting = Any  # type: ignore[explicit-any]
 
 
 class Needed(NamedTuple):
-    """Requirement that some message of a topic has a value of a field; the layout does not show this.
+    """Requirement that at least one message of a topic has a value in a field.
 
     Attributes:
         field: name of the field.
-        refusal: error message if no message has a value of it.
+        refusal: error message if no message has such a value.
     """
 
     field: str
@@ -136,7 +136,7 @@ class Recursive:
     """Bound estimator that processes its topics in time order.
 
     Attributes:
-        name: its output topics begin with `/estimates/` + name.
+        name: name of the estimator; its output topics begin with `/estimates/` + name.
         streams: topics that `run` gets, in the order of the indices in `Events.topic`.
         static: topics that `start` needs as a whole, such as a map or a prior.
         start: start(static topics) -> the state before the first block.
@@ -156,7 +156,7 @@ class Recursive:
         assumed: values of the parameters that are assumed, because the log does not state them.
         is_random: whether it draws random numbers, so that its likelihood is not a smooth function of
             its parameters.
-        offers: by topic that it does not use, the setting that would make it use the topic.
+        offers: for each topic that it does not use, the setting with which it would use the topic.
         reading: what it reads; None if that is not known.
         needed: by topic, a field without which it does not fit a log.
         truth: topic against which its estimates are judged, and which it must not read.
@@ -194,7 +194,7 @@ class Batch:
     `streams` are the measurements within the replayed span; everything else is as for `Recursive`.
 
     Attributes:
-        name: the label, and what is estimated.
+        name: the label, followed by the name of the estimated thing.
         streams: topics of measurements.
         static: topics that are read as a whole.
         solve: solve(streams of all runs by topic) -> the output streams.
@@ -371,7 +371,7 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting])
 
     The ensemble caches the estimators last bound to it, so binding with the same settings again is free.
 
-    Raises BadInput if the estimator does not fit the log, or if the runs do not state its topics alike.
+    Raises BadInput if the estimator does not fit the log, or if its topics differ from run to run.
 
     Args:
         label: label of the estimator, see `configure`.

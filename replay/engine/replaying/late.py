@@ -8,8 +8,8 @@ policies:
     wait:SECONDS    hold back every message until this time after its stamp; then as drop
     rewind:SECONDS  reprocess the messages after it, by at most this time; skip older messages
 
-Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Messages that
-newer ones waited for are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
+Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Messages for
+which newer messages waited are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
 does the reprocessing itself and reports it on `rewound`, as `schemas.REWOUND`
 (`Recursive.out_of_sequence`; for filters of models, `fuselog.replay.inference.run.out_of_sequence`, for
 those of libraries `fuselog.replay.foreign.native.out_of_sequence`).
@@ -42,7 +42,7 @@ class Late(NamedTuple):
 
     @property
     def back_ns(self) -> int:
-        """Return by how much the stamps that an estimator is given may go back."""
+        """Return how far back, in ns, the stamps of an estimator's messages may go."""
         return self.window_ns if self.policy == "rewind" else 0
 
 
@@ -81,10 +81,11 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
 def taking_late(bound: Bound, late: Late) -> Recursive:
     """Make an estimator that gets its messages in order of log time.
 
-    Raises BadInput if the estimator is not recursive, or cannot go back as the policy asks.
+    Raises BadInput if the estimator is not recursive, or cannot reprocess messages as the policy
+    requires.
 
     Args:
-        bound: the estimator that wants its messages in order of their stamps.
+        bound: the estimator, which expects its messages in order of their stamps.
         late: policy for out-of-sequence messages.
     """
     if not isinstance(bound, Recursive):
@@ -224,9 +225,9 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
 def _find_behind(
     arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
 ) -> tuple[Integers, Integers]:
-    """Find the newest stamps (runs,) after the ready messages, and how far (n,) each was behind them.
+    """Find the newest stamps (runs,) after the ready messages, and the lag (n,) of each message.
 
-    Zero for a message that is not behind its predecessors, and for one that is not ready.
+    The lag is zero if a message is not older than its predecessors, or is not ready.
     """
     newest_ns = np.zeros(arrivals.runs, np.int64) if before_ns is None else before_ns.copy()
     behind_ns, rows = np.zeros(len(ready), np.int64), np.flatnonzero(ready)
@@ -276,7 +277,7 @@ def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> R
 def _waited(
     name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
 ) -> tuple[Integers, Ragged]:
-    """Find the newest stamps (runs,) that have arrived, and messages that newer ones wait for."""
+    """Find the newest stamps (runs,) that have arrived, and the messages for which newer ones wait."""
     arrivals = _arrivals(Late("drop", 0), streams, {})
     everything = np.ones(len(arrivals.run), bool)
     arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)

@@ -1,9 +1,9 @@
 """Monitoring of an estimator while it processes the runs of an ensemble, for any kind of estimator.
 
 A run fails on its own if it cannot start, if its code raises, if a covariance is invalid, if stamps go
-back, or if it stops giving estimates. A failed run gets no further messages and gives no further
-outputs, and the other runs are not affected. The monitor also counts for how much of each run there
-were estimates, and the time that the estimator took.
+back, or if its estimates end before the run does. A failed run gets no further messages and has no
+further outputs; other runs are not affected. The monitor also measures the share of each run that has
+estimates, and the computing time of the estimator.
 """
 
 import time
@@ -47,7 +47,7 @@ class RunMonitor:
     Attributes:
         name: name of the bound estimator.
         runs: number of runs.
-        seconds: working time of the estimator, without one-time work such as compiling.
+        seconds: computing time of the estimator in s, without one-time work such as compiling.
         usage: counts of how its measurements were used; None if they are not counted.
         static: the streams that it starts from.
         refused: the exception that all runs of a part of an ensemble raised.
@@ -193,7 +193,7 @@ class RunMonitor:
         ]
 
     def _starts(self) -> Integers:
-        """Return the stamps before any estimate; a batch's estimates cover a run from its start."""
+        """Return the stamps (runs,) from which batch estimates cover each run; -1 for a recursion."""
         return self._first_ns if self._is_batch else np.full(self.runs, -1)
 
     def _note_span(self, streams: Streams) -> None:
@@ -210,7 +210,7 @@ class RunMonitor:
         }
 
     def _end_raising(self, work: Callable[[Streams], object], streams: Streams, error: BadInput) -> None:
-        """Find the runs that raise by bisecting the set of runs, and the stamp at which each does."""
+        """Bisect the runs to find those that raise, and the stamp at which each of them raises."""
 
         def raised(end_ns: Integers) -> BadInput | None:
             try:
@@ -289,7 +289,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """Remove the rows of an output from a run's first bad one on, or from the run's end on."""
+        """Remove the rows of each run from its first invalid row, or from the end of the run."""
         if first_bad is None and not self._has_ends:
             return output
         run = run_of_rows(output.offsets)
@@ -299,7 +299,7 @@ class RunMonitor:
         return output if kept.all() else _kept(output, kept)
 
     def _find_silence(self, failed: set[int]) -> None:
-        """Record a failure for runs with messages whose state was never estimated, or not up to the end.
+        """Record a failure for each run that has messages but no estimates, or none at its end.
 
         Runs that have already failed are excluded.
         """

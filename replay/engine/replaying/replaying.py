@@ -37,7 +37,7 @@ FIRST_MESSAGES = 1 << 15
 ASYMMETRIC = 1e-6
 # The largest start (in bytes) that is cached with an ensemble in memory.
 SMALL_BYTES = 1 << 16
-# The state of an estimator that can start in no run.
+# The state of an estimator that cannot start in any run.
 _REFUSED = object()
 
 
@@ -46,9 +46,9 @@ class Report:
     """Report of a replay in addition to its outputs.
 
     Attributes:
-        seconds: working time of each estimator by label, without one-time work such as compiling.
-        coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
-        refused: by estimator, why no run of a part can be replayed.
+        seconds: computing time of each estimator in s by label, without one-time work such as compiling.
+        coverage: for each case, the share of every run that has estimates (`schemas.COVERAGE`).
+        refused: by estimator, the error that no run of a part can be replayed.
         usages: by estimator, how its measurements were used.
     """
 
@@ -75,7 +75,7 @@ def replay(
         estimators: bound estimators with different names.
         order: the clock to go by: publish time, or log time (order of arrival).
         late: in order of log time, the policy for messages whose publish times go back; without it, log
-            time is taken as the time of measurement.
+            time is used as the time of measurement.
         block_messages: approximate number of messages of a run in memory at a time.
         report: filled after the last block.
         is_part: whether there are more runs than these. It is then not an error if an estimator can
@@ -162,9 +162,10 @@ class _Start(NamedTuple):
     """Start of a bound estimator.
 
     Attributes:
-        state: state of a recursion, or input of a batch estimator; _REFUSED if it can start in no run.
-        unable: by run, why the estimator cannot start there.
-        why: the error if it can start in no run.
+        state: state of a recursion, or input of a batch estimator; _REFUSED if it cannot start in any
+            run.
+        unable: by run, the reason why the estimator cannot start.
+        why: the error if it cannot start in any run.
         streams: output streams of the initialization.
     """
 
@@ -210,7 +211,7 @@ def _start(
     order: Clock,
     stamps: Clock,
 ) -> _Start:
-    """Start an estimator; if it can start in no run, the result has the reason."""
+    """Start an estimator; if it cannot start in any run, return the reason in the result."""
     streams: Sequence[Ragged] = ()
     try:
         found, streams = _initialized(ensemble, bound, static, order, stamps)
@@ -249,7 +250,7 @@ def _initialized(
 
 
 def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str, BadInput]:
-    """Return, by the label of an estimator, why it can start in no run.
+    """Return, by label, the error of each estimator that cannot start in any run.
 
     If only some of the bound estimators of a label (one for each robot, say) cannot start, these fail
     on their own.
@@ -310,7 +311,7 @@ def _refuse_old_priors(
 def _refuse_asymmetric_priors(
     bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged]
 ) -> None:
-    """Raise BadInput if a prior's covariance is not symmetric; its two triangles would disagree."""
+    """Raise BadInput if the covariance of a prior is not symmetric."""
     for topic in bound.priors.keys() & static.keys():
         prior = static[topic]
         run = prior.findings.once("asymmetric", partial(_first_asymmetric, prior))
@@ -345,7 +346,7 @@ def _required(
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
-    """Join the blocks of a replay into whole output streams by topic, each run's rows together."""
+    """Join the blocks of a replay into whole output streams by topic; rows of a run are adjacent."""
     parts: dict[str, list[Ragged]] = {}
     for block in outputs:
         for ragged in block:

@@ -1,4 +1,4 @@
-"""Detection of invalid estimates: not finite, with an invalid covariance, or stamped before the last."""
+"""Detection of estimates that are not finite, have an invalid covariance, or go back in time."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ UNSOUND = (
     "the covariance is not symmetric",
 )
 NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK, NOT_SYMMETRIC = range(len(UNSOUND))
-# Fraction of a variance: a covariance that is singular up to rounding, as of one particle, is valid.
+# Fraction of a variance: a covariance that is singular up to rounding (for example, of one particle) is
+# valid.
 INDEFINITE = 1e-9
 # Squared fraction of two standard deviations: rounding in single precision is smaller.
 ASYMMETRIC = 1e-6
@@ -33,7 +34,7 @@ def find_unsound(
     found: Integers,
     factor: Floats,
 ) -> None:
-    """Find the first invalid estimate of a run, and which entry of `UNSOUND` describes it.
+    """Find the first invalid estimate of a run, and the entry of `UNSOUND` that describes its fault.
 
     Args:
         run: number of the run.

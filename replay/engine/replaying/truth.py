@@ -1,8 +1,8 @@
-"""Checks that filters do not read the truth by which their estimates are judged.
+"""Checks that filters do not read the truth against which their estimates are judged.
 
-A truth is a topic of `TruthState`, or one that a channel or an estimator names as its truth. Estimators
-are bound to logs by `estimator.bound_to`, which refuses one that reads a truth. A bound is not an
-estimate and may read it; a replay that starts from the truth passes a prior instead.
+A truth is a topic of type `TruthState`, or a topic that a channel or an estimator names as its truth.
+`estimator.bound_to`, which binds estimators to logs, rejects an estimator that reads a truth. A bound is
+not an estimate and may read the truth; a replay that starts from the truth passes it as a prior.
 """
 
 from collections.abc import Collection, Mapping
@@ -40,7 +40,7 @@ def refuse_truths(label: str, read: Collection[str], truths: Collection[str], ho
 def refuse_named_truths(
     label: str, renamed: Mapping[str, str], topics: Mapping[str, Topic], own: Collection[str]
 ) -> None:
-    """Raise BadInput if a setting `topics.ROLE` names a truth for a role that is not a truth.
+    """Raise BadInput if a setting `topics.ROLE` selects a truth for a role that is not a truth.
 
     Args:
         label: label of the estimator.

@@ -1,7 +1,7 @@
-"""Counts of how an estimator's measurements were used: used, gated, skipped, or without effect.
+"""Counts of an estimator's measurements by outcome: used, gated, skipped, or without effect.
 
-They are computed from inputs and outputs, for any estimator: messages by topic, innovations, and the
-messages that the estimator reports as skipped.
+They are computed from the inputs and outputs of any estimator: its messages by topic, its innovations,
+and the messages that it reports as skipped.
 """
 
 from collections import Counter
@@ -33,7 +33,7 @@ class Row(NamedTuple):
         estimator: its label.
         topic: topic of the measurements; several topics if innovations cannot be assigned to one.
         messages: number of messages.
-        used, gated: numbers of accepted and of rejected innovations; None if the estimator gives no
+        used, gated: numbers of accepted and of rejected innovations; None if the estimator has no
             innovations.
         skipped: number of messages that the estimator reports as skipped.
         why: reasons for unused messages, in words.
@@ -54,7 +54,7 @@ class Row(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Return a sentence on unused messages; empty if all were used or the reason is known."""
+        """Return a sentence about unused messages; empty if all were used or the reason is known."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -72,8 +72,8 @@ class Usage:
         facts: by topic, the number of messages to which each description applies.
         used, gated: numbers of accepted and rejected innovations.
         skipped: number of skipped messages, by reason.
-        speaks: whether the estimator gives innovations.
-        doubtful: by topic that it starts from, a sentence on what is wrong with it.
+        speaks: whether the estimator has innovations.
+        doubtful: by topic that it starts from, a sentence about a problem with the topic.
         shares: the innovations by topic.
         begins_ns: (runs,) the stamp of the first prior; None if there are no priors.
     """
@@ -105,7 +105,7 @@ class Usage:
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Record landmarks that are stated at two positions."""
+        """Record landmarks for which the map states two positions."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.where(np.diff(number) == 0, np.linalg.norm(np.diff(place, axis=0), axis=1), 0.0)
@@ -118,7 +118,7 @@ class Usage:
     def note_given(
         self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged], order: Clock = "publish_time"
     ) -> None:
-        """Count a block of messages, `streams`, by the clock `order`.
+        """Count the messages of a block, `streams`, in the order of the clock `order`.
 
         `static` are the streams that the estimator started from.
         """
@@ -175,7 +175,7 @@ class Usage:
         self.shares.merge(other.shares)
 
     def rows(self) -> Iterator[Row]:
-        """Yield how measurements were used, by topic, or together if they cannot be separated."""
+        """Yield a row for each topic, or one for all topics if their innovations cannot be separated."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
@@ -204,7 +204,7 @@ class Usage:
 
     @property
     def _is_by_topic(self) -> bool:
-        """Test whether the outcome is known for every topic, or there is nothing to know."""
+        """Test whether the outcome of every topic's measurements is known."""
         named = all(_topic_in(why, self.measured) for why in self.skipped)
         return not self.measured or (named and (self.shares.is_known or not self.speaks))
 

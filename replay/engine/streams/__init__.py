@@ -1,4 +1,4 @@
-"""Streams of many runs end to end: reading, merging in time order, and making output streams.
+"""Streams of many runs: how they are read, concatenated, merged in time order, and output.
 
 Begin with `blocks`.
 """

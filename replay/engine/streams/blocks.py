@@ -1,4 +1,4 @@
-"""Streams of many runs in ragged columns, end to end, and their events merged in time order."""
+"""Streams of many runs, concatenated in ragged columns, and their events merged in time order."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ Found = TypeVar("Found")
 
 
 class Findings(dict[Hashable, Columns]):
-    """Cache of values computed from columns, which never change; the most recent entries are kept."""
+    """Cache of values computed from columns that never change; it keeps the most recent entries."""
 
     def __init__(self, most: int = 16) -> None:
         super().__init__()
         self._most = most
 
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return the cached value of `key`, or the result of calling `find`, which is then cached."""
+        """Return the cached value of `key`; if there is none, call `find` and cache its result."""
         try:
             known: Found = self[key]
             return known
@@ -54,7 +54,7 @@ class Ragged:
 
     @cached_property
     def findings(self) -> Findings:
-        """Return the cache of values computed from these messages alone, such as priors."""
+        """Return the cache of values that depend only on these messages, such as priors."""
         return Findings()
 
     def __getitem__(self, name: str) -> AnyArray:
@@ -77,9 +77,9 @@ class Ragged:
 class Events(NamedTuple):
     """Messages of several topics in time order; events offsets[r]:offsets[r + 1] belong to run r.
 
-    Event e is a message of the topic with index `topic[e]`, and message number `source[e]` of all
-    topics end to end. `is_last[e]` is true if no later event of the run has the same stamp: an estimate
-    is given then.
+    Event e is a message of the topic with index `topic[e]`, and message number `source[e]` of all topics
+    end to end. `is_last[e]` is true if no later event of the run has the same stamp: only then is there
+    an estimate.
     """
 
     offsets: NDArray[np.int64]
@@ -98,8 +98,9 @@ class Block(NamedTuple):
     Attributes:
         streams: by topic.
         events: the messages of all topics in order of processing.
-        arrival: (n, 2), for every event the time at which it is processed and its position in the file,
-            if the order is not that of stamps alone; see `fuselog.replay.engine.replaying.late`.
+        arrival: (n, 2), for every event, the time at which it is processed and its position in the file,
+            if the events are not simply in the order of their stamps; see
+            `fuselog.replay.engine.replaying.late`.
         findings: cache of a block that is replayed again; otherwise None.
     """
 
@@ -109,7 +110,7 @@ class Block(NamedTuple):
     findings: Findings | None = None
 
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return the cached value of `key`, or what `find` computes from these messages."""
+        """Return the cached value of `key`; if there is none, compute it with `find`."""
         return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> AnyArray:
@@ -160,7 +161,7 @@ def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def by_runs(parts: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order the rows of several parts, end to end, so that the rows of each run are together.
+    """Compute an order of the rows of several parts in which the rows of each run are together.
 
     Args:
         parts: offsets (runs + 1,) of each part.

@@ -1,4 +1,4 @@
-"""Numbers that the channels of a log state, and the search for topics that estimators bind to."""
+"""Lookup of numbers that the channels of a log state, and of topics to which estimators bind."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -19,7 +19,7 @@ def stated(
     needed: bool = True,
     stands_for: str = "",
 ) -> float:
-    """Return the first number with this name that a channel states; NaN if it is missing and not needed.
+    """Return the first number of this name that a channel states; NaN if it is missing and not needed.
 
     A channel may state `sigma_m` as its square, `variance_m2`, and vice versa.
 
@@ -44,7 +44,8 @@ def stated(
     return np.nan
 
 
-# For a number: the name under which channels state a power of it, and the exponent that inverts it.
+# For a number, the name under which channels state a power of it, and the exponent that inverts this
+# power.
 _POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
 
 
@@ -80,7 +81,7 @@ def heading_variance(metadata: Mapping[str, str]) -> float:
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
-    """Return a parameter or, if it is None, what a channel states for it. Errors as in `stated`.
+    """Return a parameter or, if it is None, the value that a channel states; raise as `stated` does.
 
     Args:
         values: the parameters.

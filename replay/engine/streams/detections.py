@@ -1,6 +1,6 @@
-"""Positions of detections in the local tangent plane, from the scan of each and its sensor's position.
+"""Positions of detections in the local tangent plane, from their scans and the sensor's position.
 
-A moving sensor names the topic of its own position in the metadata of its scans, as ORIGIN.
+The metadata of a moving sensor's scans names the topic of the sensor's position, as ORIGIN.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Ensembles of runs that are replayed together, with their streams end to end by topic and cached."""
+"""Ensembles of runs that are replayed together; their streams are concatenated by topic and cached."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -18,7 +18,7 @@ from fuselog.replay.engine.streams.blocks import (
 from fuselog.replay.engine.streams.sources import MemorySource, Source
 
 SourceType = TypeVar("SourceType", bound=Source)
-# Blocks of few messages cache the findings of a few filters; larger blocks would take too much memory.
+# Only small blocks cache the findings of a few filters; larger blocks would need too much memory.
 FEW_MESSAGES, FEW_FILTERS = 1 << 13, 4
 
 
@@ -40,7 +40,7 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def starts_ns(self) -> dict[int, int]:
-        """Return by run where its replayed span starts, if that is not the start of the run."""
+        """Return the start of the replayed span, by run, if it is not the start of the run."""
         starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
         return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
 
@@ -73,7 +73,8 @@ class Ensemble(list[SourceType]):
     ) -> Iterator[dict[str, Ragged]]:
         """Yield the next block of every run, until all runs have ended.
 
-        The runs need not be at the same time, because each has its own state. Recordings are one block.
+        The runs need not be at the same time, because each has its own state. A recording in memory is a
+        single block.
         """
         if not topics:
             return

@@ -1,7 +1,7 @@
-"""Failures of runs: which runs an estimator could not process to the end, when and why.
+"""Failures of runs that an estimator could not process to the end, with time and reason.
 
-A failure is a message whose number is an index in a list of sentences; the channel's metadata has the
-list as JSON. Streams whose lists differ are merged into one stream when they are joined.
+A failure is a message with a number, an index in a list of sentences; the channel's metadata has this
+list as JSON. When streams are joined, their lists are merged.
 """
 
 import json
@@ -29,7 +29,7 @@ class Failure(NamedTuple):
 
 
 def reason_of(error: Exception) -> str:
-    """Return the text of an exception; for one of ours, the message alone."""
+    """Return the text of an exception; for fuselog's own exceptions, only the message."""
     if isinstance(error, BadInput) and error.__cause__ is None:
         return str(error)
     raised = error.__cause__ if isinstance(error, BadInput) else error
@@ -79,7 +79,8 @@ def reason_stream(
 def sentences_of(stream: Stream) -> list[str]:
     """Return the reason of every message of a stream made by `reason_stream`.
 
-    Raises BadInput if the channel's list is not a JSON list of sentences, as in logs from before 0.1.0.
+    Raises BadInput if the channel's list is not a JSON list of sentences, as in logs older than version
+    0.1.0.
     """
     reasons = _reasons(stream)
     return [

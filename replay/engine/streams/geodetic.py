@@ -1,6 +1,6 @@
 """Conversion of geodetic fixes to positions in the log's local tangent plane (ENU).
 
-The origin is the one that the log's channels state, otherwise the first fix of the run.
+The origin is stated by the log's channels; otherwise it is the first fix of the run.
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,7 +24,7 @@ def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:
     """Return the origin that channels state (3,): latitude and longitude in deg, altitude in m; or None.
 
     An altitude that is not stated is zero. Raises BadInput if channels state different origins, or if a
-    channel states only half of one.
+    channel states only a latitude or only a longitude.
     """
     found: dict[str, tuple[float, ...]] = {}
     for topic in topics.values():
@@ -65,8 +65,8 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
     """Convert geodetic fixes to positions (n, 3) relative to origins (runs, 3).
 
     A missing value, such as the altitude, becomes NaN. Covariances (n, 9) are rotated from the axes of
-    the fix to those of the origin; a log may state them diagonal or full, for east and north only or
-    including up.
+    the fix to those of the origin; a log may store them as diagonals or in full, for east and north only
+    or including up.
 
     Args:
         fixes: latitudes, longitudes and altitudes of all runs.

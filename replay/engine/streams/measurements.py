@@ -47,7 +47,7 @@ class Vectors(NamedTuple):
 class MeasuredVectors(NamedTuple):
     """Measured vectors (n, d), their covariances (n, d, d), and which covariances are missing (n,).
 
-    A covariance that the log lacks (NaN, or a variance of zero) is replaced by that of the given sigma;
+    A covariance that the log lacks (NaN, or a variance of zero) is computed from the given sigma;
     without a sigma it is missing. Components of the vector that are NaN need no covariance.
     """
 
@@ -211,7 +211,7 @@ def check_width(stream: Stream, field: str, width: int) -> None:
 
 
 def _stated(stream: Stream, field: str) -> Mapping[str, str]:
-    """Return names and kinds as the channel states or the field implies them; check their number."""
+    """Return the names and kinds that the channel states or the field implies; check their number."""
     width = stream[field].shape[1]
     stated = stream.metadata
     if "components" not in stated:

@@ -1,8 +1,8 @@
 """Transformation of positions between local tangent planes (ENU) with different origins.
 
-The two planes are rotated and shifted against each other because the earth is curved. A position
-without a height is assumed to be as high above the ellipsoid as the origin of its tangent plane; if it
-is 100 m higher and the other origin is 1 km away, the result is 2 cm off.
+The two planes are rotated and shifted against each other because the earth is curved. A position without
+a height is assumed to have the ellipsoidal height of its origin; if its true height is 100 m more and
+the other origin is 1 km away, the result has an error of 2 cm.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.components import in_body_axes, stated_components
 from fuselog.replay.engine.vectors.tangent import manifold_blocks, tangent_components
 
-# Components of one vector in the log's frame, which rotate together; the first vector is the position.
+# Components of each vector in the log's frame; they rotate together. The first vector is the position.
 VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]
 HEADING = "heading_rad"
 # Fields that are vectors in the axes of the plane, and their covariances; positions are also shifted.
@@ -100,10 +100,10 @@ def moved_states(
 
 
 def into_plane_of(stream: Stream, origin: Origin) -> Stream:
-    """Transform a stream from the local tangent plane whose origin it states to that of another origin.
+    """Transform a stream from its stated local tangent plane to that of another origin.
 
-    Latitudes and longitudes do not change; only the stated origin does. Raises BadInput if such
-    messages cannot be transformed.
+    Latitudes and longitudes do not change; only the stated origin does. Raises BadInput if messages of
+    this type cannot be transformed.
     """
     own = stated_in(stream.topic, stream.metadata)
     if own is None or own == origin:
@@ -133,7 +133,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
 
 
 def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
-    """Transform the fields of messages that are vectors or directions in the axes of the plane."""
+    """Transform the fields that are vectors or directions in the axes of the tangent plane."""
     field, covariance = _FIELDS[stream.schema.full_name]
     if not len(stream):  # vectors have no width here
         return {}

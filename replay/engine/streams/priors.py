@@ -94,7 +94,7 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
-    """Make the layout of a channel that states these names and kinds; errors as in `priors_of`."""
+    """Make the layout of a channel that states these names and kinds; raise as `priors_of` does."""
     metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
     stated = stated_components(metadata, components, where)
     return _Layout(
@@ -106,7 +106,7 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Make priors that cannot be used, all for one reason.
+    """Make priors of runs that cannot start, all for one reason.
 
     Args:
         runs: number of runs.
@@ -125,15 +125,15 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 def start_of_runs(
     static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
-    """Return what an estimator starts from, and the reasons why some runs cannot start.
+    """Return the topics that an estimator starts from, and the reasons why some runs cannot start.
 
     Args:
         static: topics of all runs.
-        priors: which of them are priors, and the components wanted from each.
+        priors: the components to read from each topic that is a prior.
 
-    In the returned topics, a prior has one message for every run with the wanted components in their
-    order, NaN if the run cannot start. The reasons are by run; all runs may have one.
-    Raises BadInput if a topic is not such a prior, see `priors_of`.
+    In the returned topics, a prior has one message for every run, with the wanted components in their
+    order; it is NaN if the run cannot start. The reasons are by run; there may be one for every run.
+    Raises BadInput if a prior does not have these components, see `priors_of`.
     """
     found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():

@@ -17,7 +17,7 @@ from fuselog.replay.engine.vectors.components import Components
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-ALL_WELL = -1  # the state of a run; a number that is not negative is an index in a list of reasons
+ALL_WELL = -1  # the state of a run; any other number is an index in a list of reasons
 
 
 def named(components: Mapping[str, str]) -> dict[str, str]:
@@ -67,7 +67,7 @@ def wrapped(mean: Floats, components: Components) -> Floats:
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Make a stream of means (n, d) and covariances (n, t, t); NaN ends its run, see `monitor`.
+    """Make a stream of means (n, d) and covariances (n, t, t); a NaN ends the run, see `monitor`.
 
     Args:
         topic: topic of the stream.

@@ -30,7 +30,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the name of the run in messages."""
+        """Return the name of the run that messages use."""
 
     @property
     def run(self) -> RunMetadata | None:
@@ -68,7 +68,7 @@ class Source(Protocol):
 
 
 def is_sensed(source: Source, topic: str) -> bool:
-    """Test whether `topic` of `source` has columns that were recorded: no estimates, no images."""
+    """Test whether `topic` of `source` is recorded sensor data in columns, not estimates or images."""
     if topic.startswith("/estimates/"):
         return False
     try:
@@ -149,9 +149,9 @@ class LogSource(_Readable):
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
-        """Return the time from which seconds count: the log's epoch, or else the first stamp of `clock`.
+        """Return the zero of times in s: the log's epoch or, without one, the first stamp of `clock`.
 
-        A first stamp that is years from those of most messages is ignored.
+        A first stamp that is years away from most others is ignored.
         """
         if self.log.run:
             return self.log.run.epoch_ns
@@ -217,7 +217,7 @@ class LogSource(_Readable):
 
 @dataclass(frozen=True, repr=False)
 class MemorySource(_Readable):
-    """Recording in memory, read and replayed like the log that it would be written to.
+    """Recording in memory, read and replayed like a log file with the same streams.
 
     Attributes:
         streams: by topic.
@@ -238,7 +238,7 @@ class MemorySource(_Readable):
         return self.run.epoch_ns
 
     def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
-        """Return the time from which seconds count: the epoch, for any `clock`."""
+        """Return the zero of times in s: the epoch, for any `clock`."""
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
@@ -321,7 +321,7 @@ class MemorySource(_Readable):
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
-    """Make a source of a recording with positions as in a log: sorted by log time, ties in given order.
+    """Make a source of a recording, with its messages sorted by log time as in a file (a stable sort).
 
     Args:
         recording: streams in memory.

@@ -18,7 +18,7 @@ ROTATION_AXES = "rotation_axes"
 
 
 def components_of(names: Sequence[str]) -> Components:
-    """Return names with their kinds: a component in rad is an angle, which wraps; others are linear."""
+    """Return the kinds of components by name: "angle" for components in rad, "linear" for others."""
     return stated_components(state_metadata(names), {}, "components")
 
 
@@ -69,10 +69,11 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
 
 
 def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
-    """Return names and kinds as a channel states them, in its order; empty if it names none.
+    """Return the names and kinds that a channel states, in its order; empty if it names no components.
 
     If a channel states no kinds, a component has the wanted kind, or "linear" if it is not wanted.
-    Raises BadInput if a name occurs twice, or if the kinds are unknown or not one for each name.
+    Raises BadInput if a name occurs twice, if a kind is unknown, or if there is not one kind for each
+    name.
 
     Args:
         stated: metadata of the channel.
@@ -94,8 +95,8 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
 def in_body_axes(stream: Stream) -> Stream:
     """Convert Gaussian estimates so that rotation errors in their covariances are about body axes.
 
-    A channel may state that they are about world axes, as in ROS: `rotation_axes` = "world". Raises
-    BadInput if it states other axes, or no kinds.
+    Some channels state rotation errors about world axes, as in ROS: `rotation_axes` = "world". Raises
+    BadInput if a channel states other axes, or no kinds.
     """
     axes = stream.metadata.get(ROTATION_AXES, "body")
     if axes == "body":

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A fraction of a variance below this is rounding.
+# Smaller fractions of a variance are rounding errors.
 ROUNDING = 1e-14
 
 

@@ -28,7 +28,7 @@ TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternio
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
-    """Test whether these are kinds, with all components of every axis and quaternion adjacent."""
+    """Test whether all kinds exist and the components of every axis and quaternion are adjacent."""
     index = 0
     while index < len(kinds):
         width = WIDTHS.get(kinds[index])
@@ -39,7 +39,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
 
 
 def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, "slice[int, int, int]"]]:
-    """Yield the kind and columns of every number, angle, axis and quaternion."""
+    """Yield the kind and columns of every linear component, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):
         width = WIDTHS[kinds[index]]
@@ -79,7 +79,7 @@ def _tangent_components(
 
 
 def _common(names: Sequence[str]) -> str:
-    """Return the common prefix of a vector's component names; `rotation` if it is a letter or less."""
+    """Return the common prefix of a vector's component names, or `rotation` if it is too short."""
     stem = names[0]
     while not all(name.startswith(stem) for name in names):
         stem = stem[:-1]
@@ -105,7 +105,7 @@ def named_now(
 
 
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
-    """Subtract truth from estimate, both (n, components), in the tangent space (n, tangent components).
+    """Compute errors, estimate minus truth, in the tangent space (n, tangent components).
 
     Args:
         estimate: (n, components).
@@ -166,7 +166,7 @@ def states_at(
 ) -> Floats:
     """Interpolate states (m, d) at times (m,) to states (n, d) at stamps (n,), along the shortest way.
 
-    The result is NaN in gaps longer than the limit, except at a stamp that has a state of its own.
+    The result is NaN in gaps longer than the limit, except at the stamps of the states themselves.
 
     Args:
         times: (m,), in ns and in order.

@@ -1,10 +1,10 @@
 """Iterated least squares over many runs together, and the corresponding bound.
 
 For parameters (runs, n), a model returns the residuals of the measurements, the derivatives of the
-predictions, and the covariance of the measurements. From these, the module computes the step of the
-search, the Fisher information, the Cramer-Rao lower bound (CRLB), the rank, and the unobservable
-directions. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with scaled
-columns and a step-halving line search; the weights follow the latest estimate.
+predictions, and the covariance of the measurements. The module computes the step of the search, the
+Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the unobservable directions from
+them. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with scaled columns
+and a line search that halves steps; the weights are computed at the latest estimate.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +21,8 @@ Rows = NDArray[np.intp]
 
 # Keeps the scaled normal equations (unit diagonal) solvable if a direction is unobservable.
 LEAST_DAMPING = 1e-12
-# Relative singular values of the scaled information root below this count as zero: exact rank
-# deficiencies result in about 1e-16.
+# Relative singular values of the scaled information root below this count as zero; if the rank is
+# deficient, the smallest is about 1e-16.
 RANK_TOLERANCE = 1e-10
 # Smaller components of a unit null vector are rounding errors.
 PARTICIPATION = 1e-8
@@ -95,7 +95,7 @@ class Solution(NamedTuple):
 
     @property
     def converged(self) -> Booleans:
-        """Whether each run has an estimate, (runs,)."""
+        """Return whether each run has an estimate (runs,)."""
         return self.status == Status.CONVERGED
 
 
@@ -239,7 +239,7 @@ def information_root(at: Linearization) -> Floats:
 
 
 def cramer_rao_bound(at: Linearization) -> Bound:
-    """Invert the Fisher information from its root, so that squaring does not lose digits.
+    """Invert the Fisher information by means of its root, because squaring would lose digits.
 
     If the triangular factor proves full rank, it is inverted, which is fast; otherwise singular values
     determine the rank. A run whose model is not finite has rank 0.
@@ -281,7 +281,7 @@ def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
 
 
 def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
-    """Compute roots of the inverse information, and whether the rank is certainly full.
+    """Compute roots of the inverse information, and test whether the rank is certainly full.
 
     With F the inverse of the triangular factor, no singular value is below 1 / |F| or above sqrt(n).
     """
@@ -306,7 +306,7 @@ def _singular_values(root: Floats) -> tuple[Floats, Floats]:
 
 
 def describe_direction(names: Sequence[str], direction: Floats) -> str:
-    """Describe a direction by the shares of its parameters relative to the largest, in their order.
+    """Describe a direction by the share of each parameter relative to the largest share.
 
     Args:
         names: names of the n parameters.
@@ -371,6 +371,6 @@ def _half_square(residual: Floats) -> Floats:
 
 
 def _column_scale(matrix: Floats) -> Floats:
-    """Return factors (runs, n) that scale columns (runs, m, n) to unit length; 1 for zero columns."""
+    """Compute factors (runs, n) that scale columns (runs, m, n) to unit length; 1 for zero columns."""
     norm = np.sqrt((matrix * matrix).sum(axis=1))
     return 1.0 / np.where(norm > 0.0, norm, 1.0)

@@ -4,14 +4,15 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Floats
 
-# Rays closer to parallel than this (smallest eigenvalue of the mean projector) do not meet.
+# If the smallest eigenvalue of the mean projector is below this, the rays are treated as parallel.
 PARALLEL = 1e-12
 
 
 def intersect_rays(origin_m: Floats, direction: Floats) -> Floats:
     """Find the least-squares intersection of rays: (sum(I - u u'))^-1 sum((I - u u') origin).
 
-    The result is NaN if fewer than two rays remain, if all are parallel, or if all point away from it.
+    The result is NaN if there are fewer than two rays, if all are parallel, or if all point away from
+    the intersection.
 
     Args:
         origin_m: (rays, d), or with the batch axes of `direction`.

@@ -1,4 +1,4 @@
-"""Output streams of batch estimators: estimates, how each solution ended, and failures."""
+"""Output streams of batch estimators: estimates, convergence statistics and failures."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from fuselog.replay.estimators.localization.least_squares import SENTENCES, Solu
 
 
 class Batches(NamedTuple):
-    """Batches that are solved together: the run of each batch, in order, and its last stamp."""
+    """Batches that are solved together: the run and the last stamp of each batch, ordered by run."""
 
     runs: int
     run: Integers
@@ -30,7 +30,7 @@ class Batches(NamedTuple):
 
 
 def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
-    """Combine the messages of all sensors in a table with run, sensor (index), time_ns, and fields."""
+    """Combine the messages of all sensors in a table with columns for run, sensor, time and fields."""
     return pd.concat(
         [
             pd.DataFrame(
@@ -48,7 +48,7 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
 
 
 def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integers]:
-    """Return a table's batches, one for each value of `key` in each run, and the batch of each row.
+    """Return the batches of a table, one per run and value of `key`, and the batch of each row.
 
     A run's batches are in the order of their last stamps.
     """

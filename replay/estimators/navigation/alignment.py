@@ -1,9 +1,9 @@
 """Alignment of inertial navigation: tilt from samples at rest, heading from the course.
 
 Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
-section 5.6: roll and pitch come from the specific force, which equals gravity while nothing accelerates;
-the gyro's bias from its mean at rest; the heading from the first course at sufficient speed. Unless they
-are given, the standard deviations are estimated from the same samples.
+section 5.6: roll and pitch are computed from the specific force, which equals gravity if the body does
+not accelerate; the bias of the gyro is its mean at rest; the heading is the first course at sufficient
+speed. Standard deviations that are not given are estimated from the same samples.
 """
 
 from collections.abc import Mapping
@@ -46,21 +46,21 @@ SIDEWAYS_RAD, ALIKE = (
 
 
 class AlignmentParameters(ModelParameters):
-    """Mounting and delay of the unit, and how the state at the start is found.
+    """Mounting and delay of the unit, and settings of the search for the initial state.
 
-    Tilt comes from the first samples. The body is assumed to be at rest until a margin before it first
-    moves. The heading is the course when the speed is first high enough, minus the turn of the gyro
-    until then; without such a speed it is unknown. Standard deviations of the start that are not given
-    are estimated from the data: position and velocity start so uncertain that their first messages
-    determine them; the tilt is as uncertain as the accelerometer's bias and the motion imply; the gyro's
-    bias as uncertain as its mean at rest; the heading as much as the course differs from the turn of the
-    gyro.
+    The tilt is computed from the first samples. The body is assumed to be at rest until shortly before
+    it first moves (`rest_margin_s`). The heading is the course at the first sufficient speed, minus the
+    turn that the gyro measured until then; without such a speed it is unknown. Standard deviations of
+    the start that are not given are estimated from the data: position and velocity are so uncertain that
+    their first messages determine them; the uncertainty of the tilt follows from the accelerometer's
+    bias and the motion, that of the gyro's bias from its mean at rest, and that of the heading from the
+    differences between the course and the turn of the gyro.
 
     The mounting rotates the unit's axes to forward, left, up: by yaw about up, then pitch about left,
     then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
 
     Attributes:
-        mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
+        mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: angles of the mounting.
         force_scale_x, force_scale_y, force_scale_z: relative excess of the measured force, per axis.
         gyro_scale_x, gyro_scale_y, gyro_scale_z: relative excess of the measured rate, per axis.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
@@ -123,15 +123,15 @@ def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the start: the first fix within the unit's samples, with the velocity nearest to it in time.
+    """Find the start: the first fix in the time span of the samples, and the velocity nearest in time.
 
     Args:
         streams: `inertial` samples, `fix`, positions in the local tangent plane (east, north, up), and
             optionally `velocity`, velocities in that plane.
         parameters: `AlignmentParameters`.
 
-    Raises BadInput if there is no such fix, if no gravity is measured, or if numbers seem to have
-    another unit.
+    Raises BadInput if there is no such fix, if the unit does not measure gravity, or if numbers seem to
+    have another unit.
     """
     samples, topic = read_samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
@@ -167,9 +167,9 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
-    """Describe what looks wrong in the first samples of a body whose start is known.
+    """Describe apparent errors in the first samples of a body whose initial state is known.
 
-    The checks are those of `align`, but they are only reported, since the body may start in motion.
+    The checks are those of `align`, but they raise no exception, because the body may start in motion.
 
     Args:
         streams: see `align`.
@@ -194,13 +194,13 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """Return the covariance (3, 3) of a start at a message of this covariance, which is used again."""
+    """Return the covariance (3, 3) of a start at a message; wide, because the message is used again."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
 
 def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
-    """Return the covariance (6, 6) of tilt and accelerometer bias in the body's axes, with `up` up.
+    """Return the covariance (6, 6) of tilt and accelerometer bias in body axes; `up` points up.
 
     If the tilt's standard deviation is not given, both are correlated: levelling compensates for a bias,
     so the body tilts by the ratio of the bias to gravity.
@@ -242,7 +242,7 @@ def _first_place(
 
 
 def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, float]:
-    """Compute roll and pitch, rad, at which the mean of the first specific forces points up.
+    """Compute roll and pitch, in rad, for which the mean of the first specific forces points up.
 
     Raises BadInput if it is not gravity in m/s2, or points down.
     """
@@ -266,10 +266,10 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
 def _bias(
     samples: ImuSamples, topic: str, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[Floats, float]:
-    """Return the mean turn rate (3,) at rest, zeros without rest, and its standard deviation.
+    """Return the mean turn rate (3,) at rest, or zeros if there is no rest, and its standard deviation.
 
-    The standard deviation comes from the means of single stretches of `level_s`, which differ by noise
-    and motion, and from the rotation of the earth.
+    The standard deviation is computed from the rotation of the earth and from the means of intervals of
+    `level_s`, which differ because of noise and motion.
 
     Raises BadInput if the rate exceeds the error of any gyro.
     """
@@ -295,7 +295,7 @@ def _bias(
 
 
 def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) -> str:
-    """Report that the unit and the fixes start to move as far apart as the leap seconds of GPS time."""
+    """Report if the unit and the fixes start to move at times that differ by the leap seconds of GPS."""
     moved = motion.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
@@ -319,7 +319,7 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
 def _turned(
     samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the later samples' times since the start (n,) in s, and the turn about the vertical."""
+    """Return the times (n,) of later samples since the start, in s, and the turn about the vertical."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
@@ -337,11 +337,11 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 def _heading(
     turning: tuple[Floats, Floats], start_ns: int, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[float, float] | None:
-    """Find the heading at the start, rad, and its standard deviation; None if nothing moves.
+    """Find the heading at the start and its standard deviation, in rad; None if the body never moves.
 
-    It is the first course, minus the turn of the body about the vertical until then. A body that faces
-    its direction of motion yields the same heading from all later courses; their differences determine
-    the standard deviation.
+    The heading is the first course, minus the body's turn about the vertical axis until then. If the
+    body faces its direction of motion, all later courses give the same heading; their differences
+    determine the standard deviation.
     """
     fast = motion.first_above(row, parameters.course_mps)
     if fast is None:
@@ -365,7 +365,7 @@ def _mounting(
     heading: float,
     parameters: Any,
 ) -> str:
-    """Report that the body accelerates in another direction than its velocity changes.
+    """Report if the measured acceleration and the change of the velocity have different directions.
 
     Both are compared over the intervals between the velocities, in the plane and as complex numbers.
     """

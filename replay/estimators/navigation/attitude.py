@@ -2,8 +2,8 @@
 
 The state is the rotation, the gyro's bias, the velocity, and the local magnetic field. The accelerometer
 drives the velocity, which stays small because the body is carried around. Gravity is therefore separated
-from motion by their durations, similar to the averaging over seconds of Laidig and Seel, "VQF",
-Information Fusion 91, 2023, but with a known uncertainty. The gate rejects a disturbed field.
+from motion by duration, similar to the averaging over seconds in Laidig and Seel, "VQF", Information
+Fusion 91, 2023, but with a known uncertainty. The gate rejects disturbed fields.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 class AttitudeParameters(ModelParameters):
     """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
-    The assumptions that the velocity is about zero and the field about constant are applied once a
-    second, because their errors last about as long.
+    The filter assumes once a second that the velocity is near zero and the field nearly constant,
+    because the errors of these assumptions last about a second.
 
     Attributes:
         gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it includes scale errors
@@ -48,7 +48,7 @@ class AttitudeParameters(ModelParameters):
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         field_density_ut: random walk of the magnetic field, in uT/sqrt(s).
         gravity_mps2: acceleration of gravity.
-        sigma_velocity_mps: standard deviation of the velocity about zero.
+        sigma_velocity_mps: standard deviation of the velocity, whose mean is zero.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
         inertial_gap_s: time without samples that counts as a gap, in which the body may turn.
         gap_turn_radps: standard deviation of the turn rate in a gap.
@@ -104,13 +104,13 @@ def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components
 
 
 def velocity(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return the velocity, which is zero on average."""
+    """Return the velocity, whose mean is zero."""
     _, _, _, _, _, _, _, vx, vy, vz, _, _ = state
     return vx, vy, vz
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """Return the variances of the velocity at which the body is carried."""
+    """Return the variances of the velocity of a body that is carried around."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 
@@ -128,7 +128,7 @@ def field_noise(parameters: Any) -> Components:
 
 
 def first_of_periods(stream: Stream) -> Booleans:
-    """Return which samples (n,) are the first in a second of the clock, independent of blocks."""
+    """Test whether each sample (n,) is the first in a second of the clock, regardless of blocks."""
     rate_hz = stream.metadata.get("rate_hz")
     steps_ns = np.diff(stream.publish_time_ns)
     step_ns = 1e9 / float(rate_hz) if rate_hz else np.median(steps_ns[steps_ns > 0])
@@ -141,7 +141,7 @@ def read_velocity(stream: Stream) -> Floats:
 
 
 def read_field(stream: Stream) -> Floats:
-    """Return the field (n, 3) once a period: the first sample, also of a slower magnetometer."""
+    """Return the first field sample (n, 3) of every period, including those of a slower magnetometer."""
     field = stream["magnetic_field_ut"]
     if field.shape[1:] != (3,):  # the magnetometer has a separate topic
         return np.full((len(stream), 3), np.nan)
@@ -162,7 +162,7 @@ def read_own_field(stream: Stream) -> Floats:
 
 
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find orientation and field from means at rest, where the force points up and the field north.
+    """Find orientation and field from the means at rest: the force points up, the field north.
 
     Raises BadInput if there is no magnetometer, or if both point in the same direction.
     """

@@ -1,8 +1,8 @@
 """Navigation by an inertial unit, corrected by the position and velocity measurements of a log.
 
-The state has 15 components, and an inertial unit is its control: position and velocity in a local
-tangent plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases
-of gyro and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation
+The control is an inertial unit. The state has 15 components: position and velocity in a local tangent
+plane (east, north, up), the orientation of the body (forward, left, up) in this plane, and the biases of
+gyro and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation
 Systems, 2nd edition, 2013, chapter 14; the error of the orientation is in the body's axes.
 """
 
@@ -44,9 +44,10 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 class NavigationParameters(AlignmentParameters):
     """Noise of the inertial unit and other sensors, their mounting, and gaps.
 
-    The biases are in the body's axes. Gravity and the rotation of the earth are those of the plane's
-    origin. After more than `inertial_gap_s` without samples, everything except the biases becomes
-    unknown: the body may have accelerated, turned and tilted by the standard deviations of a gap.
+    The biases are in the body's axes. Gravity and the rotation of the earth are those at the origin of
+    the plane. After more than `inertial_gap_s` without samples, everything except the biases becomes
+    uncertain: the body may have accelerated, turned and tilted, with the standard deviations given for a
+    gap.
 
     Attributes:
         force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz).
@@ -59,21 +60,20 @@ class NavigationParameters(AlignmentParameters):
         gap_acceleration_mps2: standard deviation of the acceleration in a gap.
         gap_turn_radps: standard deviation of the turn rate in a gap.
         gap_tilt_rad: standard deviation of the tilt after a gap.
-        lever_x_m, lever_y_m, lever_z_m: position of the antenna relative to the unit along this axis of
-        the body (forward, left, up).
-        axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit along this axis
-        of the body (forward, left, up).
+        lever_x_m, lever_y_m, lever_z_m: position of the antenna relative to the unit in body axes
+            (forward, left, up).
+        axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit in body axes
+            (forward, left, up).
         wheel_scale: relative excess of the speed that the wheels measure.
-        field_east_ut, field_north_ut, field_up_ut: local magnetic field in this direction.
+        field_east_ut, field_north_ut, field_up_ut: local magnetic field by direction.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
-        standing_delay_s: delay of messages that the body stands still: time from the measurement to the
-            stamp.
-        sigma_velocity_mps: standard deviation of each component of a velocity that does not state its
+        standing_delay_s: delay of messages about standing still: time from the measurement to the stamp.
+        sigma_velocity_mps: standard deviation of each component of a velocity whose message states no
             covariance.
         sigma_heading_rad: standard deviation of a heading.
         sigma_height_m: standard deviation of a height.
         sigma_wheel_mps: standard deviation of the wheels' forward speed.
-        sigma_slip_mps: standard deviation of the wheels' sideways and upward velocity, which is about
+        sigma_slip_mps: standard deviation of the wheels' sideways and upward velocity, whose mean is
             zero.
         sigma_standing_mps: standard deviation of the velocity of a body that stands still, per axis.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
@@ -172,12 +172,12 @@ def velocity(state: Components, samples: Components, parameters: Any) -> Compone
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix that does not state its own."""
+    """Return the variances of a fix whose message states none."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """Return the variances of a velocity that does not state its own."""
+    """Return the variances of a velocity whose message states none."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 

@@ -20,7 +20,7 @@ NS = 1e-9
 
 
 class ImuSamples(NamedTuple):
-    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
+    """Samples of an inertial unit in body axes: times (n,), specific forces and turn rates (n, 3)."""
 
     time_ns: Integers
     force: Floats
@@ -28,7 +28,7 @@ class ImuSamples(NamedTuple):
 
 
 class GnssMotion(NamedTuple):
-    """A receiver's velocities (n, 3), their covariances (n, 3, 3), and times of measurement (n,)."""
+    """Velocities (n, 3) of a receiver, their covariances (n, 3, 3) and times of measurement (n,)."""
 
     topic: str
     time_ns: Integers
@@ -36,13 +36,13 @@ class GnssMotion(NamedTuple):
     covariance: Floats
 
     def first_above(self, row: int, limit_mps: float) -> int | None:
-        """Return the first row from `row` on with a greater horizontal speed."""
+        """Return the first row, from `row` on, whose horizontal speed exceeds the limit."""
         faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
         return row + int(faster[0]) if len(faster) else None
 
 
 def mounted(sample: Any, parameters: Any) -> Any:
-    """Rotate a measurement of the unit, or columns of them, to the body's axes."""
+    """Rotate one measurement of the unit, or columns of measurements, to the body's axes."""
     roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
@@ -87,9 +87,9 @@ PLUMB_SIGMA_RAD = 1e-4  # deflection of the plumb line from the ellipsoid's norm
 
 
 def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
-    """Compute the standard deviation, m/s2, of the first samples' mean specific force about gravity.
+    """Compute the standard deviation, in m/s2, of the mean specific force of the first samples.
 
-    It includes the differences between the samples and the change of the velocity during them.
+    It includes the differences between the samples and the change of the velocity during this time.
     """
     begin_ns = samples.time_ns[0]
     until_ns = begin_ns + round(parameters.level_s / NS)

@@ -1,7 +1,8 @@
-"""Models of further sensors of a body with an inertial unit: compass, barometer, wheels, radio tags.
+"""Models of additional sensors of a body with an inertial unit, such as a compass or wheels.
 
-They are sensors of the state of `navigation`; each has a topic that a log may lack. Groves, Principles
-of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters 6 and 15.
+They measure the state of `navigation`; each has a topic of its own, which a log may lack. Groves,
+Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters
+6 and 15.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 
 
 def be_headed(state: Components, reference: Any, parameters: Any) -> Components:
-    """Return the direction of the body's forward axis in the plane, from east to north."""
+    """Return the direction of the body's forward axis in the plane, in rad from east towards north."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     east, north, _ = into_plane((qw, qx, qy, qz), (1.0, 0.0, 0.0))
     return (np.arctan2(north, east),)
@@ -68,7 +69,7 @@ def feel_north(state: Components, reference: Any, parameters: Any) -> Components
 
 
 def see_anchor(state: Components, reference: Components, parameters: Any) -> Components:
-    """Return the range of an anchor from a tag on the body; `reference` has both, the anchor first."""
+    """Return the range from a tag on the body to an anchor; `reference` has the anchor, then the tag."""
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     ax, ay, az, tx, ty, tz = reference
     x, y, z = into_plane((qw, qx, qy, qz), (tx, ty, tz))
@@ -104,7 +105,7 @@ def slip_noise(parameters: Any) -> Components:
 
 
 def field_noise(parameters: Any) -> Components:
-    """Return the variances of a field that does not state its own."""
+    """Return the variances of a field whose message states none."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
@@ -120,7 +121,7 @@ def read_heading(stream: Stream) -> Floats:
 
 
 def heading_sigma(metadata: Mapping[str, str]) -> float:
-    """Return the standard deviation of headings from the variance that their channel states."""
+    """Return the standard deviation of headings, from the variance that their channel states."""
     return float(np.sqrt(heading_variance(metadata)))
 
 
@@ -130,24 +131,24 @@ def read_height(stream: Stream) -> Floats:
 
 
 def read_wheels(stream: Stream) -> Floats:
-    """Return the velocities of the wheels (n, 3): forward as measured, zero otherwise."""
+    """Return the velocities of the wheels (n, 3): forward as measured, zero to the left and up."""
     forward = stream["forward_mps"]
     return np.stack([forward, np.zeros(len(forward)), np.zeros(len(forward))], axis=1)
 
 
 def read_standing(stream: Stream) -> Floats:
-    """Return zero velocities (n, 3) if the value is not zero, otherwise NaN, since the body may move."""
+    """Return zero velocities (n, 3) where the value is not zero, otherwise NaN: the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
 
 
 def read_rolling(stream: Stream) -> Floats:
-    """Return zero velocities to the side and up (n, 2) if the value is not zero, otherwise NaN."""
+    """Return zero velocities (n, 2) to the side and up where the value is not zero, otherwise NaN."""
     return read_standing(stream)[:, :2]
 
 
 def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
-    """Return the further sensors of a body with this inertial unit."""
+    """Return the additional sensors of a body with this inertial unit."""
     return (
         Sensor(
             "heading",

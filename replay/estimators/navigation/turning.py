@@ -1,17 +1,17 @@
 """Correction of a body's state together with its heading, which may be very uncertain.
 
-Measurements of an inertial unit act in the plane rotated by the heading; measurements of fixes act in
-the plane itself. For a given heading, both act linearly. Therefore the mean of any other part of the
-state, as a function of the heading, is a sum of two terms, one of which rotates with the heading: it
-moves on a circle. For position and velocity, in the plane, the term of the inertial samples rotates. For
-tilt and biases, in the body's axes, the term of the fixes rotates, in the opposite direction. The
-covariance contains the tangent of the circle, which determines its radius. A filter that moves along the
-tangent mistakes the difference for information about the heading: a body at rest then seems to learn its
-heading, which is impossible.
+Measurements of an inertial unit act in the plane after a rotation by the heading; fixes act in the plane
+itself. For a given heading, both act linearly. As a function of the heading, the mean of any other part
+of the state is therefore a sum of two terms, one of which rotates with the heading: the mean moves on a
+circle. For position and velocity, in the plane, the term of the inertial samples rotates. For tilt and
+biases, in the body's axes, the term of the fixes rotates, in the opposite direction. The covariance
+contains the tangent of the circle, which determines its radius. A filter that moves along the tangent
+mistakes the distance from the circle for information about the heading: it would find the heading of a
+body at rest, which is impossible.
 
 An innovation is a vector in the plane, so its contribution to tilt and biases rotates in the body's
-axes. In a smoother's backward pass, steps are vectors in the body, whose biases do not depend on its
-heading.
+axes. In the backward pass of a smoother, steps are vectors in the body's axes, because the biases do not
+depend on the heading.
 
 If all terms rotate, this is the invariant filter: Barrau and Bonnabel, The Invariant Extended Kalman
 Filter as a Stable Observer, IEEE Transactions on Automatic Control 62(4), 2017.
@@ -27,7 +27,7 @@ UP = 0.0, 0.0, 1.0
 
 
 def heading(state: Components) -> Components:
-    """Return the error (15,) of a heading that is off by one radian: a rotation of the body about up."""
+    """Return the error state (15,) of a heading error of 1 rad: a rotation about the vertical axis."""
     x, y, z = into_body(state[6:10], UP)
     return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
@@ -65,7 +65,7 @@ WITH_HEADING = Correction(heading, move, step_to, move_back)
 
 
 def _moved(state: Components, step: Components, slope: Components, of_body: float) -> Components:
-    """Return the state after a step whose residual is in the body's axes (1) or in the plane's (0)."""
+    """Return the state after a step with a residual in the axes of the body (1) or of the plane (0)."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
@@ -86,7 +86,7 @@ def _moved(state: Components, step: Components, slope: Components, of_body: floa
 def _forth(
     step: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """Return the change of a vector by its step: along its circle, plus the rotated rest of the step."""
+    """Return the change of a vector: a move along its circle, plus the rotated rest of its step."""
     rest = _less(step, _times(turn, slope))
     return _plus(_arc(slope, axis, turn), _rotated(rest, axis, swing))
 
@@ -94,13 +94,13 @@ def _forth(
 def _back(
     change: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """Return the step that results in a change of a vector, the inverse of `_forth`."""
+    """Return the step that causes a given change of a vector; the inverse of `_forth`."""
     rest = _rotated(_less(change, _arc(slope, axis, turn)), axis, -swing)
     return _plus(_times(turn, slope), rest)
 
 
 def _arc(slope: Components, axis: Components, turn: Component) -> Vector:
-    """Return the chord of a turn on the circle about an axis that has the given tangent at its start."""
+    """Return the chord of a turn about an axis, on the circle that starts with the given tangent."""
     once = cross(axis, slope)
     bent = _plus(_times(1.0 - np.cos(turn), once), _times(turn - np.sin(turn), cross(axis, once)))
     return _plus(_times(turn, slope), bent)

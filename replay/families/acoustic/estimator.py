@@ -31,7 +31,7 @@ from fuselog.replay.families.acoustic.localization import (
 
 
 class ShooterParameters(Parameters):
-    """Data that the sensors send, and choice of what is estimated.
+    """Data that the sensors send, and quantities to estimate.
 
     Attributes:
         mode: data that the sensors send to the fusion centre.
@@ -49,7 +49,7 @@ HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> Iterator[Binding]:
-    """Find the sensors, and the noise and medium that they state."""
+    """Find the sensors, their stated noise, and the stated medium."""
     sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
     streams = [f"/sensor{s}/detections" for s in sensors]
     static = [f"/sensor{s}/position" for s in sensors]
@@ -98,7 +98,7 @@ def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tupl
 
 
 def _latest(positions: Ragged, batches: Batches) -> Floats:
-    """Return the latest fix (batches, 2) of a sensor at the end of each batch, NaN if it had none."""
+    """Return the latest fix (batches, 2) of a sensor at the end of each batch; NaN if there is none."""
     times = positions.stream.publish_time_ns
     latest = np.full(len(batches.run), -1)
     for run in np.unique(batches.run):

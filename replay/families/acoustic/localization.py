@@ -1,8 +1,9 @@
 """Localization of a shooter from a single shot: the three methods of Osborne et al., JAIF 2014.
 
 The parameters are the shooter's position, the bullet's direction (except in bearings-only mode, which
-has no information about it) and, if they are estimated, the sensors' positions. If they are not, each
-position fix is used as it is, and its error is added to that of the sensor's measurements.
+has no information about it) and, if they are estimated, the sensors' positions. If the sensors'
+positions are not estimated, each position fix is used as it is, and its error is added to that of the
+sensor's measurements.
 """
 
 from collections.abc import Sequence
@@ -125,7 +126,7 @@ def noise_free(
 
 
 def starting_point(setting: Setting, heard: Detections) -> Floats:
-    """Find where the bearings meet, the shockwaves' mean trajectory, and the position fixes.
+    """Compute the intersection of the bearings, the mean trajectory of the shockwaves, and the fixes.
 
     The tangents and cotangents of eqs (32)-(34) describe the same rays with other weights.
     """
@@ -144,13 +145,13 @@ def starting_point(setting: Setting, heard: Detections) -> Floats:
 def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linearization:
     """Linearize the chosen measurements, with one block of correlated errors per sensor.
 
-    If the sensors are not estimated, the position fixes' share of the covariance depends on the
-    parameters, which the resulting bound ignores.
+    If the sensors are not estimated, the contribution of the position fixes to the covariance depends on
+    the parameters; the resulting bound ignores this dependence.
 
     Args:
         setting: assumptions of the estimator.
         heard: one shot per run, as detected by all sensors.
-        parameters: (runs, n), at which it is linearised.
+        parameters: (runs, n), the point of linearisation.
     """
     position = heard.position_m
     if setting.estimate_sensors:
@@ -172,7 +173,7 @@ def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linear
 
 
 class _Geometry(NamedTuple):
-    """Position of the shooter relative to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
+    """Position of the shooter relative to the sensors (runs, sensors), and the trajectory (runs, 1)."""
 
     azimuth_rad: Floats
     range_m: Floats
@@ -198,7 +199,7 @@ def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Bloc
 
 
 def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Compute both directions of arrival and the delay, on the branch nearest to the shockwave."""
+    """Compute both directions of arrival and the delay; choose the branch nearest to the shockwave."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     misses = [
@@ -313,7 +314,7 @@ def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
 
 
 def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
-    """Append position fixes as two more measurements of every sensor, which are its last parameters."""
+    """Append the position fix of every sensor as two further measurements of its last two parameters."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)
     wider = [(0, 0), (0, 0), (0, 2), (0, 2)]
@@ -328,7 +329,7 @@ def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
 
 
 def _absorb_fixes(view: _Blocks, sigma_m: float) -> _Blocks:
-    """Add the error of a position fix, which shifts the measurements like a shift of the shooter."""
+    """Add the error of position fixes, which has the same effect as a shift of the shooter."""
     by_shooter = view.jacobian[..., :2]
     share = sigma_m**2 * by_shooter @ np.swapaxes(by_shooter, 2, 3)
     return view._replace(covariance=view.covariance + share)

@@ -1,9 +1,9 @@
 """Model `moving-shooter`, which locates a moving shooter from all shots so far.
 
 A report contains the muzzle blast's direction of arrival, the bullet's direction derived from the
-shockwave, and the shockwave's lead. All of them refer to the position from which the shot was fired, not
-to that at the arrival of the sound. Reports may be wrong, because of an echo or a shockwave of another
-shot. Gaussian methods treat a report as right or wrong as a whole, see
+shockwave, and the shockwave's lead. All of them refer to the shooter's position at the time of the shot,
+not at the arrival of the sound. Reports may be wrong, because of an echo or a shockwave of another shot.
+Gaussian methods treat a report as entirely right or entirely wrong, see
 `fuselog.replay.inference.linear_algebra.inflation`; `particles:N` treats each component separately.
 """
 
@@ -29,7 +29,7 @@ from fuselog.replay.inference.model.start import Start, Started
 
 _NS = 1e-9
 HALF_TURN = float(np.pi)
-# Residuals of the candidates for a start are clipped at this number of standard deviations.
+# Residuals of candidates for the start are clipped at this number of standard deviations.
 CUT = 3.0
 
 
@@ -46,8 +46,8 @@ class MovingShooterParameters(ModelParameters):
         mach_number: speed of the bullet, as a multiple of the speed of sound.
         outlier_probability: probability that a component of a report is wrong and may have any value;
             only `particles:N` uses it.
-        longest_s: longest time between shockwave and muzzle blast that a wrong report may have.
-        start_s: duration of the reports in which the start is found.
+        longest_s: longest time between shockwave and muzzle blast in a wrong report.
+        start_s: duration of the first reports, from which the start is found.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
         start_sigma_rad: standard deviation of the direction of shots at the start.
@@ -69,7 +69,7 @@ class MovingShooterParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Predict position, direction of shots and velocity at constant velocity."""
+    """Predict position, direction of shots and velocity, assuming constant velocity."""
     x, y, trajectory, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, trajectory, vx, vy
 
@@ -92,9 +92,8 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 def hear(state: Components, sensor: Components, parameters: Any) -> Components:
     """Compute the muzzle blast's direction of arrival, the bullet's direction, and the shockwave's lead.
 
-    There are two leads, for a shockwave from the left of the muzzle blast and for one from the right: a
-    sensor is on one side of the line of fire, and its report uses the lead of that side. Each lead
-    continues smoothly across the line of fire, where the true lead has a kink.
+    There are two leads, one for each side of the line of fire; the report of a sensor uses the lead of
+    the sensor's side. Each of the two is smooth across the line of fire, where the true lead has a kink.
     """
     x, y, trajectory, vx, vy = state
     speed = parameters.speed_of_sound_mps
@@ -119,7 +118,7 @@ def hear_noise(parameters: Any) -> Components:
 def log_likelihood(
     state: Components, measured: Components, sensor: Components, parameters: Any
 ) -> float:
-    """Compute the log-likelihood of a report, each component of which may be an outlier of any value."""
+    """Compute the log-likelihood of a report; each of its components may be an outlier of any value."""
     azimuth, trajectory, left, right = hear(state, sensor, parameters)
     turn, longest, share = 2.0 * HALF_TURN, parameters.longest_s, parameters.outlier_probability
     lead_s = parameters.sigma_time_difference_s
@@ -133,7 +132,7 @@ def log_likelihood(
 
 
 def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> float:
-    """Compute the log density of a Gaussian mixed with a uniform density; 0 for a missing value."""
+    """Compute the log density of a mixture of Gaussian and uniform density; 0 for a missing value."""
     if np.isnan(deviation):
         return 0.0
     gaussian = -0.5 * (deviation / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_TWO_PI
@@ -143,10 +142,10 @@ def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> f
 def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Find the shot that fits most of the first reports.
 
-    Candidates are all points where the muzzle blasts of two sensors meet, with every direction of the
-    bullet in the reports. A least-squares fit with Cauchy loss starts from the candidate with the
-    smallest residuals, which are clipped at three standard deviations. It suppresses wrong reports if
-    most are right. Raises BadInput if the reports do not determine a shot.
+    Candidates are all points where the directions of two muzzle blasts intersect, each with every
+    reported direction of the bullet. A least-squares fit with Cauchy loss starts from the candidate with
+    the smallest residuals, which are clipped at three standard deviations. The fit suppresses wrong
+    reports if most reports are right. Raises BadInput if the reports do not determine a shot.
     """
     reports, sensors = streams["reports"], streams[SENSORS.topic]
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))
@@ -174,7 +173,7 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None:
-    """Fit position and direction (3,) of a shot to reports (n, 4) from sensors (n, 2), if possible."""
+    """Fit position and direction (3,) of a shot to reports (n, 4) of sensors (n, 2), if possible."""
     sigma = np.sqrt(np.array(hear_noise(parameters)))
 
     def residuals(shot: Floats) -> Floats:
@@ -207,7 +206,7 @@ HEARD: Components = {
     "left_lead_s": "linear",
     "right_lead_s": "linear",
 }
-# For logs that do not state it: a person on foot.
+# Default for logs that do not state it: a person on foot.
 ASSUMED = {"acceleration_density": 0.1, "trajectory_density": 0.05}
 MOVING_SHOOTER = Model(
     "a moving shooter, from the shots that acoustic sensors hear",

@@ -1,8 +1,8 @@
-"""Model `sound-source`, which locates a sound from differences of its arrivals at microphones.
+"""Model `sound-source`, which locates a sound from the differences of its arrival times.
 
-All differences refer to one reference microphone and share its error. This error is part of the state,
-so that the differences are independent given it. If all microphones are at one height, the source is
-assumed to be at that height too, because the data do not determine its height above or below.
+All differences refer to one reference microphone and share its error. This error is part of the state;
+given the error, the differences are independent. If all microphones are at one height, the source is
+assumed to be at that height too, because the data do not determine whether it is above or below.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,21 +26,21 @@ from fuselog.replay.inference.model.start import Start, Started
 SOUGHT = np.linspace(-1.5, 1.5, 21)
 BEST = 3
 ALIKE = 6  # decimals of a cost, in squared standard deviations, that distinguish two positions
-NEAR_M = 1e-9  # least distance to a microphone, at which the direction is undefined
-WIDER = 100.0  # factor on the start's standard deviations, so that it has 1e-4 of the information
+NEAR_M = 1e-9  # smallest distance to a microphone, because at zero the direction is undefined
+WIDER = 100.0  # factor on the standard deviations of the start, which then has 1e-4 of the information
 
 
 class SoundSourceParameters(ModelParameters):
     """Speed of sound, and the search for the start.
 
     The start is found by least squares. Its standard deviations are a hundred times those that the
-    differences imply, so that it counts little compared with them.
+    differences imply, so the start has little weight.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
         start_sigma_m: largest standard deviation of the start, per axis.
-        height_sigma_m: standard deviation of the source's height from that of the microphones, if all
-            are at one height.
+        height_sigma_m: standard deviation of the difference between the heights of source and
+            microphones, if all microphones are at one height.
     """
 
     speed_of_sound_mps: PositiveFloat | None = None
@@ -55,7 +55,7 @@ def stay(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def hear(state: Components, reference: Components, parameters: Any) -> Components:
-    """Compute how much later a sound arrives at the first of two points, plus the reference's error."""
+    """Compute the arrival time at the first point minus that at the second, plus the shared error."""
     away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
     return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
 
@@ -71,7 +71,7 @@ def read_variances(stream: Stream) -> Floats:
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the position that fits the differences of the first stamp best, searching on all sides.
+    """Find the position that best fits the differences of the first stamp, searching on all sides.
 
     Raises BadInput if there are fewer differences than unknown coordinates.
     """
@@ -130,9 +130,9 @@ def _settled(
 ) -> tuple[Floats, Floats]:
     """Refine a position (n,) to a root of the cost's gradient; return it and the information (n, n).
 
-    A search by the cost ends where rounding hides lower values, at different points on different CPUs.
-    If the differences do not determine the distance, the gradient is zero at infinity; then the position
-    stays.
+    A search for the lowest cost ends where rounding hides lower values; this point differs between CPUs.
+    If the differences do not determine the distance, the gradient is zero only at infinity; the position
+    is then not changed.
     """
 
     def cost(there: Floats) -> float:

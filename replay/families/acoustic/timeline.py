@@ -1,4 +1,4 @@
-"""Timeline of shots: a map of sensors, detections as rays, and the shot's ellipses, next to NEES."""
+"""Timeline of shots: a map with sensors, rays of detections and ellipses of shots, next to the NEES."""
 
 from typing import NamedTuple
 
@@ -81,7 +81,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _place(scene: Scene, sensor: int) -> Floats:
-    """Find a sensor's position (2,), from the truth or else its first fix; NaN if it has neither."""
+    """Find the position (2,) of a sensor, from the truth or its first fix; NaN if it has neither."""
     for truth in scene.truths_of(CASE):
         columns = [truth.components.index(name) for name in sensor_components(sensor)]
         return truth["state"][0, columns]
@@ -90,7 +90,7 @@ def _place(scene: Scene, sensor: int) -> Floats:
 
 
 def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
-    """Return the Mach angle as the detections' channels state it, or else the usual one."""
+    """Return the Mach angle that the detections' channels state, or the usual angle."""
     for sensor in sensors:
         stated = scene.source.topics[f"/sensor{sensor}/detections"].metadata
         if "mach_number" in stated:
@@ -99,7 +99,7 @@ def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
 
 
 def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: float) -> Times:
-    """Draw a ray for each direction of arrival when all sensors have heard the shot; return when."""
+    """Draw rays of all directions of arrival once all sensors have heard a shot; return these times."""
     detections, positions = (
         [gather([scene.read(f"/sensor{sensor}/{leaf}")]) for sensor in sensors]
         for leaf in ("detections", "position")

@@ -2,8 +2,7 @@
 
 Zheng & Blasch, "An exploration of the impacts of three factors in multimodal biometric score fusion",
 JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), one case per subset, into the
-stream `/estimates/NAME/CASE/fused`. An estimator that learns never scores users that it has learned
-from.
+stream `/estimates/NAME/CASE/fused`. An estimator that learns never scores users from its training data.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -61,12 +60,12 @@ class Subsets(Parameters):
 
 
 class RuleParameters(Subsets):
-    """How scores are normalized and fused.
+    """Settings of the normalization and fusion of scores.
 
     Attributes:
-        normalisation: normalization of scores, over all comparisons or, with column-min-max, per gallery
+        normalisation: normalization of scores over all comparisons or, for column-min-max, per gallery
             entry.
-        rule: function of the normalized scores that gives the fused score.
+        rule: function that computes the fused score from the normalized scores.
     """
 
     normalisation: Literal["none", "z", "min-max", "tanh", "column-min-max"] = "column-min-max"
@@ -74,7 +73,7 @@ class RuleParameters(Subsets):
 
 
 class LearnerParameters(Subsets):
-    """Training data of a fusion, and the pairs that it scores.
+    """Training data of a learned fusion, and the pairs of users that it scores.
 
     Attributes:
         seed: seed of folds and impostors.
@@ -82,7 +81,7 @@ class LearnerParameters(Subsets):
         pairs: the paper's trimmed database (all genuine, two random impostors per user), or all pairs.
         failures: whether failures to enrol keep their scores, as in the paper, or are missing.
         logarithmic: modalities whose scores are replaced by log(1 + score).
-        impostor_limit: largest number of impostor pairs that a fusion learns from.
+        impostor_limit: largest number of impostor pairs in the training data.
     """
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -117,7 +116,7 @@ class MixtureParameters(LearnerParameters):
         components_of: Gaussians per state of both kinds of pairs, by the name of a subset.
         covariance_floor: value added to the diagonal of every covariance, in squared z units.
         iterations: largest number of steps of expectation maximization.
-        tolerance: gain in log-likelihood below which expectation maximization ends.
+        tolerance: increase of the log-likelihood below which expectation maximization ends.
     """
 
     topology: Literal["left-right", "ergodic", "joint"] = "left-right"
@@ -135,9 +134,9 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """Fit a classifier whose score is above zero for genuine pairs; a missing score counts as the mean.
+    """Fit a classifier with scores above zero for genuine pairs; missing scores are set to the mean.
 
-    QDA, LDA, logistic regression and all calibrated classifiers give a log-likelihood ratio for equal
+    QDA, LDA, logistic regression and all calibrated classifiers compute a log-likelihood ratio for equal
     priors.
 
     Args:
@@ -149,7 +148,7 @@ def learn_classifier(
     Raises BadInput if the classifier cannot be fitted to these scores.
     """
     with extra("papers", f"classifier {parameters.classifier}"):
-        from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
+        from sklearn.calibration import CalibratedClassifierCV  # slow to import
 
     vectors = np.nan_to_num(vectors)
     model = _classifier(parameters, int(rng.integers(2**31)))
@@ -290,7 +289,8 @@ def _learnt(
     vectors = scores[pairs.probe, pairs.gallery]
     with extra("papers", "a learnt fusion"):
         import sklearn.cluster  # noqa: F401  # only libraries that are loaded are limited below
-    # the problems are small: on a busy machine, the libraries' threads would only wait for each other
+    # these problems are small; on a busy machine, threads of the libraries would only wait for each
+    # other
     with threadpool_limits(1):
         fused = cross_validate(vectors, pairs, learner, parameters.impostor_limit, rng)
     metadata = {"fold_of_user": ",".join(map(str, fold)), "threshold": "0"}
@@ -300,7 +300,7 @@ def _learnt(
 
 
 def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
-    """Return scores (users, users, matchers) in global z units, with some modalities as logarithms."""
+    """Return scores (users, users, matchers) in global z units, or logarithms for some modalities."""
     scores = compared.scores
     if parameters.failures == "missing":
         scores = np.where(compared.failed, np.nan, scores)
@@ -341,7 +341,7 @@ def fused_stream(
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: Subsets) -> Iterator[Binding]:
-    """Find the scores and the matchers to fuse, by case; yield nothing if there is nothing to fuse."""
+    """Find the scores and, by case, the matchers to fuse; yield nothing if there are none."""
     if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
         return
     subsets = subsets_of(matchers_of(topics[TOPIC].metadata))

@@ -1,7 +1,7 @@
 """Hidden Markov models with Gaussian mixtures, fitted to many short sequences by Baum-Welch.
 
-Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) takes a sequence of n vectors of m scores; every state has a
-mixture of g Gaussians. A model with one state is a mixture; a left-to-right model is a product of
+Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) models a sequence of n vectors of m scores; every state has
+a mixture of g Gaussians. A model with one state is a mixture; a left-to-right model is a product of
 mixtures, one per vector. The recursions are those of Rabiner, Proc. IEEE 1989, for all sequences in
 parallel and with probabilities as logarithms.
 """
@@ -42,7 +42,7 @@ class Fit(NamedTuple):
 
 
 def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
-    """Fit a model to sequences (count, n, m), without those that have a missing score (NaN).
+    """Fit a model to sequences (count, n, m), excluding sequences with a missing score (NaN).
 
     The means start from k-means of the vectors at the state's position in the sequence.
 
@@ -98,7 +98,7 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
 def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     """Initialize a model by k-means of each state's vectors, with left-right or equal transitions."""
     with extra("papers", "a mixture of scores"):
-        from sklearn.cluster import KMeans  # which takes long to import
+        from sklearn.cluster import KMeans  # slow to import
 
     states = sequences.shape[1]
     initial, transition = np.full(states, 1 / states), np.full((states, states), 1 / states)
@@ -118,8 +118,8 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 def _uneven(vectors: Floats) -> Floats:
     """Return vectors (count, m) with slightly distorted scales, different in each dimension.
 
-    Whole-number scores are often equally far from two means. The distortion makes the lower mean the
-    nearer one, where otherwise rounding would decide.
+    Whole-number scores are often equally far from two means. With the distortion, the lower mean is
+    nearer; without it, rounding would decide.
     """
     bend = UNEVEN * np.arange(1, vectors.shape[1] + 1)
     return vectors + bend * (vectors - vectors.min(axis=0)) ** 2
@@ -164,7 +164,7 @@ def _mixtures(model: MixtureHmm, vectors: Floats, responsibility: Floats, floor:
 
 
 def _log_components(model: MixtureHmm, vectors: Floats) -> Floats:
-    """Compute the log of weight times density (count, s, g) of vectors (count, m); m may be zero."""
+    """Compute the log of weight × density (count, s, g) of vectors (count, m); m may be zero."""
     size = vectors.shape[-1]
     whiten = np.linalg.inv(np.linalg.cholesky(model.covariances))
     shape = (len(vectors), *model.weights.shape, size)

@@ -20,7 +20,7 @@ IMPOSTORS_PER_USER = 2
 
 
 class Pairs(NamedTuple):
-    """The comparisons to fuse: probe and gallery user (n,) of each, and the folds (users,) of users.
+    """Comparisons to fuse: their probe and gallery users (n,), and the folds (users,) of the users.
 
     If `fold` is None, the fusion does not learn.
     """
@@ -33,9 +33,9 @@ class Pairs(NamedTuple):
 def normalise(scores: Floats, how: str) -> Floats:
     """Convert scores to a common scale; missing scores (NaN) stay missing.
 
-    `tanh` is that of Jain, Nandakumar & Ross 2005, with mean and standard deviation instead of Hampel's
-    estimates. A gallery column with equal scores becomes 0. Raises BadInput if a standard deviation is
-    zero or not finite.
+    `tanh` is the normalisation of Jain, Nandakumar & Ross 2005, with mean and standard deviation instead
+    of Hampel's estimates. A gallery column with equal scores becomes 0. Raises BadInput if a standard
+    deviation is zero or not finite.
 
     Args:
         scores: (users, users, matchers), NaN if missing.
@@ -82,7 +82,7 @@ def all_pairs(users: int) -> Pairs:
 
 
 def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
-    """Draw the paper's trimmed database: genuine pairs, and two random other probes per gallery user.
+    """Draw the paper's trimmed database: genuine pairs, and two random impostor probes per gallery user.
 
     The probes are the same for all matchers; different probes for each matcher would inflate the
     results.
@@ -108,7 +108,7 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
 def cross_validate(
     vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
 ) -> Floats:
-    """Fuse scores (n,), with each fusion learned without the users of the gallery user's fold.
+    """Fuse scores (n,); each fusion is learned without the users in the fold of the gallery user.
 
     Args:
         vectors: (n, m), a score of each matcher.
@@ -130,7 +130,7 @@ def cross_validate(
 
 
 def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
-    """List subsets of matchers: each modality, the k-th matcher of each modality, all, and single ones.
+    """List subsets of matchers: by modality, the k-th of each modality, all, and single matchers.
 
     A subset of a single matcher has that matcher's name. The larger subsets are those of the paper (M1,
     M2, R1, R2, all).

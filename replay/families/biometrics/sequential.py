@@ -26,7 +26,7 @@ class Rates(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """Decisions on sequences (n,): whether they were accepted, and after how many probes.
+    """Decisions on sequences (n,): whether each was accepted, and after how many probes.
 
     A sequence without a decision has 0 probes and is not accepted.
     """
@@ -41,7 +41,7 @@ class Decisions(NamedTuple):
 
 
 def thresholds(rates: Rates) -> tuple[float, float]:
-    """Return the sums of log-likelihood ratios at which a test rejects and accepts.
+    """Compute the sums of log-likelihood ratios at which a test rejects and accepts.
 
     Raises BadInput if a rate is not above zero, or if their sum is not below one.
     """
@@ -60,10 +60,10 @@ def wald_bounds(rates: Rates) -> Rates:
 
 
 def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
-    """Compute the mean number of probes by Wald (4.8), as if the sum ended exactly on a threshold.
+    """Compute the mean number of probes by Wald (4.8), assuming that sums end exactly on a threshold.
 
-    `mean_ratio` is the mean log-likelihood ratio of a probe, either of the person (`genuine`) or of
-    impostors.
+    `mean_ratio` is the mean log-likelihood ratio of a probe, either of the genuine person (`genuine`) or
+    of impostors.
     """
     low, high = thresholds(rates)
     accepted = 1.0 - rates.false_reject if genuine else rates.false_accept
@@ -107,7 +107,7 @@ def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
     """Count the probes (...,) until one of the sums (..., n) exceeds its threshold; 0 if none does.
 
     The threshold is log(together * run_length), where each probe adds to `together` sums. By the
-    martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is then at least
+    martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is at least
     `run_length` (Pollak, Annals of Statistics 13(1), 1985).
 
     Args:

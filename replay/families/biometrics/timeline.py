@@ -47,12 +47,12 @@ class Fusion(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw a board for every fused subset of matchers; without estimates, draw all scores."""
+    """Draw a panel for every fused subset of matchers; without estimates, draw all scores."""
     return draw_cases(scene, partial(_draw_case, canvas, scene))
 
 
 def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
-    """Draw distributions and errors of fused scores and, in a tab, the scores of each probe."""
+    """Draw distributions and errors of fused scores, and in another tab the scores of each probe."""
     fusions = list(_fusions(scene, case))
     probes = [_draw_fused_probes(canvas, case, fusion) for fusion in fusions]
     rows = [rrb.Horizontal(*views) for views in (probes, _draw_matchers(canvas, scene, case)) if views]
@@ -71,7 +71,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
 def _fusions(scene: Scene, case: str) -> Iterator[Fusion]:
     """Yield the fusions of a case.
 
-    If a fusion has no threshold, it is half-way between the medians of genuine and impostor scores.
+    If a fusion has no threshold, the mean of the medians of genuine and impostor scores is used.
     """
     for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
         fused = fused_of(stream)
@@ -97,7 +97,7 @@ def _draw_fused_probes(canvas: Canvas, case: str, fusion: Fusion) -> rrb.View:
 
 
 def _draw_rates(canvas: Canvas, scene: Scene, case: str, fusions: Sequence[Fusion]) -> rrb.View:
-    """Draw both error rates at every threshold, one curve for each fusion of a case."""
+    """Draw the ROC curve of each fusion of a case: both error rates at every threshold."""
     curves, strokes = {}, {}
     for estimator, fused, *_ in fusions:
         found = roc(fused.score, fused.genuine)
@@ -147,7 +147,7 @@ def _errors_so_far(fused: Fused, threshold: float) -> Floats:
 
 
 def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChartView:
-    """Draw two histograms of scores so far, each with sum 1; end bars include scores outside the range.
+    """Draw two normalized histograms of scores so far; the end bars include scores outside the range.
 
     The two bars of a bin are side by side. A bar of the largest height marks the threshold.
     """
@@ -189,7 +189,7 @@ def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChar
 
 
 def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
-    """Draw the scores that the case's matchers gave each probe, without failures to enrol."""
+    """Draw the scores of each probe by the case's matchers, without failures to enrol."""
     if TOPIC not in scene.source.topics:
         return []
     stream = scene.read(TOPIC)

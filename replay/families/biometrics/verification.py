@@ -1,4 +1,4 @@
-"""Measures of verification and identification by scores: rates, ROC, equal error rate, Cllr.
+"""Performance measures of verification and identification: rates, ROC, equal error rate, Cllr.
 
 Verification rate and relative rate increase: Zheng & Blasch, JAIF 2014, eq. 3. Cllr: Brummer & du Preez,
 Computer Speech & Language 2006. A greater score means more similar; a comparison is accepted if its
@@ -44,7 +44,7 @@ class Fused(NamedTuple):
 
     @property
     def genuine(self) -> NDArray[np.bool_]:
-        """Return which comparisons are of the same user."""
+        """Test whether each comparison (n,) is of the same user."""
         return self.probe == self.gallery
 
     @property
@@ -73,7 +73,7 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
     Args:
         score: (n,), greater if more similar.
         genuine: (n,), whether probe and gallery entry are of the same person.
-        weight: (n,), how often each comparison counts; once by default.
+        weight: (n,), the weight of each comparison; 1 by default.
 
     Returns:
         Rates from nothing accepted to everything accepted.
@@ -88,7 +88,7 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """Return the greatest genuine accept rate whose false accept rate does not exceed the given rate.
+    """Find the greatest genuine accept rate for which the false accept rate does not exceed a limit.
 
     Args:
         curve: rates of a fusion.
@@ -127,9 +127,9 @@ def identified(scores: Floats) -> int:
 
 
 def verification_rate(fused: Fused) -> float:
-    """Compute the share of correct decisions (genuine above the threshold), averaged over the folds.
+    """Compute the share of correct decisions by the threshold, averaged over the folds.
 
-    If the fusion has no threshold, it is 0, as for a log-likelihood ratio.
+    If the fusion has no threshold, 0 is used, as for a log-likelihood ratio.
     """
     right = (fused.score > (fused.threshold or 0.0)) == fused.genuine
     if fused.fold is None:
@@ -140,7 +140,7 @@ def verification_rate(fused: Fused) -> float:
 
 
 def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
-    """Compute by how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3).
+    """Compute the absolute and relative increase of a rate over the mean of single matchers (eq. 3).
 
     Args:
         fused_rate: rate of the fusion, between 0 and 1.
@@ -152,7 +152,7 @@ def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, 
 
 
 def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
-    """Compute GAR at the three FARs, and EER, (replicates, 4), for users resampled with replacement.
+    """Compute the GAR at three FARs and the EER (replicates, 4) for users resampled with replacement.
 
     A comparison counts as often as its probe's user was drawn times its gallery's user; a genuine
     comparison counts as often as its user was drawn. This preserves the dependence of scores of the same

@@ -1,7 +1,7 @@
 """Filters of axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
 
 The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
-Kalman filters that the paper compares it with. All of them process an ensemble as ragged rows in
+Kalman filters with which the paper compares it. All of them process an ensemble as ragged rows in
 compiled loops, in parallel over the runs.
 """
 
@@ -32,10 +32,10 @@ from fuselog.replay.families.directional.distributions.gaussian_kernels import c
 
 
 class Steps(NamedTuple):
-    """Steps of many runs, concatenated: run r owns the rows offsets[r]:offsets[r + 1].
+    """Steps of many runs, concatenated: rows offsets[r]:offsets[r + 1] belong to run r.
 
-    A row is a prediction with a known increment u, followed by an update with a measurement z. NaN in
-    one of them skips that half of the step.
+    A row is a prediction with a known increment u, followed by an update with a measurement z. A NaN in
+    the increment or the measurement skips that half of the step.
 
     Attributes:
         offsets: (runs + 1,).
@@ -49,11 +49,11 @@ class Steps(NamedTuple):
 
 
 def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
-    """Check vectors, normalize them to exactly unit length and return them as steps.
+    """Make steps of vectors that are checked and scaled to exactly unit length.
 
     Args:
         offsets: (runs + 1,), the first row of each run.
-        increment: known turns (rows, d), unit vectors.
+        increment: known rotations (rows, d), unit vectors.
         measurement: unit vectors (rows, d), NaN if there is no measurement.
 
     Raises BadInput if a vector is neither a unit vector nor NaN, or if the numbers of rows differ.
@@ -73,7 +73,7 @@ def _unit_or_nan(x: NDArray, what: str) -> Floats:
 
 
 class BinghamNoise(NamedTuple):
-    """System noise w and measurement noise v without batch axes, with modes at or near the identity."""
+    """System noise w and measurement noise v, without batch axes; their modes are near the identity."""
 
     system: Bingham
     measurement: Bingham
@@ -101,7 +101,7 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
 def run_bingham_filter(
     noise: BinghamNoise, state: Bingham, steps: Steps, rotations: Floats | None = None
 ) -> tuple[Bingham, Bingham]:
-    """Run the recursive Bingham filter: algorithms 1 and 2.
+    """Run the recursive Bingham filter (algorithms 1 and 2).
 
     Args:
         noise: system and measurement noise.
@@ -171,16 +171,17 @@ def run_kalman_filter(
     *,
     rotated: bool,
 ) -> tuple[Gaussian, Gaussian]:
-    """Run the paper's modified Kalman filter on R^d (section 7), which mirrors measurements.
+    """Run the paper's modified Kalman filter on R^d, which may negate measurements (section 7).
 
     The filter normalizes the mean after every update.
 
     Args:
-        noise: system and measurement noise; the paper adds it unrotated, whatever the state is.
+        noise: system and measurement noise; the paper adds it without rotation, for any state.
         state: the Gaussians before the first row, batch axis (runs,).
         steps: increments and measurements of all runs.
         rotations: as for `run_bingham_filter`.
-        rotated: rotate the noise into the frame of the state, x (+) (w - e_1), before adding it.
+        rotated: whether the noise is rotated into the frame of the state, x (+) (w - e_1), before it is
+            added.
 
     Returns:
         The state after the last row, and the estimates of all rows, batch axis (rows,). If the
@@ -258,7 +259,7 @@ def _length(x: NDArray) -> float:
 
 
 def _frame(state: NDArray, rotated: bool, frame: NDArray) -> None:
-    """Write the state scaled to unit length if `rotated`, the identity otherwise."""
+    """Write the state, scaled to unit length, if `rotated`; otherwise write the identity."""
     length = _length(state)
     for i in range(len(state)):
         identity = 1.0 if i == 0 else 0.0

@@ -15,7 +15,7 @@ AVERAGED_NS = 1_000_000_000
 
 
 class Disturbances(NamedTuple):
-    """Spans (n,) in which the field differs from the local field: begin, end, and largest difference."""
+    """Spans (n,) in which the field differs from the local field: start, end and largest difference."""
 
     begin_ns: Integers
     end_ns: Integers
@@ -23,12 +23,12 @@ class Disturbances(NamedTuple):
 
 
 def disturbances(samples: Stream, estimates: Stream, limit_ut: float = 8.0) -> Disturbances:
-    """Find the seconds in which the field's mean deviation exceeds a limit, and join them to spans.
+    """Find seconds in which the mean deviation of the field exceeds a limit, and join them into spans.
 
     Args:
         samples: samples of an inertial unit with a magnetometer.
         estimates: estimates with the components `COMPONENTS`; samples without an estimate are ignored.
-        limit_ut: usually four times the standard deviation of an undisturbed field.
+        limit_ut: limit in uT, usually four times the standard deviation of an undisturbed field.
     """
     row = np.searchsorted(estimates.publish_time_ns, samples.publish_time_ns).clip(0, len(estimates) - 1)
     field = samples["magnetic_field_ut"]

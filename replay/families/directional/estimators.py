@@ -1,7 +1,7 @@
 """Estimators of axes, orientations and pairs of headings for replay.
 
-The algorithms are in `bingham` and `torus`; this module binds them to streams. Noise and prior are those
-that the channel states, unless a parameter overrides them.
+The algorithms are in `bingham` and `torus`; this module binds them to streams. The channel states the
+noise and the prior; parameters override them.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,17 +43,17 @@ from fuselog.replay.families.directional.torus import (
     run_unscented_filter,
 )
 
-# The states of all runs and their measurements -> the states after them; fills the results.
+# (states of all runs, their measurements) -> the states after them; it fills the results.
 Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """Distributions of the prior and the noises; by default those that the log's channel states.
+    """Distributions of the prior and the noise; by default, those that the channel of the log states.
 
     Attributes:
         prior: distribution of the orientation at the start.
         system: distribution of the rotation in a step.
-        measurement: distribution of the rotation by which a measurement is wrong.
+        measurement: distribution of the rotation error of a measurement.
     """
 
     prior: DirectionalNoise | None = None
@@ -62,17 +62,17 @@ class BinghamParameters(Parameters):
 
 
 class KalmanParameters(BinghamParameters):
-    """Distributions of the prior and the noises, and how noise is added.
+    """Distributions of the prior and the noise, and the way in which noise is added.
 
     Attributes:
-        rotated: whether the noise is rotated into the state's frame; the paper adds it unrotated.
+        rotated: whether the noise is rotated into the state's frame; the paper adds it without rotation.
     """
 
     rotated: bool = False
 
 
 class HeadingsFilterParameters(Parameters):
-    """The model of `headings`; by default, the numbers that the log's channel states.
+    """Parameters of the model of `headings`; by default, the numbers that the channel of the log states.
 
     Attributes:
         coupling_rad: in each step, the first heading turns by this times the cosine of the second, and
@@ -95,21 +95,21 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """The model of `headings`, and the samples of the filter.
+    """Parameters of the model of `headings`, and of the samples of the filter.
 
     Attributes:
-        central_weight: weight of the central one of the five samples (w5 in the paper).
+        central_weight: weight of the central sample among the five (w5 in the paper).
     """
 
     central_weight: Annotated[float, Field(ge=0, le=0.5)] = 0.2
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """The model of `headings`, and how angles are compared.
+    """Parameters of the model of `headings`, and the comparison of angles.
 
     Attributes:
-        wrapped: whether the innovation is wrapped to [-pi, pi); otherwise angles are only taken modulo
-            2 pi.
+        wrapped: whether the innovation is wrapped to [-pi, pi); if not, only the angles are reduced
+            modulo 2 pi.
     """
 
     wrapped: bool = True
@@ -130,7 +130,7 @@ def follow_all(advance: Advance, messages: Messages, state: Any, results: Result
 
 
 def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
-    """Return prior and noises; raise BadInput if one is not stated or does not have d components."""
+    """Return the prior and the noise; raise BadInput if one is missing or does not have d components."""
     found = {}
     for name in Distributions._fields:
         value = getattr(given.parameters, name)

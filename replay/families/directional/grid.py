@@ -1,7 +1,7 @@
 """Bayesian filters on a grid over the half circle and the torus, as a reference.
 
-They discretize the domain and approximate no density, so they show what any filter of the same model can
-achieve.
+They discretize the domain and do not approximate densities, so they show the best accuracy that a filter
+of the same model can reach.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from fuselog.replay.families.directional.torus import HeadingModel, Motion
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Cells that a transition reaches with less than this fraction of its peak are dropped.
+# A transition drops cells whose probability is below this fraction of its peak.
 _NEGLIGIBLE = 1e-12
 
 
@@ -123,7 +123,7 @@ def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> Floats:
 
 
 def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
-    """Compute the densities (rows, cells) of measurements; if the second angle is NaN, of the first."""
+    """Compute densities (rows, cells) of measurements, or of the first angle if the second is NaN."""
     missing = np.isnan(measured)
     sigmas = np.where(missing, np.sqrt(UNIFORM), np.sqrt(np.diag(model.measurement)))
     correlation = model.measurement[0, 1] / np.sqrt(np.prod(np.diag(model.measurement)))
@@ -134,8 +134,8 @@ def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
 
 
 def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.csr_array":
-    """Compute the probabilities of the next cell (rows) given the previous cell (columns)."""
-    from scipy import sparse  # which takes long to import
+    """Compute the probability of each next cell (rows) given the previous cell (columns)."""
+    from scipy import sparse  # slow to import
 
     moved = np.stack(motion(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
     reached = np.stack(
@@ -146,7 +146,7 @@ def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.c
 
 
 def _in_step(offsets: Integers) -> Iterator[tuple[Integers, Integers]]:
-    """Yield the runs that have a next row, and these rows, until no run has more."""
+    """Yield the runs that have a next row, and these rows, until all rows have been used."""
     counts = np.diff(offsets)
     for step in range(int(counts.max(initial=0))):
         runs = np.flatnonzero(counts > step)

@@ -1,6 +1,6 @@
-"""Timelines of directional scenarios: densities of two headings and of an axis, triads of orientations.
+"""Timelines of directional scenarios: densities of headings and axes, and triads of orientations.
 
-To the right of each view are the errors in degrees with their bounds, as in all timelines.
+The errors in degrees, with their bounds, are to the right of each view, as in all timelines.
 """
 
 from collections.abc import Callable, Iterator
@@ -39,7 +39,7 @@ from fuselog.replay.timeline.drawing.plots import draw_quality
 from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 
 QUATERNION = COMPONENTS[:4]
-# Pictures and outlines are large, so fewer of them are drawn than of numbers.
+# Images and outlines are large, so fewer of them are drawn.
 PICTURES = 500
 CELLS = 96
 OUTLINE_POINTS = 145
@@ -87,7 +87,7 @@ def _track(name: str, colour: Colour, stream: Stream, field: str, rows: int) -> 
 def _draw_with(
     board: Callable[[Canvas, Scene, str], Board], canvas: Canvas, scene: Scene
 ) -> rrb.Container | rrb.View:
-    """Draw a board above the events of each case, and its errors next to it."""
+    """Draw a panel above the events of each case, with the errors next to it."""
 
     def draw_case(case: str) -> rrb.Container:
         left = above_events(
@@ -99,7 +99,7 @@ def _draw_with(
 
 
 def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield the spans in which estimators that know the local magnetic field find it disturbed."""
+    """Yield spans in which the magnetic field is disturbed, by estimators of the local field."""
     topic = f"/{case}/inertial".replace("//", "/")
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if topic in scene.source.topics and set(COMPONENTS) <= set(stream.components):
@@ -113,7 +113,7 @@ def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Draw triads: red, green and blue for the truth; longer, in its own colour, for an estimate."""
+    """Draw triads: red, green and blue for the truth; longer and in one colour for each estimate."""
     root = entity_path("space", case)
     for number, track in enumerate(_tracks(scene, case, 4, 5000)):
         is_truth = track.name == "truth"
@@ -125,7 +125,7 @@ def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
 
 
 def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Draw each estimate's density around a circle, and truth and measurement as lines through it."""
+    """Draw the density of each estimate around a circle; truth and measurement are lines across it."""
     root = entity_path("axis", case)
     canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
     angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS)
@@ -218,7 +218,7 @@ def _draw_ticks(canvas: Canvas, entity: str) -> None:
 
 
 def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
-    import matplotlib as mpl  # which takes long to import
+    import matplotlib as mpl  # slow to import
 
     assert track.covariances is not None
     usable = np.linalg.eigvalsh(track.covariances)[:, 0] > 0.0

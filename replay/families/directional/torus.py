@@ -1,10 +1,10 @@
 """Filters of two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
 
-The recursive toroidal filter that Kurz and Hanebeck announce in "Deterministic Sampling on the Torus for
-Bivariate Circular Estimation", 2016, and the unscented Kalman filter with their UKF samples. Both
-process an ensemble as ragged rows, in which run r owns offsets[r]:offsets[r + 1]. A row is a prediction,
-followed by an update with its measurement (2,). If the measurement is NaN, there is no update; if only
-the second angle is NaN, the update uses the first angle.
+These are the recursive toroidal filter that Kurz and Hanebeck announce in "Deterministic Sampling on the
+Torus for Bivariate Circular Estimation", 2016, and the unscented Kalman filter with their UKF samples.
+Both process an ensemble as ragged rows: rows offsets[r]:offsets[r + 1] belong to run r. A row is a
+prediction, followed by an update with its measurement (2,). If the measurement is NaN, there is no
+update; if only the second angle is NaN, the update uses the first angle.
 """
 
 import math
@@ -59,7 +59,7 @@ class HeadingModel(NamedTuple):
 
 
 class HeadingRows(NamedTuple):
-    """Measurements (n, 2) of all runs: run r owns offsets[r]:offsets[r + 1]."""
+    """Measurements (n, 2) of all runs; rows offsets[r]:offsets[r + 1] belong to run r."""
 
     offsets: Integers
     measurement: Floats
@@ -73,7 +73,8 @@ class HeadingInputs(NamedTuple):
     option: float | bool
 
 
-# Two angles, coupling and drifts -> the next two: `fuselog.recorders.families.directional.headings`.
+# (two angles, coupling, drifts) -> the next two angles:
+# `fuselog.recorders.families.directional.headings`.
 Motion = Callable[..., tuple[Component, Component]]
 
 
@@ -143,10 +144,11 @@ def run_unscented_filter(
 
     Args:
         model, state, offsets, measurement, motion: as for `run_toroidal_filter`.
-        wrapped: wrap the innovation to [-pi, pi); otherwise angles are only taken modulo 2 pi.
+        wrapped: whether the innovation is wrapped to [-pi, pi); if not, only the angles are reduced
+            modulo 2 pi.
 
     Returns:
-        What `run_toroidal_filter` returns.
+        The state and the estimates, as `run_toroidal_filter` returns them.
     """
     return _run(_unscented_step, motion, model, state, offsets, measurement, wrapped)
 

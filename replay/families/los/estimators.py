@@ -1,8 +1,8 @@
 """Estimators `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
 
 A batch, which is solved as a whole, contains each line of sight once: when a sensor sees a target again,
-the next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on a log
-with biases, and scheme 3 is `los-biases`.
+the next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 is `los-positions`
+on a log with biases, and scheme 3 is `los-biases`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/att
 
 
 class PositionsParameters(Parameters):
-    """No parameters: all biases are assumed to be zero."""
+    """Empty set of parameters; all biases are assumed to be zero."""
 
 
 class BiasesParameters(Parameters):
@@ -108,7 +108,7 @@ def _solve(given: Given[Any]) -> list[Ragged]:
 
 
 def _constant(ragged: Ragged, field: str, width: int) -> Floats:
-    """Return the one value (width,) of a stream that is the same in all runs."""
+    """Return the constant value (width,) of a stream, which is the same in all runs."""
     check_width(ragged.stream, field, width)
     values: Floats = ragged[field]
     if len(values) == 0 or (values != values[:1]).any():

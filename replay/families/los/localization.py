@@ -1,8 +1,8 @@
 """Estimation of targets and attitude biases from lines of sight: Belfadel et al., JAIF 2014.
 
-The parameters are the positions of all targets (x, y, z each) and then the attitude biases (yaw, pitch,
-roll of each sensor) that are not known. In scheme 3 all biases are unknown; schemes 1 and 2 assume that
-all are zero, which is wrong in scheme 2.
+The parameters are the positions of all targets (x, y, z each), followed by the unknown attitude biases
+(yaw, pitch, roll of each sensor). In scheme 3 all biases are unknown; schemes 1 and 2 assume that all
+are zero, which is wrong in scheme 2.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ SAME_TURN = 1e-6
 
 
 class Scene(NamedTuple):
-    """Knowledge of the sensors before the measurements.
+    """Known properties of the sensors.
 
     position_m and nominal_attitude_rad (yaw, pitch, roll) are (sensors, 3), y up. sigma_rad (sensors, 2)
     is the noise of azimuth and elevation. known_bias_rad (sensors, 3) is NaN for biases to estimate.
@@ -50,7 +50,7 @@ class Scene(NamedTuple):
 
     @property
     def wanted(self) -> Booleans:
-        """Return which biases are estimated, (3 sensors,)."""
+        """Return which biases (3 * sensors,) are estimated."""
         return np.isnan(self.known_bias_rad).ravel()
 
 
@@ -58,7 +58,8 @@ class Observability(NamedTuple):
     """Observability of the parameters from the measurements of one run.
 
     `turning_axis` is the unit vector about which all sensors and targets can rotate together without a
-    change in the measurements; None if all parameters are observable, or if others are not.
+    change in the measurements; None if all parameters are observable, or if the unobservable directions
+    are different ones.
     """
 
     rank: int
@@ -78,7 +79,7 @@ def predict(scene: Scene, parameters: Floats) -> Floats:
     """Predict azimuth and elevation in rad, without noise.
 
     Args:
-        scene: what is known of the sensors.
+        scene: known properties of the sensors.
         parameters: (runs, n).
 
     Returns:
@@ -90,12 +91,12 @@ def predict(scene: Scene, parameters: Floats) -> Floats:
 def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Solution:
     """Estimate positions and unknown biases from lines of sight.
 
-    Raises BadInput if shapes do not agree or a noise is not positive.
+    Raises BadInput if shapes do not match or a standard deviation is not positive.
 
     Args:
         scene: knowledge before the measurements.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
-        start: (runs, n), where the search begins; by default, where the rays meet.
+        start: (runs, n), starting point of the search; by default, the intersections of the rays.
     """
     _check(scene, measured)
     return solve(
@@ -105,7 +106,7 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
 
 
 def starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Find the point (runs, n) where the rays of each target meet, with unknown biases set to zero.
+    """Compute parameters (runs, n) from the intersections of rays, with zero for unknown biases.
 
     Args:
         scene: knowledge before the measurements.
@@ -123,9 +124,9 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
 def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
     """Compute the start as printed, (21)-(23), for the first two sensors, with zero nominal attitudes.
 
-    The paper has z, x, y for x, y, z. The start depends on the difference of two azimuths: if everything
-    is nearly in one vertical plane, as in the paper's three-sensor scenes, it is too far off. For
-    experiments only.
+    The paper writes z, x, y for x, y, z. The start depends on the difference of two azimuths: if
+    everything is nearly in one vertical plane, as in the paper's three-sensor scenes, the start is too
+    inaccurate. The function is meant for experiments.
 
     Args:
         scene: knowledge before the measurements.
@@ -205,7 +206,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """Find the axis about which a direction turns all sensors alike; None if there is no such axis."""
+    """Find the common axis about which a direction turns all sensors; None if there is no such axis."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
@@ -220,18 +221,18 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 
 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
-    """Compute the CRLB sigmas of all unknown biases if one of them were known.
+    """Compute the CRLB sigmas of all biases for the case that one of the unknown biases is known.
 
-    A row with infinite or large values belongs to a bias that must not be the one to fix: fixing it does
-    not make the others observable.
+    If a row has infinite or large values, its bias is not a useful choice: if it is fixed, the others
+    are still not observable.
 
     Args:
         scene: knowledge before the measurements.
-        measured: of one run, (targets, sensors, 2), in rad.
-        parameters: (n,), at which it is linearised.
+        measured: (targets, sensors, 2), in rad, for one run.
+        parameters: (n,), the point of linearisation.
 
     Returns:
-        Sigmas in rad, a square: a row for the bias that is known, a column for each bias.
+        A square matrix of sigmas in rad, with one row for each known bias and one column for each bias.
     """
     at = linearize(scene, measured[None], parameters[None])
     wanted = int(scene.wanted.sum())
@@ -258,7 +259,7 @@ def _check(scene: Scene, measured: Floats) -> None:
 
 
 def _geometry(scene: Scene, parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return targets, sensors and biased attitudes, components first, with shapes that broadcast."""
+    """Return targets, sensors and biased attitudes as broadcastable arrays with components first."""
     runs, sensors = len(parameters), len(scene.position_m)
     targets = (parameters.shape[1] - scene.wanted.sum()) // 3
     target = parameters[:, : 3 * targets].reshape(runs, targets, 3)

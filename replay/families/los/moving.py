@@ -1,12 +1,12 @@
-"""Model of moving targets, with attitude biases and clock offsets of the sensors on aircraft.
+"""Model of moving targets, with attitude biases and clock offsets of airborne sensors.
 
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014
-(`fuselog.recorders.families.los.models`), but targets and sensors move and are not synchronised. A
-message states the sensor's pose at a stamp of the sensor's own clock. If this clock is ahead by c, the
-targets are seen as they were c before the stamp:
+(`fuselog.recorders.families.los.models`), but targets and sensors move, and the sensors are not
+synchronised. A message states the pose of its sensor, with a stamp by the sensor's own clock. If this
+clock is ahead by c, the sensor sees the targets at the time c before the stamp:
     (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clocks are `augmentable`, see `fuselog.replay.inference.model.augmentation`; with
-`estimate_drift` they are random walks.
+Biases and clock offsets can be estimated together with the state, see
+`fuselog.replay.inference.model.augmentation`; with `estimate_drift` they are random walks.
 """
 
 from typing import Any
@@ -38,12 +38,12 @@ class MovingSightParameters(ModelParameters):
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
         sigma_azimuth_rad: standard deviation of an azimuth.
         sigma_elevation_rad: standard deviation of an elevation.
-        sensor_1_yaw_bias_rad, sensor_2_yaw_bias_rad, sensor_3_yaw_bias_rad: bias of this sensor's yaw.
-        sensor_1_pitch_bias_rad, sensor_2_pitch_bias_rad, sensor_3_pitch_bias_rad: bias of this sensor's
-            pitch.
-        sensor_1_roll_bias_rad, sensor_2_roll_bias_rad, sensor_3_roll_bias_rad: bias of this sensor's
-            roll.
-        sensor_1_clock_s, sensor_2_clock_s, sensor_3_clock_s: time by which this sensor's clock is ahead.
+        sensor_1_yaw_bias_rad, sensor_2_yaw_bias_rad, sensor_3_yaw_bias_rad: yaw bias of each sensor.
+        sensor_1_pitch_bias_rad, sensor_2_pitch_bias_rad, sensor_3_pitch_bias_rad: pitch bias of each
+            sensor.
+        sensor_1_roll_bias_rad, sensor_2_roll_bias_rad, sensor_3_roll_bias_rad: roll bias of each sensor.
+        sensor_1_clock_s, sensor_2_clock_s, sensor_3_clock_s: time by which the clock of each sensor is
+            ahead.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -64,7 +64,7 @@ class MovingSightParameters(ModelParameters):
 
 
 def moved_target(state: Components, first: int, duration_s: Component) -> Components:
-    """Predict the position of the target whose components begin at `first`."""
+    """Predict the position of a target; `first` is the index of its first component."""
     return (
         state[first] + duration_s * state[first + 3],
         state[first + 1] + duration_s * state[first + 4],
@@ -83,8 +83,8 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """Compute the variances that white accelerations add.
 
-    Covariances within a step are left out: steps are fractions of a second, in which the noise of
-    positions is millimetres, and a triangle of 23 components takes minutes to compile.
+    Covariances between the components are left out: in a step of a fraction of a second, the noise of
+    positions is a few millimetres, and a triangle of 23 components takes minutes to compile.
     """
     place, _, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return (place, place, place, speed, speed, speed, place, place, place, speed, speed, speed)
@@ -107,7 +107,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Compute azimuth and elevation of a target in rad; `reference` is its number, then the pose."""
+    """Compute azimuth and elevation of a target in rad; `reference` has its number and the pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (

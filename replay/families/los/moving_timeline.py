@@ -1,7 +1,7 @@
-"""Timeline of moving targets seen by moving sensors: tracks, lines of sight, close-ups of errors.
+"""Timeline of moving targets and sensors: tracks, lines of sight, and close-ups of errors.
 
-It draws every log with moving lines of sight, from any source. Errors are small compared with distances,
-so each target has its own view around its true position.
+It applies to any log with moving lines of sight. Errors are small compared with distances, so each
+target has its own view around its true position.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +31,7 @@ from fuselog.replay.timeline.drawing.canvas import (
 from fuselog.replay.timeline.drawing.plane import with_legend
 
 AXES = "xyz"
-# Reach of a close-up, in units of the smallest median error, and the position of its eye.
+# Extent of a close-up, in units of the smallest median error, and the position of its camera.
 REACH, EYE = 1.0, np.array([1.6, 1.2, -1.9])
 MARK, THIN = rr.Radius.ui_points(5.0), rr.Radius.ui_points(1.5)
 
@@ -47,7 +47,7 @@ class Track(NamedTuple):
 
 
 def draw_moving_sights(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
-    """Draw the scene above a close-up of each target's errors; no board without sensors or targets."""
+    """Draw the scene above a close-up of each target's errors, if there are sensors and targets."""
     schema = schemas.MOVING_LINE_OF_SIGHT.full_name
     topics = [
         each for each in scene.topics_near(case) if scene.source.topics[each].schema_name == schema
@@ -96,7 +96,7 @@ def _tracks(scene: Scene, case: str) -> Iterator[Track]:
 
 
 def _targets(components: Sequence[str]) -> list[str]:
-    """Return the targets with a position among the components, such as target_1."""
+    """Return the names of targets whose positions are among the components, such as target_1."""
     names = [name.removesuffix("_x_m") for name in components if name.endswith("_x_m")]
     return [name for name in names if {f"{name}_{axis}_m" for axis in AXES} <= set(components)]
 
@@ -118,7 +118,7 @@ def _draw_way(canvas: Canvas, entity: str, track: Track, label: str | None) -> N
 
 
 def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> None:
-    """Draw a sensor's path, and its measured line of sight with the attitude as stated."""
+    """Draw the path of a sensor, and its measured line of sight for the stated attitude."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     rows = thin(stream.publish_time_ns)
@@ -133,7 +133,7 @@ def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> 
 
 
 def _draw_close(canvas: Canvas, scene: Scene, case: str, target: str) -> list[rrb.Spatial3DView]:
-    """Draw a target's errors and their ellipsoids around its true position; no view without errors."""
+    """Draw the errors of a target, with ellipsoids, around its true position, if there are errors."""
     found = [each for each in scene.errors_of(case) if target in _targets(each.components)]
     if not found:
         return []

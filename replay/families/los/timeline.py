@@ -1,7 +1,7 @@
 """Timeline of optical sensors, targets and lines of sight in space, with NEES, errors and events.
 
-Lines of sight are drawn twice: as measured, with the nominal attitudes, when they arrive; and corrected
-by the estimated biases when these are available.
+Lines of sight are drawn twice: with the nominal attitudes when they arrive, and corrected by the
+estimated biases when these are available.
 """
 
 import re
@@ -39,7 +39,7 @@ ELLIPSOID_SHARE = 0.03
 MARK = rr.Radius.ui_points(4.0)
 # Length of a ray as a factor of the scene's extent, so that rays end behind the targets.
 BEYOND = 1.05
-# Position of the eye relative to the scene's centre, in units of the scene's extent.
+# Position of the camera relative to the centre of the scene, in units of the scene's extent.
 EYE = np.array([0.2, 0.5, 1.1])
 
 
@@ -53,7 +53,7 @@ class Sensor(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """An estimator's targets: ellipsoids at each stamp, `at_once` of them."""
+    """Ellipsoids of the targets of an estimator, `at_once` of them at each stamp."""
 
     estimator: str
     colour: Colour
@@ -149,8 +149,8 @@ def draw_rays(
 
     Args:
         canvas, entity: the canvas, and the entity on it.
-        shown_ns: sorted times at which rays are shown.
-        time_ns: (n,), sorted, the time of each ray, among these.
+        shown_ns: sorted times at which rays are drawn.
+        time_ns: (n,), sorted, the time of each ray, one of these times.
         rays: (n, 2, 3), in m, begin and end.
         colour: colour of the rays.
     """

@@ -1,10 +1,10 @@
 """Cooperative localization of robots that share position estimates when they see each other.
 
 Every robot integrates its odometry; the anchors also use the mapped landmarks. When a robot sees
-another, each of the two uses the sighting as a measurement of itself that depends on the other's
-estimate: either as if the estimates were independent (naive), or by covariance intersection (Jin, Lee,
-Hashimoto, DIND networks, 4.2 and 5.2; the sensor's own noise is independent). The joint filter keeps all
-correlations, as a central node could.
+another, each of the two uses the sighting as a measurement of its own pose that depends on the other's
+estimate, either as if the estimates were independent (naive) or by covariance intersection (Jin, Lee,
+Hashimoto, DIND networks, 4.2 and 5.2; the noise of the sensor is independent). The joint filter keeps
+all correlations, as a central node could.
 """
 
 import copy
@@ -51,13 +51,13 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """How robots use their sightings of each other, and which of them use landmarks.
+    """Settings of the fusion of sightings, and the robots that use landmarks.
 
     Noise that is not set is read from the channels.
 
     Attributes:
-        mode: how sightings are fused: not at all (alone), as if independent (naive), by covariance
-            intersection (ci), or in one filter of all robots (joint).
+        mode: fusion of sightings: none (alone), as if they were independent (naive), by covariance
+            intersection (ci), or in one filter for all robots (joint).
         criterion: quantity that covariance intersection minimizes: the trace of a pose's covariance, in
             m^2 + rad^2, or its determinant.
         anchors: numbers of the robots that know the map.
@@ -82,9 +82,9 @@ class CooperativeParameters(Parameters):
 
 
 class CooperativeState(NamedTuple):
-    """The robots' states, and the reasons (runs, robots) why robots do not take part, "" if they do.
+    """States of the robots, and the reasons (runs, robots) why robots do not take part ("" if they do).
 
-    `announced` marks the robots whose reason was reported or need not be.
+    `announced` marks the robots whose reason has been reported or need not be reported.
     """
 
     robots: RobotStates
@@ -118,7 +118,7 @@ Cooperating = Given[CooperativeParameters]
 
 
 def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
-    """Return the settings and the initial state: all robots at their priors, and the maps.
+    """Return the settings and the initial state: the priors of all robots, and the maps.
 
     A robot whose prior cannot be used does not take part, and the other robots do not use it. Raises
     BadInput if no robot has a usable prior, or if the map is not planar.
@@ -195,7 +195,7 @@ def advance(
 def _events(
     block: Block, state: CooperativeState, prefixes: Sequence[str], mode: Mode, settings: RobotSettings
 ) -> RobotEvents:
-    """Return the block's events as columns; a robot's estimate is due at its odometry."""
+    """Return the events of a block as columns; estimates of a robot are due at its odometry messages."""
     order, is_able = block.events, state.reasons == ""
     value = np.stack(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1

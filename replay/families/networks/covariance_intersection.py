@@ -3,7 +3,7 @@
 Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
 Reinhardt, Hanebeck, Inverse Covariance Intersection (2017); Li, Nashashibi, Split CI (2013). A rule
-fuses K estimates of one state. The rules are scalar loops, so that networks can compile them. A rule is
+fuses K estimates of one state. The rules are scalar loops, which compiled networks can call. A rule is
 called as `fuse(count, parts, weights, mean, covariance, memory) -> gap`; the gap is infinite if a
 covariance is singular.
 """
@@ -30,18 +30,18 @@ from fuselog.replay.families.networks.pairwise import fuse_in_turn
 
 Criterion = Literal["trace", "determinant"]
 ITERATIONS = 10_000
-# one kernel contains all rules and selects one by its number when it runs
+# one kernel contains all rules and selects a rule by its number at run time
 RULES = ("ci-trace", "ci-determinant", "niehsen", "franken", "naive", "inverse-ci", "split-ci")
 CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(len(RULES))
 
 
 class Fusions(NamedTuple):
-    """Fused mean (..., n), covariance (..., n, n), weights (..., K) and their certificate `gap` (...,).
+    """Fused mean (..., n), covariance (..., n, n), weights (..., K) and their `gap` (...,).
 
     By the Karush-Kuhn-Tucker conditions, no other weights improve the criterion (the logarithm of the
-    trace, or the log determinant divided by n) by more than the gap. The gap is 0 for a rule that
-    optimizes nothing. For a rule that fuses one estimate after another, weight i > 0 is that of the
-    fusion of the estimates before i.
+    trace, or the log determinant divided by n) by more than the gap. The gap is 0 for a rule without
+    optimization. For a rule that fuses one estimate after another, weight i > 0 is the weight of the
+    fused estimates before i.
     """
 
     mean: Floats
@@ -51,7 +51,7 @@ class Fusions(NamedTuple):
 
 
 class FusionMemory(NamedTuple):
-    """Scratch memory: information matrices (K, n, n) of estimates, and their next weights (K,)."""
+    """Scratch memory for the information matrices (K, n, n) of estimates and their next weights (K,)."""
 
     information: Floats
     better: Floats
@@ -67,7 +67,8 @@ def summed(count: int, weights: Floats, information: Floats, covariance: Floats)
 
     Args:
         count: number K of estimates to sum.
-        weights, information: of each estimate, (K,), (K, n, n); entries after the first K are ignored.
+        weights, information: weights (K,) and information matrices (K, n, n); entries after the first K
+            are ignored.
         covariance: (n, n), overwritten.
     """
     size = len(covariance)
@@ -102,7 +103,7 @@ def combined(
 
 
 def trace_slope(covariance: Floats, slope: Floats) -> None:
-    """Compute P^2 / tr P; the criterion's gain by weight i is tr(I_i slope).
+    """Compute P^2 / tr P, the slope; the criterion improves with weight i at the rate tr(I_i slope).
 
     Args:
         covariance, slope: P and the result, (n, n).
@@ -122,7 +123,7 @@ def trace_slope(covariance: Floats, slope: Floats) -> None:
 
 
 def determinant_slope(covariance: Floats, slope: Floats) -> None:
-    """Compute P / n; the criterion's gain by weight i is tr(I_i slope).
+    """Compute P / n, the slope; the criterion improves with weight i at the rate tr(I_i slope).
 
     Args:
         covariance, slope: P and the result, (n, n).
@@ -141,13 +142,13 @@ def weigh_optimally(
     weights: Floats,
     tolerance: float,
 ) -> float:
-    """Iterate w_i <- w_i g_i^p, normalized, until the criterion can gain no more than the tolerance.
+    """Iterate w_i <- w_i g_i^p, normalized, until the gap is within the tolerance.
 
     The power p is 1/2 for the trace and 1 for the determinant. At the minimum, no gain g_i = tr(I_i
     slope) exceeds 1, and the gains of positive weights are 1.
 
     Args:
-        by_trace: whether to minimize the trace; otherwise the determinant.
+        by_trace: whether to minimize the trace instead of the determinant.
         count, covariances, memory, weights, tolerance: as for `weigh`.
 
     Returns:
@@ -183,7 +184,7 @@ def weigh_optimally(
 
 
 def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
-    """Set weights in proportion to 1 / tr P_i: Niehsen.
+    """Set weights in proportion to 1 / tr P_i (Niehsen).
 
     Args:
         count, covariances, weights: as for `weigh`.
@@ -200,7 +201,7 @@ def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
 
 
 def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
-    """Set weights in proportion to |sum of I| - |sum without I_i| + |I_i|: Franken and Huepper.
+    """Set weights in proportion to |sum of I| - |sum without I_i| + |I_i| (Franken and Huepper).
 
     Args:
         count, weights: as for `weigh`.
@@ -222,7 +223,7 @@ def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
 
 
 def weigh_fully(count: int, weights: Floats) -> None:
-    """Set all weights to 1, as if all errors were independent: naive Kalman fusion.
+    """Set all weights to 1, as if all errors were independent (naive Kalman fusion).
 
     Args:
         count, weights: as for `weigh`.
@@ -281,8 +282,8 @@ def fuse_by(
 ) -> float:
     """Fuse the first `count` estimates by the rule with the given number; return the certificate.
 
-    `tolerance` bounds the gap if weights are optimized together, and the square of ten times the error
-    of a single weight otherwise.
+    `tolerance` limits the gap if the weights are optimized together; otherwise, it limits the square of
+    ten times the error of a single weight.
     """
     if rule in (INVERSE_CI, SPLIT_CI):
         return fuse_in_turn(rule == SPLIT_CI, count, parts, fused, tolerance)
@@ -314,8 +315,8 @@ def fuse(
         name: one of RULES.
         means: (..., K, n).
         covariances: (..., K, n, n).
-        independents: (..., K, n, n), for "split-ci": the parts independent of all other errors.
-        tolerance: largest certificate of an optimized rule.
+        independents: (..., K, n, n), for "split-ci": the parts that are independent of all other errors.
+        tolerance: largest gap of an optimized rule.
 
     Raises BadInput if shapes do not match, a number is not finite, a covariance is not symmetric and
     positive definite, an independent part exceeds its covariance, or the weights do not converge.

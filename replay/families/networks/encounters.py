@@ -1,4 +1,4 @@
-"""Motion of robots by their odometry, and fusion of their estimates when they see each other."""
+"""Prediction of robots by odometry, and fusion of their estimates when they see each other."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from fuselog.replay.tracing.functions import traced
 
 
 class RobotStates(NamedTuple):
-    """The robots' states between blocks, first axis runs; `failure` is a code of `gaussian`.
+    """States of the robots between blocks, by run; `failure` is an error code of `gaussian`.
 
     The mean (3 n,) and covariance (3 n, 3 n) are those of all n robots. Only the joint filter has
     covariances between robots.
@@ -32,7 +32,7 @@ class RobotStates(NamedTuple):
 
 
 class RobotSettings(NamedTuple):
-    """Noise of the robots' odometry and sensors, both (n, 2), the anchors, and the gate."""
+    """Noise of odometry and sensors, (n, 2) each, with the anchors and the gate."""
 
     density: Floats
     variance: Floats
@@ -41,9 +41,9 @@ class RobotSettings(NamedTuple):
 
 
 class SightingFusion(NamedTuple):
-    """How a sighting of another robot is used: in one joint state, by intersection, or naively.
+    """Method of using a sighting of another robot: one joint state, intersection, or naive fusion.
 
-    The weight of an intersection minimizes the trace if `by_trace`, otherwise the determinant.
+    The weight of an intersection minimizes the trace if `by_trace` is true, otherwise the determinant.
     """
 
     joint: bool
@@ -52,12 +52,12 @@ class SightingFusion(NamedTuple):
 
 
 class RobotEvents(NamedTuple):
-    """The events of all runs in order: the robots they belong to, and their values.
+    """Events of all runs in order, with their robots and values.
 
-    `robots` (m, 2) are the robot that sent the event and the robot that it sees, -1 if it sees none. For
-    odometry, the value is (forward, turn) and `is_sighting` is false. For a sighting of a robot or of a
-    landmark at `place` (m, 2), the value is (range, bearing). `is_due` marks events at which the first
-    robot's estimate is written.
+    `robots` (m, 2) has the robot that sent the event and the robot that it sees, or -1 if it sees none.
+    For odometry, the value is (forward, turn) and `is_sighting` is false. For a sighting of a robot or
+    of a landmark at `place` (m, 2), the value is (range, bearing). `is_due` marks events at which the
+    first robot's estimate is written.
     """
 
     offsets: Integers
@@ -78,7 +78,7 @@ class RobotInputs(NamedTuple):
 
 
 class RobotResults(NamedTuple):
-    """The robot's pose (m, 3) and covariance (m, 3, 3) after an event; NaN if not requested."""
+    """Poses (m, 3) of robots and covariances (m, 3, 3) after the events; NaN if not requested."""
 
     mean: Floats
     covariance: Floats
@@ -130,12 +130,12 @@ linear_sight = derivative(
 def advance(
     carried: RobotStates, run: int, robot: int, time_ns: int, density: Floats, work: RobotMemory
 ) -> None:
-    """Predict one robot to a time by its odometry, with its correlations.
+    """Predict one robot, with its correlations, to a given time by its odometry.
 
     Args:
         carried: the robots of all runs, changed in place.
         run, robot: the run and the robot.
-        time_ns: time to predict to; nothing happens if the robot's state is not older.
+        time_ns: time to predict to; if the robot's state is not older, it is not changed.
         density: densities of the odometry's noise, forward and turn, (2,).
         work: scratch memory.
     """
@@ -164,7 +164,7 @@ def advance(
 
 
 def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
-    """Compute rows P rows' for the block P (3, 3) of one robot; symmetric by construction.
+    """Compute the exactly symmetric matrix rows P rows' for the block P (3, 3) of one robot.
 
     Args:
         covariance: (3 n, 3 n) of all robots.
@@ -189,12 +189,12 @@ def look(
     difference: Floats,
     work: RobotMemory,
 ) -> None:
-    """Compute the innovation of a robot's sighting of a position, and its Jacobians by both robots.
+    """Compute the innovation of a sighting, and its Jacobians with respect to both robots.
 
     Args:
         mean: (3 n,) of all robots.
-        robot: the robot that sees.
-        place: x and y in m, of a landmark or of the robot that is seen.
+        robot: the observing robot.
+        place: x and y, in m, of a landmark or of the observed robot.
         value: range in m and bearing in rad, (2,).
         difference: (2,), overwritten.
         work: scratch memory, whose `both` is overwritten.
@@ -213,7 +213,7 @@ def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) ->
 
     Args:
         covariance, first: as for `fill_spread`.
-        side: 0 for the robot that sees, 1 for the one that is seen.
+        side: 0 for the observing robot, 1 for the observed robot.
         work: scratch memory with `both`; `spread` and `square` of this side are overwritten.
     """
     rows, trace = work.both[side], 0.0
@@ -258,11 +258,11 @@ def meet(
 
     Args:
         mean, covariance: (3 n,), (3 n, 3 n) of all robots, changed in place.
-        robots: the robot that sees and the robot that is seen, -1 for a landmark, (2,).
+        robots: (2,), the observing robot and the observed robot, or -1 for a landmark.
         difference: the innovation (2,), see `look`.
         variance: variances of range and bearing, (2,).
         gate: largest squared distance at which a sighting is accepted.
-        fusion: how another robot's estimate is used.
+        fusion: the method for using another robot's estimate.
         work: scratch memory with `both` from `look`.
     """
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
@@ -300,7 +300,7 @@ def cooperate(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Predict the robots of an event to its time and process it, unless the robot's state is newer."""
+    """Predict the robots of an event to its time and process it, unless the state is newer."""
     events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)
@@ -339,7 +339,7 @@ def write_pose(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Write the pose of the robot that an event belongs to, if it is due."""
+    """Write the pose of the robot of an event, if it is due."""
     if inputs.events.is_due[event]:
         first = 3 * inputs.events.robots[event, 0]
         mean, covariance = carried.mean[run], carried.covariance[run]

@@ -13,9 +13,9 @@ GOLDEN = 0.6180339887498949
 
 
 class Estimate(NamedTuple):
-    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
+    """Means (..., n), covariances (..., n, n), and the independent parts of the covariances.
 
-    Only split CI uses the independent parts.
+    The independent parts are independent of all other errors; only split CI uses them.
     """
 
     mean: Floats
@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Output of a fusion: its mean (n,), covariance (n, n) and weights (K,)."""
+    """Output of a fusion: mean (n,), covariance (n, n) and weights (K,)."""
 
     mean: Floats
     covariance: Floats
@@ -88,7 +88,7 @@ def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats)
 
 
 def determinant(matrix: Floats) -> float:
-    """Compute the determinant of a positive definite matrix; return 0 if the matrix is not."""
+    """Compute the determinant of a positive definite matrix; return 0 for any other matrix."""
     size = len(matrix)
     factor = np.zeros((size, size))
     if not cholesky(factor, matrix, size):
@@ -100,7 +100,7 @@ def determinant(matrix: Floats) -> float:
 
 
 def put(given: Estimate, place: Estimate) -> None:
-    """Copy an estimate, in loops because slices take very long to compile."""
+    """Copy an estimate in loops, because slices take very long to compile."""
     copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
     place.independent[:, :] = given.independent
 
@@ -111,7 +111,7 @@ def one_of(estimates: Estimate, i: int) -> Estimate:
 
 
 def steps_for(tolerance: float) -> int:
-    """Count golden-section steps until a tenth of the square root of the tolerance remains."""
+    """Count golden-section steps until the interval is a tenth of the square root of the tolerance."""
     return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
 
 
@@ -119,13 +119,13 @@ def golden(step: int, steps: int, value: float, section: Floats) -> float:
     """Return the next position in (0, 1) of a golden-section search for a minimum.
 
     The last step returns the middle of the remaining interval. In this form, the function to minimize is
-    called at one place only and is compiled once.
+    called in only one place and is compiled once.
 
     Args:
-        step, steps: number of the step, from 0, and number of steps.
+        step, steps: number of this step, from 0, and number of all steps.
         value: value at the previous position; ignored at step 0.
         section: (7,), state of the search: both ends, both inner positions, their values, and the index
-            of the position that `value` belongs to.
+            of the position of `value`.
     """
     if step == 0:
         section[0], section[1] = 1e-9, 1.0 - 1e-9

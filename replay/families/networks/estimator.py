@@ -2,8 +2,8 @@
 
 Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
 prediction (not x*) with the received x*, by a rule of `covariance_intersection`; update with the own
-measurement again. The log states which message was sent when, and when it arrived. The content of a
-message is an output of this replay, so that the same log can be replayed with any rule. The state is
+measurement again. The log states when each message was sent and when it arrived. The content of the
+messages is computed by the replay, so the same log can be replayed with any rule. The state is
 (positions, velocities).
 """
 
@@ -55,18 +55,18 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """The fusion rule, when nodes send, and a node that sends false estimates.
+    """Fusion rule, conditions for sending, and a node that sends false estimates.
 
     Attributes:
-        rule: the fusion rule; "alone" fuses nothing, "centralised" is one filter with all sensors and no
+        rule: the fusion rule; "alone" does not fuse, "centralised" is one filter with all sensors and no
             links, and "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses
-            its measurement a second time.
+            its measurement again.
         tolerance: tolerance of the optimization of weights.
         send_interval_s: shortest time between two messages of a node.
-        send_divergence: Kullback-Leibler divergence between a node's estimate and its last message at
-            which it sends again, in nats.
+        send_divergence: a node sends again if the Kullback-Leibler divergence between its estimate and
+            its last message reaches this value, in nats.
         gate_probability: a received estimate is fused if it agrees with the node's own; consistent
-            estimates, however correlated, pass that gate with at least this probability.
+            estimates with any correlation pass this gate with at least this probability.
         liar: number of the node that sends false estimates.
         lie_m: offset that the liar adds to its estimates.
         lie_after_s: time from the start after which the liar adds the offset.
@@ -106,7 +106,7 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
 
 
 def message_bytes(name: str, states: int) -> int:
-    """Count the bytes of a message: stamp, mean, and the covariance's triangle (twice for split CI)."""
+    """Count the bytes of a message: stamp, mean, and triangle of the covariance (two for split CI)."""
     triangle = states * (states + 1) // 2
     doubles = {ALONE: 0, "split-ci": 1 + states + 2 * triangle}.get(name, 1 + states + triangle)
     return 8 * doubles
@@ -178,7 +178,7 @@ def _schedule(
     prior_ns: Integers,
     name: str,
 ) -> tuple[Activities, Sensing, Integers]:
-    """Return the activities of all nodes and runs, their measurements, and rows of arriving messages."""
+    """Return the activities of all nodes and runs, their measurements, and rows of arrived messages."""
     numbers = list(sensors)
     centralised = name == CENTRALISED
     sensing = _sensing(whole, sensors, components)
@@ -248,7 +248,7 @@ def _schedule(
 
 
 def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
-    """Return run, stamp and index of the part for all messages, part by part."""
+    """Return run, stamp and part index of all messages, one part after another."""
     run = [run_of_rows(part.offsets) for part in parts]
     index = [np.full(len(part), number) for number, part in enumerate(parts)]
     time_ns = [part.stream.publish_time_ns for part in parts]
@@ -300,7 +300,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: NetworkParameters) ->
 
 
 def state_of(prior: Topic) -> list[str]:
-    """Return a prior's components: positions, then the velocity of each, such as `x_m` and `vx_mps`.
+    """Return the components of a prior: positions, then their velocities, such as `x_m` and `vx_mps`.
 
     Raises BadInput if the prior has other components.
     """

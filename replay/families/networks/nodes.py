@@ -1,4 +1,4 @@
-"""Nodes of a network: prediction, measurement, sending, receiving and fusion at their events."""
+"""Nodes of a network, which predict, measure, send, receive and fuse."""
 
 from typing import NamedTuple
 
@@ -24,11 +24,11 @@ from fuselog.replay.inference.run.loops import Follow, over_stamps
 
 
 class Activities(NamedTuple):
-    """The moments at which nodes measure, send or receive, ordered by run, time and node.
+    """Activities of nodes (measuring, sending or receiving), ordered by run, time and node.
 
-    Run r owns offsets[r]:offsets[r + 1]. Activity a uses the measurements measured[a]:measured[a + 1]
-    and the messages received[a]:received[a + 1]. `message` (m,) is the activity in which a message was
-    sent; `may_send` marks the activities in which a node can send.
+    Activities offsets[r]:offsets[r + 1] belong to run r. Activity a uses the measurements
+    measured[a]:measured[a + 1] and the messages received[a]:received[a + 1]. `message` (m,) is the
+    activity in which a message was sent; `may_send` marks the activities in which a node may send.
     """
 
     offsets: Integers
@@ -43,7 +43,7 @@ class Activities(NamedTuple):
 class Sensing(NamedTuple):
     """Measurements (k, n) in the order of their activities, NaN if not measured.
 
-    `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
+    `variance` (nodes, n) and `density` (nodes,) describe the noise of each node's model.
     """
 
     value: Floats
@@ -53,12 +53,12 @@ class Sensing(NamedTuple):
 
 
 class NodeFusion(NamedTuple):
-    """The rule's number in `covariance_intersection.RULES`, and when nodes send and accept estimates.
+    """Number of the rule in `covariance_intersection.RULES`, and conditions for sending and accepting.
 
     If `own_first`, a node fuses its own x* instead of its prediction. A node sends a message if it
-    differs by at least `divergence` nats from the last one, which must be at least `interval_ns` old.
-    `gate` is the largest squared distance between a prediction and a received estimate, infinite if
-    everything is accepted. `faulty_node` is an index, -1 if there is none.
+    differs by at least `divergence` nats from its last message, which must be at least `interval_ns`
+    old. `gate` is the largest squared distance between a prediction and a received estimate; it is
+    infinite if all are accepted. `faulty_node` is an index, or -1 if there is none.
     """
 
     rule: int
@@ -73,12 +73,12 @@ class NodeFusion(NamedTuple):
 
 
 class NodeInputs(NamedTuple):
-    """Inputs of the nodes in all runs; stamp, mean and covariance of the prior are given per run.
+    """Inputs of the nodes in all runs.
 
     Attributes:
         events: the activities.
-        sensing, fusion: the measurements of nodes, and how nodes fuse estimates.
-        prior_ns, prior_mean, prior_covariance: (runs,), (runs, n), (runs, n, n).
+        sensing, fusion: the measurements of the nodes, and their rule of fusion.
+        prior_ns, prior_mean, prior_covariance: (runs,), (runs, n), (runs, n, n), the prior of each run.
     """
 
     events: Activities
@@ -90,7 +90,7 @@ class NodeInputs(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Estimates of the nodes of one run, first axis nodes.
+    """Estimates of the nodes of one run; the first axis is the node.
 
     Attributes:
         time_ns: stamps of the estimates, (nodes,).
@@ -108,7 +108,7 @@ class Nodes(NamedTuple):
 
 
 class NodeMemory(NamedTuple):
-    """Scratch memory of a core: a run's nodes, the estimates that a node fuses, and weights (most,)."""
+    """Scratch memory of a core: nodes of a run, estimates to fuse, and their weights (most,)."""
 
     nodes: Nodes
     parts: Estimate
@@ -135,9 +135,9 @@ def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
 
 
 class NodeResults(NamedTuple):
-    """Results per activity: the estimates, x* as it is sent, and whether it is sent.
+    """Results per activity: the estimates, x* as it would be sent, and whether it is sent.
 
-    `refused` (m,) marks the arrived messages that the gate rejected.
+    `refused` (m,) marks messages that the gate rejected.
     """
 
     mean: Floats
@@ -169,7 +169,8 @@ def observe(
 
     Args:
         mean, covariance: (n,), (n, n).
-        independent: the part of the covariance from measurements since it was zero, (n, n).
+        independent: (n, n), the part of the covariance due to measurements since this part was last
+            zero.
         value, variance: (n,), NaN for components that are not measured.
     """
     size = len(mean)
@@ -248,7 +249,7 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
 
 
 def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
-    """Test whether two estimates can be of the same state, whatever their correlation.
+    """Test whether two estimates of any correlation can belong to the same state.
 
     The covariance of the difference is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
 
@@ -266,7 +267,7 @@ def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) ->
 
 
 def following() -> Follow:
-    """Make the loop over the activities of one run, which ends after the last one or if a fusion fails.
+    """Make the loop over the activities of one run; it stops if a fusion fails.
 
     Returns `follow(run, inputs, failed_ns, results, work)`, which writes the time of a failure.
     """
@@ -294,7 +295,7 @@ def act(
     results: NodeResults,
     work: NodeMemory,
 ) -> bool:
-    """Process one time of all nodes: they send, then receive and fuse; return False if a fusion fails.
+    """Let all nodes send, then receive and fuse, at one time; return False if a fusion fails.
 
     Args:
         run: number of the run.
@@ -324,7 +325,7 @@ def act(
 def predict_and_send(
     activity: int, start_ns: int, inputs: NodeInputs, nodes: Nodes, results: NodeResults
 ) -> None:
-    """Predict a node to now, update x* with its own measurements, and send x* if it is due."""
+    """Predict a node to the current time, update x* with its measurements, and send x* if it is due."""
     activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now = activities.node[activity], activities.time_ns[activity]
     if now > nodes.time_ns[node]:
@@ -347,7 +348,7 @@ def predict_and_send(
 def is_due(
     node: int, now: int, mean: Floats, covariance: Floats, inputs: NodeInputs, nodes: Nodes
 ) -> bool:
-    """Test whether x* may be sent again and differs enough from the last message, predicted to now.
+    """Test whether x* may be sent again and differs enough from the prediction of the last message.
 
     Args:
         node, now: number of the node, and the time in ns.
@@ -370,7 +371,7 @@ def is_due(
 def receive(
     activity: int, inputs: NodeInputs, nodes: Nodes, parts: Estimate, results: NodeResults
 ) -> int:
-    """Collect the estimates that a node fuses, its own first, predicted to now; return their number."""
+    """Collect the estimates to fuse, the node's own first, at the current time; return their number."""
     activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
     first, end = activities.received[activity], activities.received[activity + 1]
@@ -385,7 +386,7 @@ def receive(
             mean, covariance = results.sent_mean[source], results.sent_covariance[source]
         copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
         late_s = (now - activities.time_ns[source]) * 1e-9
-        # other nodes may have forwarded the information of an old message, so it is not independent
+        # other nodes may have forwarded the information in an old message, so it is not independent
         new = 1.0 if not is_own and late_s <= 0.0 else 0.0
         for row in range(size):
             for column in range(size):

@@ -105,17 +105,17 @@ class Stake(NamedTuple):
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
     """Find the best weight w of a measurement of part of a state that depends on another estimate.
 
-    One part of its noise has an unknown correlation with the state; the other part, the sensor's, is
-    independent. The fusion uses P / w and the noise shared / (1 - w) + own, with the w that minimizes
-    the trace, which depends on the units of the state, or the determinant, which does not. The weight is
-    above 0, since at 0 all components that the measurement does not observe would be lost.
+    One part of the measurement's noise has an unknown correlation with the state; the other part, that
+    of the sensor, is independent. The fusion uses P / w and the noise shared / (1 - w) + own, where w
+    minimizes the trace (which depends on the units of the state) or the determinant (which does not).
+    The weight is above 0, because 0 would discard all components that the measurement does not observe.
 
     With R = shared / (1 - w) + own and S = H P H' / w + R, the fused covariance has the trace tr P / w -
     tr(S^-1 H P P H') / w^2 and a determinant proportional to |R| / (w^n |S|). Trace and log determinant
     are convex in w.
 
     Args:
-        by_trace: whether to minimize the trace; otherwise the determinant.
+        by_trace: whether to minimize the trace instead of the determinant.
         stake: projections of the state's covariance onto the measurement.
         shared, own: the correlated and the independent part of the noise, (m, m).
 

@@ -1,4 +1,4 @@
-"""Timeline of a sensor network: its graph with messages, the nodes' estimates, and NEES per node.
+"""Timeline of a sensor network: graph with messages, estimates of the nodes, and NEES per node.
 
 A message is drawn from its sender to its receiver when it is sent; a lost message is red and ends
 half-way. Each fusion rule has its own maps: the trajectories, and every node's error with its 95 %
@@ -46,19 +46,19 @@ GRAPH = f"{ROOT}/graph"
 PLACE = ("x_m", "y_m")
 ARRIVED = (0, 158, 115, 255)
 LOST = (*WRONG, 255)
-# Largest number of nodes with plots, and of lost messages that an event names.
+# Largest number of nodes with plots, and of lost messages that an event lists.
 PLOTTED_NODES = 6
 NAMED_MESSAGES = 8
 # Largest number of times at which nodes are labelled on the map of errors.
 NAMED_TIMES = 500
 # Share of the errors that are inside the bounds of their map.
 SHOWN_SHARE = 0.9
-# Distance between both directions of a link, as a share of the circle's radius.
+# Distance between the two directions of a link, as a share of the circle's radius.
 APART = 0.05
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw the graph, the maps of all rules and the events, next to NEES and errors of the nodes."""
+    """Draw the graph, the maps of all rules and the events, next to the NEES and errors of the nodes."""
     turn_up(canvas)
     links = scene.read("/links")
     nodes = _nodes(scene, links)
@@ -121,7 +121,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
 
 
 def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
-    """Draw the trajectories of the truth and of all nodes for each estimator, and their errors below."""
+    """Draw the true trajectory and those of all nodes for each estimator, with the errors below."""
     truth, shown = f"{ROOT}/truth", [np.empty((0, 2))]
     for stream in scene.truths_of(""):
         places = stream["state"][:, [stream.components.index(name) for name in PLACE]]
@@ -174,7 +174,7 @@ def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> floa
 
 
 def _draw_names(canvas: Canvas, entity: str, found: Sequence[Errors], extent_m: float) -> None:
-    """Label errors with the nodes' numbers, and join labels that would overlap."""
+    """Label errors with the numbers of the nodes, and join labels that would overlap."""
     if not found:
         return
     known = np.unique(np.concatenate([errors.time_ns for errors in found]))

@@ -1,9 +1,9 @@
 """Models that locate tags from ranges to anchors with known positions, as with ultra-wideband radios.
 
-`ranging-pose` uses several tags on a body in the plane, and so estimates its heading as well;
-`ranging-position` uses one tag. Velocities are random walks. In addition to white noise, radios have a
+`ranging-pose` uses several tags on a body in the plane and also estimates the body's heading;
+`ranging-position` uses one tag. Velocities are random walks. In addition to white noise, ranges have a
 bias, `bias_range_m`; an error of each anchor, or of each pair of anchor and tag, that lasts for seconds;
-and outliers when the line of sight is blocked. All three are options, see
+and outliers if the line of sight is blocked. All three are options, see
 `fuselog.replay.inference.model.augmentation` and `fuselog.replay.inference.linear_algebra.inflation`.
 """
 
@@ -30,7 +30,7 @@ _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """Noise, bias and height of the motion, and the search for the start.
+    """Noise of motion and ranges, bias, height of the tag, and search for the start.
 
     The start is found by least squares from the first ranges, beginning at positions on all sides of the
     anchors' centre.
@@ -38,11 +38,12 @@ class RangingParameters(ModelParameters):
     Attributes:
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
         sigma_range_m: standard deviation of a range.
-        bias_range_m: bias of measured ranges, measured minus true.
+        bias_range_m: bias of ranges: measured minus true.
         height_m: height at which the tag moves.
-        range_delay_s: delay of a range's stamp after its measurement.
-        start_s: duration of the ranges in which the start is found.
-        start_reach_m: distance from the anchors' centre at which the search begins, on all sides.
+        range_delay_s: delay of ranges: time from the measurement to the stamp.
+        start_s: duration of the first ranges, from which the start is found.
+        start_reach_m: distance of the starting points of the search from the anchors' centre, on all
+            sides.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
     """
@@ -75,7 +76,7 @@ class PoseRangingParameters(RangingParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Predict position and velocity at constant velocity."""
+    """Predict position and velocity, assuming constant velocity."""
     x, y, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, vx, vy
 
@@ -87,7 +88,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def move_pose(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Predict a pose and its velocities at constant velocity and turn rate."""
+    """Predict a pose and its velocities, assuming constant velocity and turn rate."""
     x, y, heading, vx, vy, turn = state
     return x + duration_s * vx, y + duration_s * vy, heading + duration_s * turn, vx, vy, turn
 
@@ -132,7 +133,7 @@ def see_noise(parameters: Any) -> Components:
 
 
 def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the position that fits the first ranges best; see `RangingParameters` and `find_pose`."""
+    """Find the position that best fits the first ranges; see `RangingParameters` and `find_pose`."""
     time_ns, ranges, anchors, _ = first_ranges(streams, parameters, 3)
 
     def residuals(place: Floats) -> Floats:
@@ -144,7 +145,7 @@ def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the pose at rest that fits the first ranges best, by searches from several headings.
+    """Find the pose at rest that best fits the first ranges, by searches from several headings.
 
     Args:
         streams: `ranges`, the map of anchors, and the tags.
@@ -231,7 +232,7 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
     Args:
         residuals: position or pose (k,) -> residuals (n,) of ranges, in m.
         starts: positions or poses (k,) from which to search.
-        parameters: with `sigma_range_m`; residuals of more than three times this count less.
+        parameters: with `sigma_range_m`; residuals above three times this value have less weight.
     """
     from scipy.optimize import least_squares  # slow to import
 
@@ -243,7 +244,7 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
 HOW = "where its first ranges fit best"
 VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear"}
 ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "height_m": "linear"}
-# For logs that do not state it: a radio in the open, on something that is pushed or driven slowly.
+# Default for logs that do not state it: a radio outdoors, on an object that is pushed or driven slowly.
 ASSUMED = {"acceleration_density": 0.5, "sigma_range_m": 0.1, "height_m": 1.0}
 RANGING_POSITION = Model(
     "position in the plane from ranges to anchors",

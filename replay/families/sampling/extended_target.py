@@ -2,7 +2,7 @@
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The
-filters treat the scales h as Gaussian, although they are uniform: E h^4 = 1/3.
+filters treat the scales h as Gaussian although they are uniform, so E h^4 = 1/3.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ class ExtendedTargetParameters(ModelParameters):
     """Variances added per step, and the variance of a measured point.
 
     Attributes:
-        size_drift_m2: variance that a step adds to half sides.
+        size_drift_m2: variance that a step adds to each half side.
         position_drift_m2: variance that a step adds to the position, per axis.
         point_variance_m2: variance of a measured point, per axis.
     """
@@ -47,7 +47,7 @@ def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
 
 
 def measure(target: Components, noise: Components, reference: Any, parameters: Any) -> Components:
-    """Measure a point of the surface and its squares, with noise of two scales and of the point."""
+    """Compute a point of the surface and its squares, with noise in two scales and in the point."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
 
@@ -80,7 +80,7 @@ def moments(
     2 P_st^2 + 4 m_s m_t P_st and Cov(s, t^2) = 2 m_t P_st.
 
     Args:
-        mean, covariance: of the state: two half sides l and the centre c, in m, (4,) and (4, 4).
+        mean, covariance: (4,) and (4, 4), of the state: two half sides l and the centre c, in m.
         reference: not used.
         parameters: with `point_variance_m2`, r.
         predicted, spread, cross: E y (4,), Cov(y) (4, 4), Cov(state, y) (4, 4), overwritten.
@@ -114,7 +114,7 @@ def moments(
 def scatter(
     mean: Floats, covariance: Floats, axis: int, point_variance_m2: float
 ) -> tuple[float, float, float]:
-    """Compute the means over the state of v, 2cv and 2v^2 + 4c^2 v, see `moments`, of one axis.
+    """Compute the means of v, 2cv and 2v^2 + 4c^2 v over the state for one axis; see `moments`.
 
     They are the means of Var m, Cov(m, m^2) and Var m^2 given the state.
 

@@ -1,4 +1,4 @@
-"""Model of the batch reactor, with a quadratic motion and a linear measurement.
+"""Model of a batch reactor, with a quadratic motion and a linear measurement.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.A and appendix (which prints x_hat instead of the noise's mean w_hat). Time is discrete: every
@@ -48,12 +48,12 @@ def moments(
     duration_s: Any,
     parameters: Any,
 ) -> None:
-    """Predict mean and covariance by their exact moments.
+    """Predict mean and covariance exactly.
 
     x' = x + g a^2 with a Gaussian: E a^2 = m^2 + P, Var a^2 = 2 P^2 + 4 m^2 P, Cov(x, a^2) = 2 m P_xa.
 
     Args:
-        mean, covariance: of both partial pressures, (2,) and (2, 2), changed in place.
+        mean, covariance: (2,) and (2, 2), of both partial pressures, changed in place.
         control, duration_s: not used: every step is `parameters.step_s` long.
         parameters: with `step_s`.
     """

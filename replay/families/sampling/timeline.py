@@ -12,7 +12,7 @@ PIXELS = 14.0  # radius of a sample with weight 1
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw a view for each set; the area of a point is its weight, and negative weights are red."""
+    """Draw a view for each set; the area of a point shows its weight, and negative weights are red."""
     turn_up(canvas)
     views = [
         _draw_set(canvas, scene, name, stream)

@@ -1,13 +1,13 @@
-"""Filter of guaranteed position sets: moved by odometry with bounded errors, and cut by every frame.
+"""Filter of guaranteed position sets, which odometry moves and every frame of bearings cuts.
 
-Briechle, Hanebeck (2004) give the set of one frame of relative bearings, see `set_membership`; moving
-and intersecting sets is the recursion of Schweppe, Recursive State Estimation: Unknown but Bounded
-Errors and System Inputs (1968). The error of odometry is bounded over a span, not per second: a robot
-that starts late is late only once. So each frame cuts the set at an earlier stamp, the anchor, and the
-current set is moved from there in one step.
+Briechle, Hanebeck (2004) derive the set of one frame of relative bearings, see `set_membership`; the
+recursion that moves and intersects sets is that of Schweppe, Recursive State Estimation: Unknown but
+Bounded Errors and System Inputs (1968). The error of odometry is bounded over a span, not per second,
+because a delayed start of the robot, for example, adds its error only once. Each frame therefore also
+cuts the set at an earlier stamp, the anchor, and the current set is moved from the anchor in one step.
 
-If a frame contradicts the set before it, two sets are kept, one of which contains the robot if only one
-of them is wrong. Their union is the estimate until later frames have emptied one of the two.
+If a frame contradicts the set before it, both sets are kept; if only one of the two is wrong, the other
+contains the robot. Their union is the estimate until later frames have emptied one of them.
 """
 
 from __future__ import annotations
@@ -80,18 +80,18 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 class SetFilterParameters(SetParameters):
     """Bounds of the errors; missing bounds are read from the channels.
 
-    Over a span of T s, the position of the odometry is wrong by at most `position_error_m` + T
-    `position_error_mps`, relative to the pose at the beginning, and its heading by at most
-    `heading_error_rad` + T `heading_error_radps`.
+    Over a span of T s, relative to the pose at its start, the position of the odometry has an error of
+    at most `position_error_m` + T `position_error_mps`, and its heading of at most `heading_error_rad` +
+    T `heading_error_radps`.
 
     Attributes:
         bearing_bound_rad: bound of the error of single bearings, which determine the heading;
-            `bound_deg` is that of their differences.
-        position_error_m: bound of the odometry's error of position that does not grow with time.
-        position_error_mps: bound of the odometry's error of position per second.
-        heading_error_rad: bound of the odometry's error of heading that does not grow with time.
-        heading_error_radps: bound of the odometry's error of heading per second.
-        anchor_s: time after which the current set becomes the set from which motion is counted.
+            `bound_deg` is the bound for their differences.
+        position_error_m: constant part of the bound of the odometry's position error.
+        position_error_mps: increase of the bound of the odometry's position error per second.
+        heading_error_rad: constant part of the bound of the odometry's heading error.
+        heading_error_radps: increase of the bound of the odometry's heading error per second.
+        anchor_s: time after which the current set becomes the new anchor, from which motion is measured.
         most_edges: number of edges above which a part of a set is replaced by a larger one of the form
             L = 8.
     """
@@ -107,17 +107,17 @@ class SetFilterParameters(SetParameters):
 
 
 class SetStep(NamedTuple):
-    """The estimate at one frame.
+    """Estimate at one frame.
 
     Attributes:
-        time_ns: of the frame.
+        time_ns: stamp of the frame.
         anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if there was
             none.
-        parts: the set, with another part if it contradicts a frame.
+        parts: the set, with a second part if it contradicts a frame.
         headings: interval of the heading.
         growth: factor by which the form L = 8 enlarged the set.
-        finding: what this frame showed, an index in FINDINGS; None if nothing was wrong.
-        blamed: the index of the relative bearing to blame, if any.
+        finding: index in FINDINGS of the finding at this frame; None if there is none.
+        blamed: the index of the wrong relative bearing, if any.
     """
 
     time_ns: int
@@ -131,7 +131,7 @@ class SetStep(NamedTuple):
 
 @dataclass
 class Anchor:
-    """The set and headings of a robot at an earlier stamp; `parts` as in SetStep."""
+    """Set and headings of a robot at an earlier stamp; `parts` as in SetStep."""
 
     time_ns: int
     pose: Floats
@@ -145,7 +145,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
     Args:
         time_ns: (2,), the earlier one first.
         poses: (2, 3), x, y in m and heading in rad.
-        bounds: of the odometry's error, which grow with the time in between.
+        bounds: bounds of the odometry's error, which grow with the time between the stamps.
     """
     span_s = float(time_ns[1] - time_ns[0]) * 1e-9
     *displacement, turn = relative_pose(*poses)
@@ -173,7 +173,7 @@ def follow(
     bounds: Bounds,
     parameters: SetFilterParameters,
 ) -> list[SetStep]:
-    """Compute the estimates of one run, from its first frame with a set on."""
+    """Compute the estimates of one run, starting at its first frame with a set."""
     anchor: Anchor | None = None
     steps = []
     for frame, seen in found:
@@ -197,7 +197,7 @@ def follow(
 
 
 def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> SetStep:
-    """Make the estimate of a frame by itself."""
+    """Make the estimate from a single frame."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
     return SetStep(frame.time_ns, frame.time_ns, [cut], headings)
 
@@ -205,7 +205,7 @@ def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) 
 def _advance(
     anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> SetStep:
-    """Move an anchor's set to a frame and cut it by the frame, which cuts the anchor as well."""
+    """Move the set of an anchor to a frame, and cut the set and the anchor by the frame."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
     motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
     past = [moved(part, anchor.headings, motion) for part in anchor.parts]
@@ -254,7 +254,7 @@ def _cut(
 
 
 def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
-    """Find the relative bearing that exceeds its bound most, at the corner of a set that fits best."""
+    """Find the relative bearing with the greatest excess, at the best-fitting corner of a set."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None
@@ -292,7 +292,7 @@ def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
 def _streams(
     prefix: str, metadata: Mapping[str, str], steps: Sequence[SetStep], frame_at: Mapping[int, Frame]
 ) -> tuple[Stream, ...]:
-    """Make the streams of sets as in `set_membership`, of their anchors, and of findings."""
+    """Make the streams of sets (as in `set_membership`), of their anchors and of findings."""
     blamed = [(frame_at[step.time_ns], step.blamed) for step in steps if step.blamed is not None]
     with_finding = [step for step in steps if step.finding is not None]
     return (

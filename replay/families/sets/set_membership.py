@@ -1,8 +1,8 @@
 """Guaranteed position sets from bounded relative bearings, one for each frame of equal stamps.
 
-Briechle, Hanebeck (2004). The estimate is the set itself: the exact one, its tightest box, or the
-pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative bearing to blame is
-repeated on the fault's topic.
+Briechle, Hanebeck (2004). The estimate is a set: the exact one, its tightest box, or a pseudo-ellipsoid
+with L = 4 or L = 8. An empty set is a fault; the wrong relative bearing is then repeated on the topic of
+faults.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,19 +35,19 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 class SetParameters(Parameters):
     """Form of the sets, and bounds of the errors; missing bounds are read from the log.
 
-    Bearings with equal stamps form all their pairs.
+    All pairs of bearings with equal stamps are used.
 
     Attributes:
         shape: form of the sets: exact, the box around them, or the paper's pseudo-ellipsoids L = 4 and L
             = 8.
         bound_deg: bound of the error of a relative bearing.
-        weighting: how pseudo-ellipsoids weigh the rings that they fuse: by the least area of each step,
-            of all steps together (batch), by the determinant, or equally (equal).
+        weighting: weights of the rings that pseudo-ellipsoids fuse: minimal area after each step (area)
+            or after all steps (batch), minimal determinant (determinant), or equal weights (equal).
         sweeps: number of times that pseudo-ellipsoids fuse all pairs.
-        least_landmarks: least number of landmarks at one stamp that give a set.
+        least_landmarks: smallest number of landmarks at one stamp for which a set is computed.
         arena_m: rectangle that certainly contains the robot (low x, low y, high x, high y).
         maximum_range_m: without an arena, the greatest distance of a robot from a landmark that it sees;
-            by default the longest range that its sensor measured.
+            by default, the longest range that its sensor has measured.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"
@@ -95,7 +95,7 @@ def solve(given: Given[SetParameters]) -> list[Ragged]:
 
 
 def set_metadata(topic: str, known: Known) -> dict[str, str]:
-    """Make the metadata of a channel of sets: components, truth, and the frames they come from."""
+    """Make the metadata of a channel of sets: components, truth, and settings of their frames."""
     return {
         "components": "x_m,y_m",
         "kinds": "linear,linear",
@@ -108,11 +108,11 @@ def set_metadata(topic: str, known: Known) -> dict[str, str]:
 def set_streams(
     prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
 ) -> tuple[Stream, Stream]:
-    """Make the streams of a run's sets, and of the number of vertices of each.
+    """Make two streams for the sets of a run: numbers of vertices, and vertices.
 
     Args:
-        prefix: of their topics.
-        metadata: of the channels.
+        prefix: prefix of their topics.
+        metadata: metadata of the channels.
         borders: stamp (ns) and rings of each set, (vertices, 2) in m; no rings for an empty set.
     """
 
@@ -141,7 +141,7 @@ def set_streams(
 
 
 def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
-    """Make the stream of relative bearings to blame for empty sets, from frames and indices of pairs."""
+    """Make a stream of the wrong relative bearings of empty sets, from frames and indices of pairs."""
     pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
     return make_stream(
         f"{prefix}/fault",
@@ -155,10 +155,10 @@ def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
 
 
 def bearings_in(topics: Mapping[str, Topic], leaves: Sequence[str]) -> Iterator[tuple[str, Topic]]:
-    """Find the prefixes of robots with bearings, in a log with landmarks, and the first topic of each.
+    """Find the prefixes of robots with bearings in a log with landmarks, and a topic for each.
 
     Args:
-        topics: of the log.
+        topics: topics of the log.
         leaves: the last parts of the topics' names, the preferred ones first.
     """
     for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
@@ -175,7 +175,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: SetParameters) -> Ite
 
 
 def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
-    """Read bounds and arena from the parameters, or from the channels' metadata if not given."""
+    """Read bounds and arena from the parameters, or from the metadata of channels if not given."""
     bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
     arena_m: tuple[float, ...] | None = parameters.arena_m
     if arena_m is None and "arena_m" in landmarks.metadata:

@@ -1,6 +1,6 @@
-"""Timeline of set-valued estimates: every estimator's set as polygons around the truth, and its area.
+"""Timeline of set-valued estimates: the sets as polygons around the truth, and their areas.
 
-No set is drawn at a frame whose set is empty; the relative bearing to blame is among the events.
+At a frame with an empty set, no set is drawn; the wrong relative bearing is listed in the events.
 """
 
 from functools import partial
@@ -49,7 +49,7 @@ SIZE = schemas.ESTIMATE_SIZE
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw the plane and events next to the areas, for each robot."""
+    """Draw for each robot the plane and the events, next to the areas."""
     turn_up(canvas)
     landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
     if landmarks is not None:
@@ -71,7 +71,7 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
     colours, scene_root = scene.colours(robot), entity_path(ROOT, "bearings", robot)
     allowed = _draw_allowed(canvas, scene, robot, f"{scene_root}/allowed")
     name, is_single = "Map", all(len(each) == 1 for _, each in scene.outputs_of(robot, SIZE))
-    if plots and is_single:  # a plot would be a dot
+    if plots and is_single:  # a plot would be a single dot
         name, plots = f"Map; {plots[0].name}", []
     places = np.concatenate([*shown, reach])
     board: Board = plane_view(canvas, root, [landmarks, *allowed], [], places, name=name)
@@ -119,7 +119,7 @@ def _single(pairs: Pairs) -> list[Pairs]:
 def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
 ) -> tuple[Floats, list[rrb.TimeSeriesView]]:
-    """Draw a case's sets; return two corners (2, 2) around most of them, and the plot of their areas."""
+    """Draw the sets of a case; return corners (2, 2) around most of them, and the plot of areas."""
     plot, corners, areas = entity_path("plots", case, "area"), [], {}
     for estimator, sizes in scene.outputs_of(case, SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")
@@ -147,7 +147,7 @@ def draw_sets(
 
 
 def draw_areas(canvas: Canvas, scene: Scene, case: str) -> list[Board]:
-    """Draw a case's sets in the plane of its positions, and return the plot of their areas."""
+    """Draw the sets of a case in the plane of its positions, and return the plot of their areas."""
     _, plots = draw_sets(canvas, scene, case, entity_path(ROOT, case))
     return [*plots]
 

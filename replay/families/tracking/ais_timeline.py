@@ -1,8 +1,8 @@
-"""Timeline of vessels: reports in the colours of their tracks, on a map and in the tangent plane.
+"""Timeline of vessels: a map and a plane with reports in the colours of their tracks.
 
-The map's tiles come from the network; offline the reports are still drawn at their positions. Next to
-the map are the numbers of live tracks and vessels, and the share of each vessel's reports that its own
-track has.
+Map tiles are loaded from the network; offline, the reports are still drawn at their positions. Next to
+the map are the numbers of live tracks and vessels, and the share of each vessel's reports in its own
+track.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ GOLDEN = 0.618034
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw map and plane of each estimator in tabs, live counts, and a table of vessels."""
+    """Draw the map and plane of each estimator in tabs, the live counts, and a table of vessels."""
     turn_up(canvas)
     tracks = scene.outputs_of("", schemas.TRACK_ESTIMATE)
     boards = [_draw_board(canvas, scene, name, stream) for name, stream in tracks]
@@ -68,7 +68,7 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
 
 
 def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return a colour (n, 3) for every track number; successive numbers have very different hues."""
+    """Return a colour (n, 3) for every track number, with very different hues for successive numbers."""
     hue = numbers * GOLDEN % 1.0
     value = np.where(numbers % 2 == 0, 1.0, 0.75)
     colours = hsv_to_rgb(np.stack([hue, np.full(len(hue), 0.7), value], axis=1))

@@ -3,8 +3,8 @@
 Source: Vo, Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 54(11), 2006,
 table I (recursion), II (pruning, merging), III (extraction). Targets are equally likely to appear
 anywhere, as in Beard, Vo, Vo, Arulampalam, "A partially uniform target birth model for Gaussian mixture
-PHD/CPHD filtering", IEEE TAES 49(4), 2013: every detection also begins a component, and undetected
-births are not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
+PHD/CPHD filtering", IEEE TAES 49(4), 2013: every detection also begins a component, and births without a
+detection are not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
 """
 
 import warnings
@@ -62,7 +62,7 @@ class PhdParameters(Parameters):
         birth_sigma_mps: standard deviation of a new target's velocity, per axis.
         acceleration_sigma_mps2: standard deviation of the acceleration between two scans, per axis.
         gate_probability: probability that the detection of a component is inside its gate.
-        prune_weight: weight at or below which a component is dropped.
+        prune_weight: weight up to which a component is dropped.
         merge_squared: squared Mahalanobis distance up to which components are merged.
         most_components: greatest number of components that are kept.
     """
@@ -89,7 +89,7 @@ Filtering = Given[PhdParameters]
 
 
 def start(given: Filtering) -> tuple[Filtering, Mixture]:
-    """Start with a component of weight 1 at each prior, or without components if there are no priors.
+    """Return the initial mixtures, with a component of weight 1 at each prior.
 
     Raises BadInput if there are more priors than components.
     """
@@ -122,7 +122,7 @@ def no_components(runs: int, most: int) -> Mixture:
 
 
 def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[Mixture, Sets]:
-    """Filter the scans: return the mixtures after them, and the set that each scan leads to."""
+    """Filter the scans; return the mixtures after them, and a set for each scan."""
     columns: Any = before
     mixture = Mixture(*(column.copy() for column in columns))
     runs, most = mixture.weight.shape
@@ -152,7 +152,7 @@ def _work(most: int, detections: int) -> PhdMemory:
 
 
 def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
-    """Make empty sets, with room for twice the greatest weight that each scan can lead to."""
+    """Make empty sets with room for twice the greatest possible weight after each scan."""
     count = len(scans.time_ns)
     bound = np.empty(count)
     passed = (1.0 - settings.detection_probability) * settings.survival_probability
@@ -217,7 +217,7 @@ def _outputs(
         mean=sets.mean[rows],
         covariance=sets.covariance[rows].reshape(-1, STATES**2),
     )
-    # in a PHD filter the number of targets is Poisson, so that its variance equals its mean
+    # in a PHD filter, the number of targets is Poisson, so its variance equals its mean
     number, spread = expected[:, None], expected[:, None, None]
     things: Components = {"things": "linear"}
     cardinality = state_stream(f"{topic}/cardinality", time_ns, things, None, number, spread)
@@ -242,7 +242,7 @@ def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
 
 
 def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Iterator[Binding]:
-    """Bind a filter to every sensor with scans and detections, with the priors in the sensor's frame."""
+    """Bind a filter to every sensor with scans and detections, and to the priors in its frame."""
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
         found["prior"].name: found["prior"]

@@ -19,7 +19,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
 )
 
 STATES = 4
-PLACE = (0, 2)  # x and y; the velocity of each is next to it
+PLACE = (0, 2)  # x and y; each is followed by its velocity
 
 
 # A component with more than this weight counts as a target.
@@ -27,7 +27,7 @@ EXTRACTED = 0.5
 
 
 class PhdSettings(NamedTuple):
-    """The parameters as the kernel reads them; the gate is in squared sigmas."""
+    """Parameters as the kernel reads them; the gate is in squared sigmas."""
 
     variance_m2: float
     detection_probability: float
@@ -43,7 +43,7 @@ class PhdSettings(NamedTuple):
 
 @varying(2)
 class Mixture(NamedTuple):
-    """The mixtures of all runs: axes are run and component, of which the first `used` are occupied.
+    """Mixtures of all runs, with the axes run and component; the first `used` components are occupied.
 
     used, time_ns, failure: (runs,); time is negative before the first scan. weight, mean, covariance:
     (runs, most), (runs, most, 4), (runs, most, 4, 4).
@@ -58,7 +58,7 @@ class Mixture(NamedTuple):
 
 
 class Scans(NamedTuple):
-    """The scans of all runs in time order; scan s has detections first[s]:end[s] of `place` (n, 2)."""
+    """Scans of all runs in time order; scan s has the detections first[s]:end[s] of `place` (n, 2)."""
 
     offsets: Integers
     time_ns: Integers
@@ -75,9 +75,9 @@ class PhdInputs(NamedTuple):
 
 
 class Sets(NamedTuple):
-    """Output of every scan: the expected number of targets, and the elements of the set.
+    """Output after every scan: the expected number of targets, and the elements of the set.
 
-    Scan s has room for elements from `room[s]` on, and has filled `elements[s]` of them.
+    The elements of scan s begin at `room[s]`; `elements[s]` of them are filled.
     """
 
     is_reported: Booleans
@@ -94,11 +94,11 @@ class PhdMemory(NamedTuple):
     """Scratch memory of one core.
 
     Attributes:
-        weight, mean, covariance: the components after a scan, before they are reduced.
-        factor, is_merged, heaviest, step, shift: needed to merge them.
-        innovation: of any detection with a component.
-        seen_factor, seen_gain, seen_covariance: of each component as if it were detected: the factor L
-            of the innovation's covariance S (2, 2), W = C L^-T (4, 2), and the covariance afterwards.
+        weight, mean, covariance: the components after a scan, before reduction.
+        factor, is_merged, heaviest, step, shift: memory for merging them.
+        innovation: innovation of a detection for a component.
+        seen_factor, seen_gain, seen_covariance: for the update of each component: the factor L of the
+            innovation covariance S (2, 2), W = C L^-T (4, 2), and the updated covariance.
     """
 
     weight: Floats
@@ -116,7 +116,7 @@ class PhdMemory(NamedTuple):
 
 
 def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int) -> None:
-    """Write a component into a row of anything with these columns.
+    """Write a component to a row of a mixture or of the memory.
 
     Args:
         weight, mean, covariance: the component, with mean (4,) and covariance (4, 4).
@@ -128,11 +128,11 @@ def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int)
 
 
 def prepare(mean: Floats, covariance: Floats, variance: float, work: PhdMemory, parent: int) -> bool:
-    """Compute what the updates of a component by all detections share; return False if S is singular.
+    """Compute the common part of all updates of a component; return False if S is singular.
 
     Args:
-        mean, covariance: of the component, (4,), (4, 4).
-        variance: of a detection, per axis, in m^2.
+        mean, covariance: (4,), (4, 4), of the component.
+        variance: variance of a detection, per axis, in m^2.
         work: memory to fill.
         parent: index of the component.
     """
@@ -162,16 +162,16 @@ def add_detected(
     work: PhdMemory,
     end: int,
 ) -> int:
-    """Append each component updated by one detection, and a birth; return the new end.
+    """Append all components after the update by one detection, and a birth; return the new end.
 
     Args:
         run: index of the run.
         parents: number of components before the scan.
         place: position of the detection, (2,), in m.
         mixture: the predicted mixture, with weights before survival.
-        settings: of the filter.
-        work: memory with what `prepare` filled for each component; components are appended to it.
-        end: number of components in it.
+        settings: settings of the filter.
+        work: memory that `prepare` filled for each component; components are appended to it.
+        end: number of components in the memory.
     """
     first = end
     total = settings.clutter_per_m2
@@ -241,7 +241,7 @@ def squared_distance(work: PhdMemory, member: int, other: int) -> float:
 
 
 def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
-    """Merge components around the heaviest one, and so on with the rest; return the number of groups.
+    """Merge components around the heaviest remaining one, repeatedly; return the number of groups.
 
     Each merged component replaces the heaviest of its group; `heaviest` lists their indices. Returns -1
     if a covariance is not positive definite.
@@ -266,9 +266,9 @@ def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
 
 
 def merge_group(seed: int, count: int, settings: PhdSettings, work: PhdMemory) -> None:
-    """Replace a component by the one Gaussian with the moments of all components close to it.
+    """Replace a component by the Gaussian with the moments of all components close to it.
 
-    Moments are taken about the seed's mean, which does not move until all members are found.
+    Moments are computed about the mean of the seed, which does not change until all members are found.
     """
     work.is_merged[seed] = True
     total = work.weight[seed]
@@ -321,7 +321,7 @@ def keep(run: int, groups: int, mixture: Mixture, work: PhdMemory) -> None:
 def process(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Process one scan of a run; a scan before the mixture's time has no effect."""
+    """Process one scan of a run; a scan that is older than the mixture has no effect."""
     scans, settings = inputs
     if mixture.time_ns[run] >= 0:
         duration_s = (scans.time_ns[scan] - mixture.time_ns[run]) * 1e-9
@@ -343,7 +343,7 @@ def process(
 def extract(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Fill in a scan's set; the rounded weight of a component is its number of targets."""
+    """Fill the set of a scan; a component's number of targets is its rounded weight."""
     row = sets.room[scan]
     for component in range(mixture.used[run]):
         weight = mixture.weight[run, component]

@@ -11,17 +11,17 @@ from fuselog.replay.families.tracking.association.clusters import AssociationMem
 LEVELS = 4
 
 
-# Gain with which the usual interval of a track follows the observed intervals.
+# Gain with which the usual interval of a track is updated by the observed intervals.
 INTERVAL_GAIN = 0.2
 
 
-# Pairs farther apart than this, in squared sigmas of the widest level, are not considered further.
+# Pairs that are farther apart than this, in squared sigmas of the widest level, are ignored.
 GATE = 60.0
 NO_TRACK = -1
 
 
 class ReportSettings(NamedTuple):
-    """The parameters as the kernel reads them; those of the levels have shape (LEVELS,)."""
+    """Parameters as the kernel reads them; parameters of the levels have the shape (LEVELS,)."""
 
     acceleration_density: Floats
     position_variance: Floats
@@ -38,17 +38,18 @@ class ReportSettings(NamedTuple):
 
 @varying(2)
 class Tracks(NamedTuple):
-    """The tracks of all runs: axes run and place; the first `used` places are taken.
+    """Tracks of all runs, with the axes run and place; the first `used` places are occupied.
 
     Attributes:
-        used: (runs,); met: (runs,) number of tracks ever begun, from which tracks are numbered.
+        used: (runs,); met: (runs,) number of all tracks so far, which numbers new tracks.
         number, time_ns: (runs, places).
         mean: (runs, places, 4) x, vx, y, vy.
         spread: (runs, places, 3) variance of a position, covariance, variance of a velocity, per axis.
         weight: (runs, places, LEVELS).
         interval_s: (runs, places) usual time between reports.
-        course_rad, speed_mps: (runs, places) as last reported.
-        held: (runs, places, 2) how often a slow vessel repeated its course, or did not, from 1.
+        course_rad, speed_mps: (runs, places), last reported values.
+        held: (runs, places, 2) counts, from 1, of how often a slow vessel repeated or changed its
+            course.
     """
 
     used: Integers
@@ -65,7 +66,7 @@ class Tracks(NamedTuple):
 
 
 class Reports(NamedTuple):
-    """The reports of all runs in time order; velocities (n, 2) have variances (n,) of their own.
+    """Reports of all runs in time order; each velocity (n, 2) has its own variance (n,).
 
     The variance is large if course or speed is unknown.
     """
@@ -87,7 +88,7 @@ class ReportInputs(NamedTuple):
 
 
 class ReportResults(NamedTuple):
-    """Output for every report: the number of its track, mean (n, 4) and spread (n, 3)."""
+    """Output for every report: number of its track, mean (n, 4) and spread (n, 3)."""
 
     number: Integers
     mean: Floats
@@ -98,8 +99,8 @@ class ReportResults(NamedTuple):
 class ReportMemory(NamedTuple):
     """Memory for associating the reports of one stamp.
 
-    See `fuselog.replay.families.tracking.association.association`; rows are reports, columns tracks. A
-    report that is `missed` by all tracks begins a new one.
+    See `fuselog.replay.families.tracking.association.association`; rows are reports and columns are
+    tracks. A report that is `missed` by all tracks begins a new one.
     """
 
     weights: Weights
@@ -132,7 +133,7 @@ def reported(
         spread, duration_s: as for `widened`.
         level: the level, below `LEVELS`.
         velocity_variance: the report's own variance, added to that of the level, in (m/s)^2.
-        settings: with the noise of the levels.
+        settings: settings with the noise of the levels.
     """
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
     return (
@@ -157,7 +158,7 @@ def differences(
 
     Args:
         mean: mean of the track, (4,) x, vx, y, vy.
-        position, velocity: as reported, (2,) in m, (2,) in m/s.
+        position, velocity: reported values, (2,) in m and (2,) in m/s.
         duration_s: time from the track's last report to this one.
     """
     return (
@@ -169,12 +170,12 @@ def differences(
 
 
 def mixed(weight: float, settings: ReportSettings) -> float:
-    """Compute the weight of a level before the next report."""
+    """Compute the predicted weight of a level at the next report."""
     return (1.0 - settings.forgetting) * weight + settings.forgetting / LEVELS
 
 
 def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> bool:
-    """Test whether a course repeats the one before, or both are unavailable."""
+    """Test whether a course repeats the previous one, or both are unavailable."""
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
     turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
@@ -182,17 +183,17 @@ def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> b
 
 
 def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: ReportSettings) -> bool:
-    """Test whether track and report are both so slow that the course says little about the motion."""
+    """Test whether track and report are so slow that the course is a poor indicator of motion."""
     return speed_mps < settings.slow_mps and tracks.speed_mps[run, place] < settings.slow_mps
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
-    """Compute the density of such reports from vessels not met before, per m^2, s and (m/s)^2.
+    """Compute the density of such reports from new vessels, per m^2, s and (m/s)^2.
 
     Args:
-        velocity: as reported, (2,) in m/s.
+        velocity: reported velocity, (2,) in m/s.
         own_variance: variance of that velocity, in (m/s)^2.
-        settings: with births, and the speeds of vessels.
+        settings: settings with the rate of births and the speeds of vessels.
     """
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)
     variance = settings.slow_mps**2 + own_variance
@@ -205,7 +206,7 @@ def birth_density(velocity: Floats, own_variance: float, settings: ReportSetting
 def ratio_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> float:
-    """Compute the likelihood ratio of a report coming from a track and from a vessel not met before."""
+    """Compute the ratio of the likelihoods that a report is from a track and from a new vessel."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     if duration_s <= 0.0:
         return 0.0
@@ -222,7 +223,8 @@ def ratio_of(
         a, b, c = reported(spread, level, duration_s, reports.velocity_variance[event], settings)
         weight = mixed(tracks.weight[run, place, level], settings)
         density += weight * density_at(difference, a, b, c)
-    # the rate of reports rises during half the usual interval, and falls after a long silence
+    # the rate of reports rises during the first half of the usual interval, and falls after a long
+    # silence
     usual_s = tracks.interval_s[run, place]
     density *= min(1.0, 2.0 * duration_s / usual_s) / (usual_s + duration_s)
     if are_slow(tracks, run, place, reports.speed_mps[event], settings):
@@ -237,7 +239,7 @@ def ratio_of(
 
 
 def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings) -> int:
-    """Begin a track with a report and return its place."""
+    """Begin a track with a report; return the place of the track."""
     place = tracks.used[run]
     tracks.used[run] = place + 1
     tracks.number[run, place] = tracks.met[run]
@@ -318,7 +320,7 @@ def take_in(
     settings: ReportSettings,
     results: ReportResults,
 ) -> None:
-    """Assign a report to a track, or to a new one, and fill in the result."""
+    """Assign a report to an existing or a new track, and fill the result."""
     if place == NO_TRACK:
         place = begin(run, event, reports, tracks, settings)
     else:
@@ -357,7 +359,7 @@ def track(
     results: ReportResults,
     memory: ReportMemory,
 ) -> bool:
-    """Process one run's reports of one stamp, the most likely pair of report and track first."""
+    """Process the reports of one run and stamp, the most likely pair of report and track first."""
     (reports, settings), weights, probability = inputs, memory.weights, memory.probability
     count = end - first
     forget(run, reports.time_ns[first], tracks, settings)

@@ -1,17 +1,17 @@
 """Tracker of vessels from reports that do not identify their sender.
 
-Every report goes to the track that most likely sent it, or begins a new one. Tracks are modelled as
-independent point processes. For each track, its rate of reports now times its predictive density of
-this report is compared with the rate and density of vessels that were not met before. New vessels may
-appear anywhere; some are at rest, close to each other in harbours, the others have any velocity.
-Reports with equal stamps come from different vessels; the most likely pairs are made first.
+Every report is assigned to the track that most likely sent it, or begins a new track. Tracks are
+modelled as independent point processes. For each track, the product of its current rate of reports and
+its predictive density of the report is compared with the same product for new vessels. New vessels may
+appear anywhere; some are at rest, close to each other in harbours, and the others have any velocity.
+Reports with equal stamps are from different vessels; the most likely pairs are assigned first.
 
-A track moves with one of several levels of noise, from a moored hull to a vessel that turns sharply or
-was silent for a long time. The weights of the levels are learnt by Bayes' rule and move back a little
-towards equal weights with every report. The state is the Gaussian with the moments of the mixture: the
-first-order generalised pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 11.6.2). Both axes have the same noise, so three numbers are
-enough for a track's covariance.
+A track has one of several levels of noise, from that of a moored vessel to that of a vessel that turns
+sharply or was silent for a long time. The weights of the levels are updated by Bayes' rule and move
+slightly back towards equal weights with every report. The state is the Gaussian with the moments of the
+mixture, as in the first-order generalised pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 11.6.2). Both axes have the same noise, so three
+numbers are enough for a track's covariance.
 """
 
 from collections.abc import Iterator, Mapping
@@ -49,22 +49,23 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """Assumptions about vessels and their receivers, the same for all of them.
+    """Assumptions about vessels and receivers, which are the same for all of them.
 
-    Each track weighs several levels of noise, the smallest first.
+    Each track has weights for several levels of noise, which are sorted from the smallest.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration by level, in m^2/s^3.
         sigma_position_m: standard deviation of a position by level, per axis, in m.
         sigma_velocity_mps: standard deviation of a velocity by level, per axis, in m/s.
-        forgetting: share by which a report moves the weights of the levels back to equal ones.
+        forgetting: share by which each report moves the weights of the levels back to equal weights.
         births_per_km2_h: number of new vessels per area and time.
         resting_share: share of new vessels that are at rest.
         top_speed_mps: greatest speed of a vessel.
-        usual_interval_s: time between a vessel's reports that a new track assumes.
-        slow_mps: speed below which a vessel may be at rest, and then often repeats its last course.
-        course_width_deg: difference within which a course counts as repeated, which distinguishes a
-            vessel at rest from others.
+        usual_interval_s: time between reports that is assumed for a new track.
+        slow_mps: speed below which a vessel may be at rest; a vessel at rest often repeats its last
+            course.
+        course_width_deg: difference up to which a course counts as repeated, which is a sign of a vessel
+            at rest.
         forget_s: time without a report after which a track ends.
     """
 
@@ -88,7 +89,7 @@ Reporting = Given[ReportTrackerParameters]
 
 
 def start(given: Reporting) -> tuple[Reporting, Tracks]:
-    """Start without tracks."""
+    """Return the settings, and a state without tracks."""
     return given, _no_tracks(given.runs)
 
 
@@ -129,7 +130,7 @@ def _reports(block: Block, topic: str, settings: ReportSettings) -> Reports:
     offsets, time_ns, _, source, _ = block.events
     given = block.streams[topic]
     course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
-    # with an unknown direction, or an unknown speed as well, the velocity is wide about zero
+    # if the direction, or also the speed, is unknown, the velocity has a large variance about zero
     fastest = settings.top_speed_mps
     unknown = np.isnan(course_rad) | np.isnan(speed_mps)
     variance = np.where(unknown, np.where(np.isnan(speed_mps), fastest, speed_mps) ** 2, 0.0)
@@ -183,7 +184,7 @@ def _memory(reports: int, places: int) -> ReportMemory:
 
 
 def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
-    """Convert the parameters to the kernel's settings, with births per m^2 and s.
+    """Convert the parameters to settings of the kernel, with births per m^2 and s.
 
     Raises BadInput if the last level is not the widest, because gates are computed with it.
     """

@@ -1,4 +1,4 @@
-"""Kinds of sensors whose unordered scans a tracker can use.
+"""Kinds of sensors with unordered scans that a tracker can use.
 
 A target is (x_m, vx_mps, y_m, vy_mps) in the plane; `origin` is the position of the sensor.
 """
@@ -25,7 +25,7 @@ def is_within(bearing_rad: Component, begin_rad: Component, end_rad: Component) 
 
 
 def between(range_m: Component, near: Component, far: Component, parameters: Any) -> Component:
-    """Interpolate linearly from `near`, up to the near range, to `far`, from the far range on."""
+    """Interpolate linearly between `near`, up to the near range, and `far`, beyond the far range."""
     if range_m <= parameters.near_range_m:
         return near
     if range_m >= parameters.far_range_m:
@@ -35,7 +35,7 @@ def between(range_m: Component, near: Component, far: Component, parameters: Any
 
 
 def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
-    """Compute the probability of detection: by range, scaled in one sector, 0 in the blind sector."""
+    """Compute the probability of detection by range, scaled in one sector and 0 in the blind sector."""
     x, y = away(target, origin)
     bearing_rad = np.arctan2(y, x)
     if is_within(bearing_rad, parameters.blind_from_rad, parameters.blind_to_rad):
@@ -48,7 +48,7 @@ def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
 
 
 def clutter_in_plane(range_m: Component, bearing_rad: Component, parameters: Any) -> Component:
-    """Compute the clutter per m^2: by range, scaled in one sector."""
+    """Compute the clutter per m^2 by range, scaled in one sector."""
     near, factor = parameters.clutter_per_m2, parameters.far_clutter_factor
     density = between(range_m, near, near * factor, parameters)
     if is_within(bearing_rad, parameters.sector_from_rad, parameters.sector_to_rad):
@@ -98,7 +98,7 @@ def bearing_of(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def bearing_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """Compute a bearing's variance; `sigma_across_m` matters less the farther the target is."""
+    """Compute the variance of a bearing; the effect of `sigma_across_m` decreases with the range."""
     across = parameters.sigma_across_m / np.hypot(*away(target, origin))
     return (parameters.sigma_rad**2 + across**2,)
 
@@ -128,7 +128,7 @@ def polar_noise(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def polar_clutter(detection: Any, parameters: Any) -> Component:
-    """Compute the clutter per m and rad, which is that per m^2 times the range."""
+    """Compute the clutter per m and rad: the clutter per m^2 times the range."""
     range_m, bearing_rad = detection
     return range_m * clutter_in_plane(range_m, bearing_rad, parameters)
 
@@ -183,8 +183,8 @@ RANGES_BEARINGS = ScanSensor(
     polar_birth,
 )
 KINDS = (PLACES, BEARINGS, RANGES_BEARINGS)
-SEEN = {(kind.leaf, kind.schema.full_name) for kind in KINDS}  # of topics with detections
-# Values of what a channel does not state: no such effect.
+SEEN = {(kind.leaf, kind.schema.full_name) for kind in KINDS}  # topics with detections
+# Defaults for values that a channel does not state: the effect is absent.
 UNSTATED: dict[str, float] = {
     "sigma_across_rad": 0.0,
     "lag_s": 0.0,

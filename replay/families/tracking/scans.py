@@ -16,7 +16,7 @@ from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
 class SensorTopics(NamedTuple):
     """Kinds, topics and frames of a log's sensors.
 
-    `origins` are the topics of the sensors' own positions, empty for a sensor that states none.
+    `origins` has the topics of the sensors' own positions, empty for a sensor that states none.
     """
 
     kinds: tuple[int, ...]
@@ -42,9 +42,9 @@ Fixes = dict[str, list[Fix | None]]
 
 
 def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fixes: Fixes) -> Scans:
-    """Return the scans of all runs and sensors in the order in which their messages are replayed.
+    """Return the scans of all runs and sensors in the order of replay.
 
-    `fixes` are the last sensor positions of earlier blocks, by topic and run. Raises BadInput as
+    `fixes` has the last sensor positions of earlier blocks, by topic and run. Raises BadInput as
     `by_scan` does, and if the position of a sensor is not known yet.
     """
     starts = np.cumsum([0, *(len(ragged) for ragged in block.streams.values())])
@@ -71,7 +71,7 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
 
 
 def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
-    """Sort detections by scan: return their order (n,) and the bounds (2, scans) of each scan in it.
+    """Sort detections by scan; return the order (n,) and the bounds (2, scans) of each scan in it.
 
     Raises BadInput if two scans of a run have the same number, if a scan does not have the number of
     detections that it states, or if the scan of a detection is missing.
@@ -113,7 +113,7 @@ def _measured(stream: Stream, kind: ScanSensor) -> Floats:
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Find the sensor's position (n, 2) at its scans: the last fix, or the first known one."""
+    """Find the positions (n, 2) of a sensor at its scans: the last fix, or the first known one."""
     found = np.empty((len(scans), 2))
     places = read_vectors(fixes.stream, "position_m", PLANE)
     for run, before in enumerate(known):

@@ -1,8 +1,8 @@
-"""Persistent errors of sensors, as components of every track's state in addition to the target's.
+"""Persistent errors of sensors, as additional components of the state of every track.
 
-A registration error is constant and shared by all tracks. A correlated error belongs to one track, such
-as the position on a hull that a box marks, and decorrelates with `correlation_s`: a first-order
-Gauss-Markov process.
+A registration error is constant and shared by all tracks. A correlated error belongs to one track (an
+example is the point of a hull that is detected) and decorrelates with the time constant `correlation_s`,
+as a first-order Gauss-Markov process.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ BY_SORT = ("registration", "correlated")
 
 
 class Errors(NamedTuple):
-    """The errors of sensors, the registration errors first.
+    """Errors of sensors, with the registration errors first.
 
     Attributes:
         names: names of the components.
-        sigma, correlation_s: of each error, (errors,); `correlation_s` is infinite for a constant.
+        sigma, correlation_s: (errors,), of each error; `correlation_s` is infinite for a constant error.
         shared: the number of registration errors.
-        places: by sensor, the indices of its errors, by kind of error and measured component, such as
-            `registration_at_0`; -1 for no error.
+        places: for each sensor, the indices of its errors by kind of error and measured component, such
+            as `registration_at_0`; -1 for no error.
     """
 
     names: tuple[str, ...]
@@ -44,7 +44,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
-    """Collect the errors for which the settings give their sensors a sigma."""
+    """Collect the errors for which the settings of a sensor have a sigma."""
     names: list[str] = []
     sigmas, times, shared = [], [], 0
     places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]
@@ -113,7 +113,7 @@ def _longer(bound_model: BoundModel, names: tuple[str, ...], lengths: tuple[int,
 
 
 def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:
-    """Extend a motion by errors that decay and are renewed; its own noise has `noises` numbers."""
+    """Extend a motion by correlated errors; the motion itself has `noises` noise components."""
     n, is_triangle = model.size, noises > model.size
     move_own, noise_own = motion.move, motion.noise
     assert noise_own is not None

@@ -1,4 +1,4 @@
-"""The model of a tracker's targets: a registered model with a position, or constant velocity."""
+"""Models of the targets of a tracker: any registered model with a position, or constant velocity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ class TargetParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Move at constant velocity."""
+    """Predict the state at constant velocity."""
     x, vx, y, vy = state
     return x + duration_s * vx, vx, y + duration_s * vy, vy
 
@@ -63,8 +63,8 @@ class Targets(NamedTuple):
     """Assumptions about the targets.
 
     Attributes:
-        bound_model: their bound model, with one motion or with all modes.
-        parameters: the model's numbers; NaN for a number that is not used.
+        bound_model: bound model of the targets, with one motion or with all modes.
+        parameters: the numbers of the model; NaN for numbers that are not used.
         newborn: a target of which only the position is known.
     """
 
@@ -74,7 +74,7 @@ class Targets(NamedTuple):
 
 
 def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
-    """Build the targets from a tracker's parameters; the scans' channels state what these leave out.
+    """Build the targets from the parameters of a tracker, or from channels for missing parameters.
 
     Raises BadInput, with a message that begins with `where`, if the model cannot describe a target or if
     a number is missing.

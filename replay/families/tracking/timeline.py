@@ -1,10 +1,10 @@
 """Timeline of multi-target tracking: the scans of each sensor, and the tracks in their own colours.
 
-The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
-nothing; bearings are rays from the sensor's position. Lines connect a track to the detections of
-positions that were associated with it; the less probable, the fainter. Next to the map are GOSPA, the
-number of tracks and their probabilities of existence. Below it are events: a track is confirmed or ends,
-or a target switches to another track.
+The map has x east and y north. Detections stay visible until the sensor's next scan, so an empty scan
+clears them; bearings are rays from the sensor's position. Lines connect a track to its associated
+detections of positions; less probable associations are fainter. Next to the map are GOSPA, the number of
+tracks and their probabilities of existence. Below the map are events: a track is confirmed or ends, or a
+target switches to another track.
 """
 
 from collections.abc import Iterator, Mapping
@@ -55,7 +55,7 @@ SCANS = "scans"
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw a map with all sensors for each tracker, in tabs, next to plots of all trackers."""
+    """Draw, for each tracker, a map with all sensors in a tab, next to plots of all trackers."""
     turn_up(canvas)
     ground, paths, places = f"{ROOT}/ground", [], []
     for topic, place, stroke in _ways(scene):
@@ -91,7 +91,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
-    """Yield the paths with known positions: true paths of targets, and those of sensors."""
+    """Yield known paths: the true paths of targets and the paths of sensors."""
     for topic in scene.source.topics.values():
         if topic.schema_name == schemas.TRUTH_STATE.full_name:
             yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)
@@ -100,7 +100,7 @@ def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
 
 
 def _legend(scene: Scene) -> dict[str, Colour]:
-    """Return the colours of the true paths and the sensors that the log contains."""
+    """Return the colours of the true paths and of the sensors in the log."""
     schemas_of = {topic.schema_name for topic in scene.source.topics.values()}
     known = {"truth": (schemas.TRUTH_STATE, TRUTH), "sensors": (schemas.POSITION_FIX, MUTED)}
     return {name: colour for name, (of, colour) in known.items() if of.full_name in schemas_of}
@@ -135,7 +135,7 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
 
 
 def _own_places(scene: Scene, scan: Stream) -> Floats:
-    """Find the sensor's position at its scans, (n, 2)."""
+    """Find the positions (n, 2) of a sensor at its scans."""
     topic = scan.metadata.get(ORIGIN, "")
     return places_of_sensor(scan, scene.read(topic) if topic in scene.source.topics else None)
 
@@ -181,14 +181,14 @@ def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) 
 
 
 class Joined(NamedTuple):
-    """A sensor's detections as trackers use them: the row of the scan, and the relative position."""
+    """Detections of a sensor as trackers use them: row of the scan, and relative position."""
 
     scan: Integers
     place: Floats
 
 
 def _joined(scan: Stream, seen: Stream) -> Joined:
-    """Replace each chain of near detections of a scan by its mean, in the order of the first ones.
+    """Replace each chain of near detections of a scan by its mean, in order of first detections.
 
     The channel of the scans states the distance; see
     `fuselog.replay.families.tracking.association.scanning.join_near`.
@@ -212,7 +212,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
 
 
 def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np.bool_]]:
-    """Find the positions (n, 2) of the associations' tracks at the time, and which of them are known."""
+    """Find the positions (n, 2) of associated tracks at the time, and whether each is known."""
     keys = [
         np.stack([stream.publish_time_ns, stream["track_id"].astype(np.int64)], axis=1)
         for stream in (tracks, associations)
@@ -226,7 +226,7 @@ def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np
 
 
 def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
-    """Yield when tracks of a tracker are confirmed, and when they end."""
+    """Yield events for the confirmation and the end of each track."""
     numbers, times = tracks["track_id"].astype(np.int64), tracks.publish_time_ns
     scans_ns = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))[name].publish_time_ns
     for number in np.unique(numbers):
@@ -238,7 +238,7 @@ def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
 
 
 def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happened]:
-    """Yield when a target switches to another track."""
+    """Yield an event whenever a target switches to another track."""
     for target, track in enumerate(errors.kept, start=1):
         followed = np.flatnonzero(track != NONE)
         for row in np.flatnonzero(np.diff(track[followed])):

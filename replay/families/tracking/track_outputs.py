@@ -1,4 +1,4 @@
-"""Output streams of a tracker: tracks after every scan, associations, innovations, unused data."""
+"""Output streams of a tracker: tracks after every scan, associations, innovations, skipped data."""
 
 from collections.abc import Iterator
 
@@ -35,8 +35,8 @@ def track_outputs(
 ) -> list[Ragged]:
     """Make the output streams of the tracker `name` for these scans.
 
-    `repeated` is the number of scans after an out-of-sequence scan that were processed again; the last
-    of them is the scan that is given here.
+    `repeated` is the number of scans after an out-of-sequence scan that were processed again; `scans`
+    then has only the last of them.
     """
     topic = f"/estimates/{name}"
     return [
@@ -49,7 +49,7 @@ def track_outputs(
 
 
 def _filled(column: NDArray, ends: Integers) -> NDArray:
-    """Concatenate the rows that each run has filled of a column (runs, rows, ...)."""
+    """Concatenate the filled rows of each run in a column (runs, rows, ...)."""
     return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
 
 
@@ -67,7 +67,7 @@ def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
 def _of_tracks(
     topic: str, found: SensorTopics, bound_model: BoundModel, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
-    """Yield the number of tracks, the tracks and their existence after every scan."""
+    """Yield streams of the number of tracks, the tracks and their existence after every scan."""
     metadata = {**named(bound_model.model.state), **in_frame(found.frames[0])}
     ends = tracked.end[:, 0]
     used = np.flatnonzero(tracked.confirmed != NEVER)
@@ -96,7 +96,7 @@ def _of_tracks(
 
 
 def _modes(topic: str, bound_model: BoundModel, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
-    """Yield the probabilities of each track's modes, if there are several."""
+    """Yield a stream of the mode probabilities of each track, if there are several modes."""
     if not bound_model.modes:
         return
     ends = tracked.end[:, 0]
@@ -129,7 +129,7 @@ def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackO
 
 
 def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) -> Iterator[Ragged]:
-    """Yield what was approximated, what was not used, and how many scans were processed again."""
+    """Yield streams of approximated clusters, unused scans and detections, and reprocessed scans."""
     approximated = np.flatnonzero(tracked.approximated)
     tracks = tracked.approximated[approximated]
     stream = make_stream(

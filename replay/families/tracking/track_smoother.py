@@ -1,4 +1,4 @@
-"""Smoothing of a tracker's tracks, so that every state uses all detections of its track."""
+"""Smoothing of tracks: every state uses all detections of its track."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,12 +12,12 @@ from fuselog.replay.families.tracking.targets import Targets
 
 
 def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
-    """Raise BadInput if tracks cannot be smoothed: with several motions, or with errors of sensors.
+    """Raise BadInput if tracks cannot be smoothed because of several motions or sensor errors.
 
     Args:
         name: name of the estimator.
-        targets: how targets move.
-        errors: the names of sensors' errors in the tracks' states.
+        targets: model of the targets.
+        errors: the names of sensor errors in the states of tracks.
     """
     if errors:
         raise BadInput(

@@ -4,17 +4,16 @@
     tracker:hungarian   the best assignment of detections to tracks (global nearest neighbour)
     tracker:jpda        all joint associations, weighted by their probabilities
     tracker:jipda       as jpda, with a probability of existence for each track
-    tracker:pmbm        as jipda, and any detection may be the first one of a target: the Poisson
-                        multi-Bernoulli mixture. After each scan only the marginals are kept, that is,
-                        the tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015).
-                        Targets that were never detected form a uniform Poisson process of constant
-                        density
+    tracker:pmbm        as jipda, and any detection may be the first of a target: the Poisson
+                        multi-Bernoulli mixture. After each scan, only the marginals are kept, that is,
+                        the existence and states of the tracks (TOMB/P of Williams, IEEE TAES 51(3),
+                        2015). Undetected targets form a uniform Poisson process of constant density
 
 Targets move at constant velocity with white acceleration noise, or by any registered model with a
 position. If that model has several modes, each track is an interacting multiple model. The channels of
-the scans state the properties of their sensors, see
-`fuselog.replay.families.tracking.scan_sensors`. Detections with a position begin tracks; bearings only
-update confirmed tracks. `fuselog.replay.families.tracking.association.tracking` does the work.
+the scans state the properties of their sensors, see `fuselog.replay.families.tracking.scan_sensors`.
+Detections with a position begin tracks; bearings only update confirmed tracks. The algorithm is in
+`fuselog.replay.families.tracking.association.tracking`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,7 +50,7 @@ from fuselog.replay.families.tracking.tracker_run import (
 from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.inference.model.parameters import number_fields
 
-# Defaults of the two associations that estimate existence; they associate as jpda does.
+# Defaults for the two associations that estimate existence and otherwise work like jpda.
 EXISTING: dict[str, dict[str, float]] = {
     "jipda": {},
     "pmbm": {
@@ -71,68 +70,69 @@ class TrackerParameters(Parameters):
     applies to all sensors.
 
     A detection begins a track if it is outside all gates and far enough from all confirmed tracks. With
-    `undetected_per_m2`, any detection begins one that may come from a target that was never detected,
-    with the probability of that as its existence. `management` selects how tracks are confirmed:
-    "existence" by the probability that the target exists, "hits" by counting detections, "score" by the
+    `undetected_per_m2`, any detection that may be the first of a target begins a track; the probability
+    of this is the existence of the track. `management` selects the method of confirmation: "existence"
+    uses the probability that the target exists, "hits" counts detections, and "score" uses the
     log-likelihood ratio of target and clutter.
 
-    A registration error is a constant error of everything that a sensor measures, and all tracks
-    estimate it together. A correlated error differs between tracks and changes over time. Both are
-    components of the tracks' states.
+    A registration error is a constant error of all measurements of a sensor, which all tracks estimate
+    together. A correlated error differs between tracks and changes over time. Both are components of the
+    states of tracks.
 
     Attributes:
-        association: how detections are associated with tracks: greedily, the most likely pair first
-            (nearest), by the best assignment (hungarian), or by all joint associations, weighted by
+        association: method of associating detections with tracks: greedily, the most likely pair first
+            (nearest); by the best assignment (hungarian); or by all joint associations, weighted by
             their probabilities (jpda, jipda, pmbm).
-        management: how tracks are confirmed and ended; by default existence for jipda and pmbm, and hits
-            for the other associations.
-        sensors: the sensors to use, such as ["radar", "lidar"]; by default all.
-        model: a registered model with a position that describes how targets move; by default they move
-            at constant velocity.
-        mode: the mode of that model to use; by default all modes.
+        management: method of confirming and ending tracks; by default, existence for jipda and pmbm, and
+            hits for the other associations.
+        sensors: the sensors to use, such as ["radar", "lidar"]; all by default.
+        model: a registered model with a position, which describes the motion of targets; constant
+            velocity by default.
+        mode: the mode of that model to use; all modes by default.
         motion: parameters of that model, by name.
         acceleration_density: power spectral density of the acceleration of targets without a model, in
             m^2/s^3.
         birth_sigma_mps: standard deviation of a new track's velocity, per axis.
         birth_distance_m: least distance of a new track from all confirmed tracks.
-        birth_existence: existence of a new track; with hits or score, of a track until it is confirmed.
+        birth_existence: existence of a new track; with hits or score, existence of a track until it is
+            confirmed.
         undetected_per_m2: density of targets that were never detected.
-        confirming_existence: with management by existence, the existence from which on a track is
+        confirming_existence: with management by existence, smallest existence of a track that is
             confirmed.
         keeping_existence: existence below which a track is no longer confirmed.
         ending_existence: existence below which a track ends.
         survival_s: mean time that a target is present.
         hits_needed: with management by hits, the number of detections in the first `chances` scans that
-            confirms a track.
-        chances: with management by hits, the number of first scans after which a track ends unless it
-            has `hits_needed` detections.
+            is needed to confirm a track.
+        chances: with management by hits, the number of scans after which a track ends unless it has
+            `hits_needed` detections.
         false_confirmation: with management by score, probability that clutter is confirmed as a track.
         missed_confirmation: with management by score, probability that a target's track is not
             confirmed.
         silence_s: time without a detection after which a confirmed track ends.
         tentative_silence_s: time without a detection after which an unconfirmed track ends.
-        same_within_m: distance below which two tracks count as one target, if their velocities agree
-            too.
-        same_within_mps: difference in velocity below which two tracks count as one target, if their
-            positions agree too.
+        same_within_m: distance below which two tracks count as one target if their velocities also
+            agree.
+        same_within_mps: difference in velocity below which two tracks count as one target if their
+            positions also agree.
         most_tracks: greatest number of tracks at a time.
         smoothed: whether the tracks are smoothed at the end of the run.
         gate_probability: probability that a target's detection is inside its gate.
         sigma_m: standard deviation of a position along the line of sight, or of a range.
         sigma_across_rad: additional standard deviation of a position across the line of sight, per m of
             range.
-        lag_s: delay of detections, which show where a target was this long before.
+        lag_s: delay of detections: time from the measurement to the stamp.
         bias_x_m: bias of measured positions along x, measured minus true.
         bias_y_m: bias of measured positions along y, measured minus true.
         bias_range_m: bias of measured ranges, measured minus true.
-        near_range_m: range up to which a target is near; beyond it, detection and clutter change
+        near_range_m: range up to which detection and clutter are constant; beyond it, they change
             linearly.
-        far_range_m: range beyond which detection and clutter stay constant.
+        far_range_m: range beyond which detection and clutter are constant again.
         far_detection_probability: probability that a target at `far_range_m` or beyond is detected.
         clutter_per_m2: mean number of false detections in a scan, per area, near the sensor.
         far_clutter_factor: factor on clutter far from the sensor.
-        sector_from_rad: beginning of a sector with other detection and clutter, anticlockwise from the
-            x axis.
+        sector_from_rad: start of a sector with different detection and clutter, anticlockwise from the x
+            axis.
         sector_to_rad: end of that sector, anticlockwise from the x axis.
         sector_detection_factor: factor on the probability of detection in the sector.
         sector_clutter_factor: factor on clutter in the sector.
@@ -142,8 +142,8 @@ class TrackerParameters(Parameters):
         bias_rad: bias of measured bearings, measured minus true.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         detection_probability: probability that a near target is detected.
-        blind_from_rad: beginning of the sector in which a sensor detects nothing, anticlockwise from the
-            x axis.
+        blind_from_rad: start of the sector in which a sensor cannot detect targets, anticlockwise from
+            the x axis.
         blind_to_rad: end of that sector, anticlockwise from the x axis.
         interval_s: least time between two detections of one sensor that update a track.
         registration_sigma_m: standard deviation of the registration error of positions or ranges; 0 for
@@ -216,7 +216,7 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Fill in the management and the probabilities of existence that suit the association."""
+        """Set the management, and the probabilities of existence, that match the association."""
         association = values.get("association", "jipda")
         goes_by_existence = association in EXISTING
         given = values.get("management")
@@ -252,7 +252,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
             seen = topics.get(f"{prefix}/{kind.leaf}")
             if seen is not None and seen.schema_name == kind.schema.full_name:
                 origin = scan.metadata.get(ORIGIN, "")
-                # a sensor with a known position measures along the axes of the frame of that position
+                # a sensor with a known position measures in the axes of the frame of that position
                 frame = frame_of(topics.get(origin, seen).metadata)
                 rows.append((number, scan.name, seen.name, origin, frame))
     missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
@@ -283,7 +283,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTo
 
 
 def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
-    """Raise BadInput if there are detections whose scans were not recorded."""
+    """Raise BadInput if the log has detections but not their scans."""
     for seen in topics.values():
         prefix, _, leaf = seen.name.rpartition("/")
         is_wanted = not wanted or prefix.strip("/") in wanted
@@ -295,7 +295,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
 
 
 class TrackerSettings(NamedTuple):
-    """Numbers that the tracking loop reads, a row per sensor, and the errors of the sensors."""
+    """Numbers that the tracking loop reads (one row per sensor), and the errors of the sensors."""
 
     names: tuple[str, ...]
     numbers: Floats
@@ -305,7 +305,7 @@ class TrackerSettings(NamedTuple):
 def settings_of(
     topics: Mapping[str, Topic], found: SensorTopics, parameters: TrackerParameters, targets: Targets
 ) -> TrackerSettings:
-    """Read the settings of sensors and targets from the parameters or else the channels."""
+    """Read the settings of sensors and targets from the parameters or, if missing, from the channels."""
     names, own = number_fields(TrackerParameters), targets.parameters._asdict()
     kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
     for kind, scan in zip(kinds, found.scans, strict=True):

@@ -1,4 +1,4 @@
-"""Runs of a tracker over its scans, in order or with reprocessing, and smoothing at the end."""
+"""Processing of scans by a tracker, in order or with reprocessing, and smoothing at the end."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -25,10 +25,10 @@ class TrackerSetup(NamedTuple):
 
     Attributes:
         name: name of the estimator.
-        found: its sensors.
-        tracker: its parts.
+        found: sensors of the log.
+        tracker: the assembled tracker.
         settings: (sensors, names), the parameters for each sensor.
-        targets: how targets move, and the state of a target of which only the position is known.
+        targets: model of the targets, and the state of a new target.
         most_tracks: greatest number of tracks at a time.
         smoothed: whether tracks are smoothed at the end.
     """
@@ -62,7 +62,7 @@ class OutOfSequenceState(NamedTuple):
     """State of one run with out-of-sequence scans.
 
     Attributes:
-        base: the tracks after all scans that no out-of-sequence scan can precede any more.
+        base: the tracks after all scans that a late scan can no longer precede.
         pending: the later scans, in time order.
         head: the tracks after all scans.
     """
@@ -78,8 +78,8 @@ class TrackerState(NamedTuple):
     Attributes:
         fixes: the last sensor positions, by topic and run.
         tracks: the tracks of all runs after all scans; with out-of-sequence scans, before all scans.
-        late: with out-of-sequence scans, the state of each run.
-        outputs: with smoothing, the outputs that are written at the end, by block.
+        late: state of each run with out-of-sequence scans.
+        outputs: with smoothing, the outputs to write at the end, by block.
     """
 
     fixes: Fixes
@@ -89,7 +89,7 @@ class TrackerState(NamedTuple):
 
 
 def start(given: Given[Any]) -> tuple[TrackerSetup, TrackerState]:
-    """Start without tracks."""
+    """Return the setup, and a state without tracks."""
     setup, runs = given.setup, given.runs
     unknown: list[Any] = [None] * runs
     fixes: Fixes = {topic: unknown for topic in setup.found.origins if topic}
@@ -108,7 +108,7 @@ def advance(setup: TrackerSetup, state: TrackerState, block: Block) -> tuple[Tra
 
 
 def finish(setup: TrackerSetup, state: TrackerState) -> list[Ragged]:
-    """Return the outputs kept until the end, with smoothed tracks."""
+    """Return the outputs that were kept until the end, with smoothed tracks."""
     outputs = _joined([each for each in state.outputs if each])
     return [
         smoothed(each, setup.targets) if each.stream.topic.endswith("/track") else each
@@ -133,8 +133,8 @@ def advance_out_of_sequence(
 ) -> tuple[TrackerState, list[Ragged]]:
     """Track targets in the order of arrival, reprocessing for scans that are late by up to `back_ns`.
 
-    A late scan is inserted at its stamp, and the scans after it are processed again. Estimates that were
-    already given stay as they are; the corrected tracks are given again at the latest stamp.
+    A late scan is inserted at its stamp, and the scans after it are processed again. Earlier outputs are
+    not changed; the corrected tracks are output again at the latest stamp.
     """
     scans, fixes = _scans(state, block, setup)
     after, outputs = [], []
@@ -161,7 +161,7 @@ def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
-    """Yield rows of a run's scans that can be processed together: scans in time order, or late ones."""
+    """Yield rows of scans that can be processed together: scans in time order, or single late scans."""
     known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
     newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
     late = scans.time_ns[first:end] < newest_ns
@@ -172,7 +172,7 @@ def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -
 def _take(
     out_of_sequence: OutOfSequenceState, arrived: Scans, setup: TrackerSetup, back_ns: int
 ) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
-    """Process scans of one run that are in order, or one late scan; also return their outputs."""
+    """Process ordered scans of one run, or one late scan; also return the outputs."""
     base, pending, head = out_of_sequence
     repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
     pending = in_time(pending, arrived)

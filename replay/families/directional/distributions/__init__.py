@@ -1,1 +1,1 @@
-"""Distributions of axes, of orientations and on the torus; begin with `bingham`."""
+"""Distributions of axes, of orientations, and of angles on the torus; begin with `bingham`."""

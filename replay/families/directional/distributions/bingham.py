@@ -1,8 +1,8 @@
 """The Bingham distribution, f(x) = exp(x^T M Z M^T x) / F, of axes and orientations.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
-Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first. The numbers come from
-`bingham_kernels` and are exact for concentrations from 0 to beyond 1e6; the paper uses a saddlepoint
+Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first. The kernels in
+`bingham_kernels` are exact for concentrations from 0 to beyond 1e6; the paper uses a saddlepoint
 approximation.
 """
 
@@ -36,7 +36,7 @@ class Bingham(NamedTuple):
 
 
 def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """Make a checked distribution from axes and concentrations in any order and with any offset.
+    """Make a distribution from axes and concentrations in any order and with any offset.
 
     Raises BadInput if d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
 
@@ -65,7 +65,7 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
 def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
     """Make distributions about given modes, with concentrations along mode (+) e_2, ..., e_d.
 
-    A concentration of -2 / sigma_rad^2 gives small errors of an orientation about its axis i the
+    With a concentration of -2 / sigma_rad^2, small errors of an orientation about its axis i have the
     standard deviation sigma_rad, because a quaternion contains half angles.
 
     Args:
@@ -91,7 +91,7 @@ def parameter_matrix(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_normaliser(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """Compute ln F (...) for concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
+    """Compute ln F (...) for concentrations (..., d) by (5); (6) and (14) misprint d / 2."""
     z = np.asarray(concentrations, float)
     top = z.max(axis=-1)
     integrand, _ = _on_contour(z - top[..., None])
@@ -111,7 +111,7 @@ def covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
-    """Compute the log density (...) at unit vectors; the paper's (10)-(11) print F for 1 / F.
+    """Compute the log density (...) at unit vectors; the paper's (10)-(11) misprint 1 / F as F.
 
     Args:
         bingham: the distributions, batch axes (...).
@@ -123,9 +123,9 @@ def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def fit(second_moment: ArrayLike) -> Bingham:
-    """Fit the most likely distributions, those with E(x x^T) = `second_moment` (..., d, d): (13)-(14).
+    """Fit the maximum-likelihood distributions: E(x x^T) = `second_moment` (..., d, d), (13)-(14).
 
-    Raises BadInput if the trace of a matrix is not 1, or if a matrix is not positive definite: its
+    Raises BadInput if the trace of a matrix is not 1, or if a matrix is not positive definite, since its
     concentration would diverge.
     """
     moment = _symmetric(second_moment, "second moment of a Bingham distribution")
@@ -149,12 +149,12 @@ def fit(second_moment: ArrayLike) -> Bingham:
 
 
 def product(first: Bingham, second: Bingham) -> Bingham:
-    """Return the normalised product of two densities: lemma 1."""
+    """Return the normalised product of two densities (lemma 1)."""
     return from_parameter_matrix(parameter_matrix(first) + parameter_matrix(second))
 
 
 def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
-    """Return the factor by which an update multiplies: the density of x given z = x (+) v, (52)-(53).
+    """Return the likelihood factor of an update: the density of x given z = x (+) v, (52)-(53).
 
     M is z (+) (D M^v); (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
 
@@ -168,7 +168,7 @@ def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
 
 
 def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
-    """Return the distributions of x (+) u for known unit increments u (..., d), such as a gyro's.
+    """Return the distributions of x (+) u for known unit increments u (..., d), such as gyro rotations.
 
     Args:
         bingham: the distributions, batch axes (...).
@@ -179,7 +179,7 @@ def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
 
 
 def compose(first: Bingham, second: Bingham) -> Bingham:
-    """Return the Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
+    """Fit Bingham distributions to the second moments of x (+) y, x ~ `first` and y ~ `second`.
 
     Lemmas 2 and 4 with (13)-(14). If a fit does not converge, its distribution is NaN.
     """
@@ -201,8 +201,8 @@ def sample(bingham: Bingham, count: int, generator: np.random.Generator) -> NDAr
 def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
     """Compute E((x - m)(x - m)^T), (..., d, d), over the hemisphere about the mode m.
 
-    It is the covariance of a Gaussian about that mode: (57), which lacks a factor of 2. E|x_d| is exact
-    too; its integrand has one more factor (s - z_d)^(-1/2).
+    This is the covariance of a Gaussian about that mode, (57), which lacks a factor of 2 in the paper.
+    E|x_d| is exact too; its integrand has one more factor (s - z_d)^(-1/2).
     """
     integrand, factors = _on_contour(bingham.concentrations)
     absolute = _sum(integrand * np.sqrt(factors[..., -1, :])) / (np.sqrt(np.pi) * _sum(integrand))
@@ -214,8 +214,8 @@ def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
 def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> Bingham:
     """Fit the Bingham distribution with the second moment of g / |g|, g ~ N(mean, covariance).
 
-    Exact up to rounding: 1 / |g|^2 = int exp(-t |g|^2) dt leaves one integral over t > 0, and the
-    trapezoidal rule in log t converges geometrically.
+    The result is exact up to rounding: with 1 / |g|^2 = int exp(-t |g|^2) dt, one integral over t > 0
+    remains, and the trapezoidal rule in log t converges geometrically.
 
     Args:
         mean: (d,), with d = 2 or 4.

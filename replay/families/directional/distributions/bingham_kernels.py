@@ -38,7 +38,8 @@ _PARTS = np.stack([CONTOUR.real, CONTOUR.imag, WEIGHTS.real, WEIGHTS.imag], axis
 for _table in (CONTOUR, WEIGHTS, _PARTS):
     _table.setflags(write=False)
 
-# Newton's method squares the error in every step: below this, one more step reaches rounding error.
+# Newton's method squares the error in every step: if it is below this, one more step reaches rounding
+# error.
 _LAST_STEP = 1e-8
 _MOST_STEPS = 30
 _MOST_SWEEPS = 30
@@ -111,11 +112,11 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
 
 
 def fit_concentrations(target: NDArray, z: NDArray) -> bool:
-    """Find the concentrations for which E(x_i^2) is `target`, by Newton's method on (14).
+    """Find concentrations for which E(x_i^2) equals `target`, by Newton's method on (14).
 
-    The start is the fit of the first-order saddlepoint approximation. The residuals are weighted by
-    E(x_i^2) / target_i, which makes them nearly linear in z if z is large, so that five steps suffice
-    from 0 to beyond -1e6. Pairs are never sorted: z[i] belongs to target[i].
+    The search starts at the fit of the first-order saddlepoint approximation. The residuals are weighted
+    by E(x_i^2) / target_i, which makes them nearly linear in z if z is large; five steps then suffice
+    for concentrations from 0 to beyond -1e6. Pairs are never sorted: z[i] belongs to target[i].
 
     Args:
         target: moments (d,), ascending, with sum 1.
@@ -150,8 +151,8 @@ def fit_concentrations(target: NDArray, z: NDArray) -> bool:
 def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
     """Compute the eigenvalues, ascending, and eigenvectors of a symmetric matrix.
 
-    Cyclic Jacobi rotations: for d <= 4 they are faster than LAPACK, and small eigenvalues keep their
-    digits.
+    The method is cyclic Jacobi rotations. For d <= 4 they are faster than LAPACK, and small eigenvalues
+    keep their digits.
 
     Args:
         matrix: (d, d), destroyed.
@@ -263,7 +264,7 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
 
 
 def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
-    """Write the second moment of x (+) y to `out`, for independent x and y: lemmas 2 and 4.
+    """Write the second moment of x (+) y to `out`, for independent x and y (lemmas 2 and 4).
 
     Lemma 2 is correct as printed; its proof, (111)-(115), has wrong signs.
 
@@ -282,7 +283,7 @@ def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
 
 
 def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
-    """Predict x (+) w in place: algorithm 1, whose second input is Z^w, not the printed Z^v.
+    """Predict x (+) w in place by algorithm 1, whose second input is Z^w, not the printed Z^v.
 
     The computation is in the frame of the mode, in which small moments keep their digits next to large
     ones.
@@ -333,7 +334,7 @@ def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> 
 
 
 def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vector) -> None:
-    """Update with one measurement in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
+    """Update with one measurement in place by algorithm 2, with M = z (+) (D M^v), not M^p as printed.
 
     Args:
         axes: principal axes (d, d) in columns, the mode last.

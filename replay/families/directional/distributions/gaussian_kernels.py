@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 
 def solve_in_place(matrix: NDArray, right: NDArray) -> None:
-    """Solve matrix x = right by the Cholesky factor of the leading (n, n) block.
+    """Solve matrix x = right with the Cholesky factor of the leading (n, n) block.
 
-    A block that is not positive definite gives NaN.
+    The result is NaN if the block is not positive definite.
 
     Args:
         matrix: n or more rows and columns; its leading block is overwritten by the factor.

@@ -21,7 +21,7 @@ Interaction = Literal["sine", "cosine"]
 
 # Standard deviations at which the density of a component is cut off.
 _REACH = 6.0
-# Added to every variance (rad^2), so that no component shrinks to a single sample: (1 deg)^2.
+# Added to every variance (rad^2), so that no component shrinks to a single sample; equals (1 deg)^2.
 _LEAST_VARIANCE = np.radians(1.0) ** 2
 _MOST_CONCENTRATION = 500.0
 _NODES = 2.0 * np.pi / 1024 * np.arange(1024)
@@ -42,11 +42,11 @@ class WrappedMixture(NamedTuple):
 class VonMisesMixture(NamedTuple):
     """A mixture of bivariate von Mises densities of one kind.
 
-    The density is exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, with a and b the
+    The density is exp(k1 cos a + k2 cos b + k3 sin a sin b), normalized, where a and b are the
     deviations from the mean (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular
-    variables", 2002), or has k3 cos(a - b) in place of the product of sines (Mardia, Taylor,
-    Subramaniam, "Protein bioinformatics and mixtures of bivariate von Mises distributions for angular
-    data", 2007).
+    variables", 2002). The second kind has k3 cos(a - b) in place of the product of sines (Mardia,
+    Taylor, Subramaniam, "Protein bioinformatics and mixtures of bivariate von Mises distributions for
+    angular data", 2007).
 
     Attributes:
         weights: (k,).
@@ -69,7 +69,7 @@ class VonMisesMixture(NamedTuple):
 
 
 def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) -> WrappedMixture:
-    """Fit the most likely wrapped normals near the clusters that k-means finds.
+    """Fit wrapped normals by maximum likelihood, starting at the clusters that k-means finds.
 
     With one component, this is the maximum-likelihood fit of a wrapped normal. Raises BadInput if there
     are fewer than ten pairs of angles for each component.
@@ -85,9 +85,9 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
         )
     embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
     with extra("papers", "a mixture on the torus"):
-        from sklearn.cluster import KMeans  # which takes long to import
+        from sklearn.cluster import KMeans  # slow to import
 
-    with threadpool_limits(1):  # with few points, a second core would only spin
+    with threadpool_limits(1):  # with few points, a second core would only wait
         labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]
     mean = np.angle(share.T @ np.exp(1j * angles))
@@ -129,7 +129,7 @@ def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[F
 def fit_von_mises_mixture(
     angles: Floats, interaction: Interaction, start: WrappedMixture
 ) -> VonMisesMixture:
-    """Fit as many von Mises densities as the start has wrapped normals, by maximum likelihood.
+    """Fit one von Mises density for each wrapped normal of the start, by maximum likelihood.
 
     Args:
         angles: (n, 2), in rad.
@@ -181,7 +181,7 @@ def fit_von_mises_mixture(
 
 
 def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """Return the functions that the concentrations weight (n, k, 3), and their slopes (n, k, 3, 2)."""
+    """Return the factors of the concentrations (n, k, 3), and their derivatives (n, k, 3, 2)."""
     a, b = np.moveaxis(angles[:, None] - mean, -1, 0)
     none = np.zeros_like(a)
     if interaction == "sine":
@@ -196,8 +196,8 @@ def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[F
 def _normalisation(kappa: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
     """Return the logarithms (k,) of the integrals, and their derivatives by the concentrations (k, 3).
 
-    Over the second angle, the integral is a Bessel function. Over the first, it is a sum over equal
-    steps, which is exact to rounding for a smooth periodic function.
+    The integral over the second angle is a Bessel function. The integral over the first angle is a sum
+    over equal steps, which is exact up to rounding for a smooth periodic function.
     """
     k1, k2, k3 = kappa.T[:, :, None]
     if interaction == "sine":

@@ -1,8 +1,8 @@
 """Bivariate wrapped normals on the torus and their deterministic samples.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. Angles
-are in rad. Every function takes batch axes first and is accurate for variances from 1e-6 up to those at
-which the density is uniform.
+are in rad. Batch axes come first in every function. The functions are accurate for variances from 1e-6
+up to those at which the density is uniform.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
     """Make a wrapped normal from a checked mean and covariance.
 
     Args:
-        mean: (..., 2), in rad; is wrapped.
+        mean: (..., 2), in rad; it is wrapped.
         covariance: (..., 2, 2), in rad^2.
 
     Raises BadInput if a number is not finite or the covariance is not symmetric and positive definite.
@@ -87,7 +87,7 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def circular_moments(distribution: WrappedNormal) -> CircularMoments:
-    """Compute circular moments in closed form; the means and variances are those of the distribution."""
+    """Compute circular moments in closed form; means and variances equal those of the distribution."""
     c = distribution.covariance
     correlation = kernels.circular_correlation(c[..., 0, 0], c[..., 0, 1], c[..., 1, 1])
     return CircularMoments(distribution.mean, np.diagonal(c, axis1=-2, axis2=-1), correlation)
@@ -104,8 +104,9 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 
     Args:
         moments: moments of any distribution on the torus.
-        central_weight: w5, 0 to 1/2. The paper's 0.2 gives equal weights without correlation; 0.45
-            preserves the covariance better in the experiment of figure 3, and the mean less well.
+        central_weight: w5, 0 to 1/2. With 0.2, as in the paper, weights are equal if there is no
+            correlation; in the experiment of figure 3, 0.45 preserves the covariance better and the mean
+            less well.
 
     Raises BadInput if no real positions exist for w5, or if |r_c| > 1.
     """
@@ -147,7 +148,7 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
 
 
 def fit_mixed_mle(samples: Samples) -> WrappedNormal:
-    """Fit as Kurz and Hanebeck, CDC 2015: moments, and the most likely C_12 (over three wraps).
+    """Fit moments, and C_12 by maximum likelihood over three wraps (Kurz and Hanebeck, CDC 2015).
 
     This does not invert `five_samples`: for sigma (0.8, 1.3) and a correlation of 0.5 it returns 0.461.
     """
@@ -155,7 +156,7 @@ def fit_mixed_mle(samples: Samples) -> WrappedNormal:
 
 
 def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
-    """Compute the normalized product of two densities exactly; both without batch axes."""
+    """Compute the exact normalized product of two densities without batch axes."""
     made = kernels.blank_mixture(np.diagonal(first.covariance + second.covariance))
     count = _product_mixture(*first, *second, made)
     return Mixture(made.mean[:count], made.weights[:count], made.covariance)

@@ -1,6 +1,6 @@
 """Kernels of bivariate wrapped normals: fits to samples and products.
 
-Functions of `Component` values also accept arrays. A covariance is passed as c11, c12, c22.
+Functions with `Component` arguments also accept arrays. A covariance is passed as c11, c12, c22.
 """
 
 import math
@@ -15,7 +15,7 @@ from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.models.planar import Component, Components, wrap_angle
 
 TURN = 2.0 * math.pi
-# exp(-UNIFORM / 2) is below the rounding of 1: a larger variance is the same as a uniform distribution.
+# exp(-UNIFORM / 2) is below the rounding of 1: a distribution with a larger variance is uniform.
 UNIFORM = 80.0
 # exp(-REACH^2 / 2) is below the rounding of 1
 _REACH = 8.6
@@ -45,12 +45,12 @@ def circular_correlation(c11: Component, c12: Component, c22: Component) -> Comp
 
 
 def covariance_of(correlation: Component, c11: Component, c22: Component) -> Component:
-    """Compute the c12 for which a wrapped normal has this r_c; inverse of `circular_correlation`."""
+    """Compute the c12 of a wrapped normal with this r_c; the inverse of `circular_correlation`."""
     return np.arcsinh(correlation * np.sqrt(np.sinh(c11) * np.sinh(c22)))
 
 
 def diracs(c11: Component, c22: Component, correlation: Component, w5: Component) -> Components:
-    """Compute the offsets a, b in (0, pi) from the mean, and the weights w1 = w2, w3 = w4: algorithm 1.
+    """Compute offsets a, b in (0, pi) from the mean, and weights w1 = w2, w3 = w4 (algorithm 1).
 
     cos a = 1 - (1 - m) / (2 w~) with 1 - m = 1 - exp(-c11 / 2); the paper misplaces the bracket. The
     computation uses half angles, which keeps all digits of small variances.
@@ -87,7 +87,7 @@ def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Component
         weights: (n,), with sum 1.
         spread: the covariance (2, 2) of every component; 0 for samples.
 
-    No step subtracts from 1, so that small variances keep their digits.
+    No step subtracts from 1, because small variances would lose digits.
     """
     means, variances, fading, squares = np.empty(2), np.empty(2), np.empty(2), np.empty(2)
     for k in range(2):
@@ -136,7 +136,7 @@ def mixed_mle(
         deviations[n, 0] = wrap_angle(x[n, 0] - m1) / math.sqrt(c11)
         deviations[n, 1] = wrap_angle(x[n, 1] - m2) / math.sqrt(c22)
     turns = TURN / math.sqrt(c11), TURN / math.sqrt(c22)
-    # correlation = sin(position): the grid is dense where the likelihood is narrow, at -1 and 1
+    # correlation = sin(position): the grid is dense near -1 and 1, where the likelihood is narrow
     spacing = math.pi / (_MLE_GRID + 1)
     best, centre = -np.inf, 0.0
     for n in range(1, _MLE_GRID + 1):
@@ -173,7 +173,7 @@ def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float
                 density += math.exp(
                     -scale * (first * first - 2.0 * rho * first * second + second * second)
                 )
-        # a sample whose density underflows must not make the sum infinite
+        # the sum must stay finite if the density of a sample underflows
         total += weights[n] * math.log(density + 1e-300)
     return total
 
@@ -194,7 +194,7 @@ def fit_samples(x: NDArray, weights: NDArray) -> Components:
 
 
 def blank_mixture(variance: NDArray) -> Mixture:
-    """Allocate memory for the product of two densities whose variances (2,) sum to at most these."""
+    """Allocate memory for a product of densities; `variance` (2,) limits the sum of their variances."""
     most = (2 * _turns(variance[0]) + 1) * (2 * _turns(variance[1]) + 1)
     return Mixture(np.empty((most, 2)), np.empty(most), np.empty((2, 2)))
 
@@ -204,11 +204,11 @@ def product_mixture(
 ) -> int:
     """Compute the product of two wrapped normal densities, which is exactly a wrapped Gaussian mixture.
 
-    The mixture has a component for every number of turns between the two means, each from a Kalman
+    The mixture has one component for each number of turns between the two means, computed by a Kalman
     update. Returns the number of components.
 
     Args:
-        mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
+        mean, covariance, other_mean, other: means (2,) and covariances (2, 2) of both densities.
         mixture: filled; large enough, see `blank_mixture`.
     """
     first, second, inverse = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
@@ -266,7 +266,7 @@ def _limit(covariance: NDArray, limited: NDArray) -> None:
 
 
 def _turns(variance: float) -> int:
-    """Return the number of turns in each direction that the wrapped sum needs for full precision."""
+    """Return the number of turns in each direction for which the wrapped sum has full precision."""
     return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
 
 
@@ -279,7 +279,7 @@ def fit_product(
     components.
 
     Args:
-        mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
+        mean, covariance, other_mean, other: means (2,) and covariances (2, 2) of both densities.
         mixture: scratch memory, see `blank_mixture`.
     """
     count = product_mixture(mean, covariance, other_mean, other, mixture)
@@ -292,7 +292,7 @@ def fit_product(
 
 
 def density(x1: float, x2: float, covariance: NDArray) -> float:
-    """Compute the density at a deviation from the mean by the wrapped sum or, if shorter, Fourier's.
+    """Compute the density at a deviation from the mean, by the wrapped sum or the shorter Fourier sum.
 
     Args:
         x1, x2: the deviation, in rad.
@@ -330,7 +330,7 @@ def _density_one(n: int, deviation: NDArray, covariance: NDArray, out: NDArray) 
 
 
 def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
-    """Compute `density` (n,) at every deviation.
+    """Compute the density (n,) at every deviation; see `density`.
 
     Args:
         deviation, covariance: (n, 2), (n, 2, 2).
@@ -346,7 +346,7 @@ def _circular_moments_one(n: int, x: NDArray, weights: NDArray, out: NDArray) ->
 
 
 def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
-    """Compute `circular_moments` (n, 5) of sample sets.
+    """Compute the circular moments (n, 5) of sample sets; see `circular_moments`.
 
     Args:
         x, weights: samples (n, samples, 2), weights (n, samples).
@@ -387,10 +387,10 @@ def _product_one(
 
 
 def fit_product_each(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> NDArray:
-    """Compute `fit_product` (n, 5) of pairs of densities.
+    """Fit wrapped normals (n, 5) to products of pairs of densities; see `fit_product`.
 
     Args:
-        mean, covariance, other_mean, other: (n, 2) and (n, 2, 2) of both.
+        mean, covariance, other_mean, other: means (n, 2) and covariances (n, 2, 2) of both densities.
     """
     out, variance = np.empty((len(mean), 5)), np.einsum("nkk->nk", covariance + other)
     memory = partial(blank_mixture, variance.max(axis=0, initial=0.0))

@@ -1,11 +1,11 @@
 """Orientation by common methods: Madgwick's, Mahony's, and VQF by Laidig and Seel.
 
-These methods serve as a comparison for filters. They estimate no covariance, so one is assumed.
-Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010;
-Mahony, Hamel, Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE
-Transactions on Automatic Control 53(5), 2008; VQF is its authors' library, unchanged. Gains and
-parameters are those of the authors. Quaternions rotate body vectors into east, north, up. Each estimate
-begins with the first sample.
+Filters are compared with these methods. The methods estimate no covariance, so one is assumed. Madgwick,
+"An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
+Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
+Automatic Control 53(5), 2008; VQF is the unchanged library of its authors. Default gains and parameters
+are those of the authors. Quaternions rotate vectors from body axes to east, north, up. Estimates begin
+with the first sample.
 """
 
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """The assumed uncertainty, since the method estimates no covariance.
+    """Assumed uncertainty of a method that estimates no covariance.
 
     Attributes:
         sigma_deg: standard deviation about each axis.
@@ -48,7 +48,7 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """The gain; its default is the author's value for such a unit.
+    """Gain of the filter; the default is the author's value for such a unit.
 
     Attributes:
         gain: step along the normalized gradient, in rad/s.
@@ -58,7 +58,7 @@ class MadgwickParameters(AssumedParameters):
 
 
 class MahonyParameters(AssumedParameters):
-    """The gains of orientation and bias.
+    """Gains of the corrections of orientation and bias.
 
     Attributes:
         gain: gain of the correction, in 1/s.
@@ -70,7 +70,7 @@ class MahonyParameters(AssumedParameters):
 
 
 class VqfParameters(AssumedParameters):
-    """The time constants of VQF.
+    """Time constants of VQF.
 
     Attributes:
         inclination_s: time constant of the inclination correction.
@@ -98,7 +98,7 @@ class ComplementaryState(NamedTuple):
 
 
 def start(given: Given[Any]) -> tuple[ComplementarySettings, ComplementaryState]:
-    """Start without any knowledge."""
+    """Return the settings, and a state with unknown orientations."""
     values = given.parameters
     settings = ComplementarySettings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
     return settings, ComplementaryState(
@@ -188,8 +188,8 @@ def follow_mahony(
 def unit_vectors(value: Floats) -> Any:
     """Return the directions of specific force and magnetic field, and the turn rate between them.
 
-    If the field is not finite, as between two samples of a slower magnetometer, its direction is zero,
-    which causes no correction.
+    If the field is not finite, as between two samples of a slower magnetometer, its direction is zero
+    and causes no correction.
     """
     rate = value[3], value[4], value[5]
     if not np.isfinite(value[6] + value[7] + value[8]):
@@ -198,7 +198,7 @@ def unit_vectors(value: Floats) -> Any:
 
 
 def can_follow(run: int, force: Any, rate: Any, field: Any, state: ComplementaryState) -> bool:
-    """Test whether a sample has finite force and turn rate and, if it is the first, a field."""
+    """Test whether a sample has a finite force and turn rate and, if it is the first, a finite field."""
     if not np.isfinite(force[0] + force[1] + force[2] + rate[0] + rate[1] + rate[2]):
         return False
     q = state.orientation[run]
@@ -207,7 +207,7 @@ def can_follow(run: int, force: Any, rate: Any, field: Any, state: Complementary
 
 
 def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
-    """Return the current orientation; initialize it by the first sample's force and field."""
+    """Return the current orientation; initialize it from the force and field of the first sample."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
         q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])

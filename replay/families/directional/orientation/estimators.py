@@ -40,10 +40,10 @@ class InertialParameters(Parameters):
 
     Attributes:
         rest_s: duration of the rest at the start; if not set, it is found in the log, up to 20 s.
-        block_s: averaging time of an attitude from accelerometer and magnetometer.
-        attitude_sigma_deg: standard deviation of such an attitude.
+        block_s: averaging time, in s, of an attitude from accelerometer and magnetometer.
+        attitude_sigma_deg: standard deviation of this attitude, in deg.
         drift_sigma_deg: random walk of the gyro's orientation, in deg/sqrt(s).
-        gap_s: time without samples above which there is a gap.
+        gap_s: duration without samples, in s, above which there is a gap.
     """
 
     rest_s: NonNegativeFloat | None = None
@@ -65,7 +65,7 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """Noise and averaging of inertial samples, and how the gyro's bias is treated.
+    """Noise and averaging of inertial samples, and treatment of the gyro's bias.
 
     Attributes:
         unbiased: whether the gyro's mean during the rest is subtracted.
@@ -77,7 +77,7 @@ class GyroParameters(InertialParameters):
 def _follow_all(
     settings: tuple[InertialModel, Advance], messages: Messages, state: Any, results: Results
 ) -> None:
-    """Process the samples of all runs; `value` is specific force, turn rate, magnetic field."""
+    """Process the samples of all runs; `value` has specific force, turn rate and magnetic field."""
     model, advance = settings
     force, rate, field = np.split(messages.value, 3, axis=1)
     samples = InertialSamples(messages.offsets, messages.time_ns, rate, force, field)

@@ -1,13 +1,13 @@
 """Orientation from inertial and magnetic samples by dead reckoning and a Bingham filter.
 
-The module also has the baseline that uses the attitude of every single sample; dead reckoning from the
-gyro only is in `reckoning`.
+The module also has a baseline, the attitude from every single sample. Dead reckoning with the gyro only
+is in `reckoning`.
 
 The filter was made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021).
-The body rests first, which gives the bias of the gyro. Then, for each block of time, the gyro rotates
-the accelerometer and magnetometer samples to the end of the block, where they are averaged, which
-separates gravity from motion. The TRIAD attitude of the averages is a quaternion measurement for the
-filter. Quaternions rotate body vectors into east, north, up.
+The body rests first; the mean of the gyro during the rest is its bias. Then, for each block of time, the
+samples of accelerometer and magnetometer are rotated to the end of the block by the gyro's turn and
+averaged, which separates gravity from motion. The TRIAD attitude of the averages is a quaternion
+measurement for the filter. Quaternions rotate vectors from body axes to east, north, up.
 """
 
 import math
@@ -48,7 +48,7 @@ class InertialModel(NamedTuple):
         rest_s: longest duration of the rest at the start.
         block_s: averaging time of one attitude.
         attitude_sigma_rad: standard deviation of a block's attitude about each axis.
-        drift_sigma_rad: standard deviation of one second's dead reckoning about each axis.
+        drift_sigma_rad: standard deviation, about each axis, of dead reckoning over one second.
         gap_s: time between two samples above which the orientation becomes unknown.
     """
 
@@ -60,7 +60,7 @@ class InertialModel(NamedTuple):
 
 
 class InertialSamples(NamedTuple):
-    """Samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
+    """Samples of many runs in time order; rows offsets[r]:offsets[r + 1] belong to run r.
 
     Attributes:
         offsets: (runs + 1,).
@@ -78,7 +78,7 @@ class InertialSamples(NamedTuple):
 
 
 class InertialState(NamedTuple):
-    """State of the filter between samples, first axis runs.
+    """State of the filter between samples; the first axis is the run.
 
     Attributes:
         time_ns: stamps of the first sample, the last sample and the start of the block, (runs, 3); -1
@@ -87,9 +87,11 @@ class InertialState(NamedTuple):
         rest_samples: number of samples in rate_sum, (runs,).
         axes: axes of the Bingham distribution at the start of the block, (runs, 4, 4).
         concentrations: (runs, 4), all 0 while the orientation is unknown.
-        covariance: covariance of its error as a rotation vector in the body frame, rad^2, (runs, 3, 3).
+        covariance: covariance of the orientation error as a rotation vector in body axes, in rad^2,
+            (runs, 3, 3).
         increment: the rotation since the start of the block, (runs, 4).
-        force: sum over the block, rotated into the frame of the last sample, (runs, 3).
+        force: sum of the accelerometer's samples in the block, rotated into the frame of the last
+            sample, (runs, 3).
         field: the same for the magnetometer, (runs, 3).
         rest_s: duration of the rest if shorter than in the model, (runs,).
     """
@@ -163,7 +165,7 @@ def run_inertial_filter(
 def attitudes(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
 ) -> OrientationEstimates:
-    """Compute the TRIAD attitude of every single sample, taking the whole specific force for gravity.
+    """Compute the TRIAD attitude of every sample, as if the specific force were only gravity.
 
     Args and errors as for `run_inertial_filter`.
     """
@@ -177,7 +179,7 @@ def attitudes(
 def prepared(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
 ) -> tuple[InertialSamples, OrientationEstimates]:
-    """Check samples and return them with the estimates to fill; see `run_inertial_filter`.
+    """Check samples, and return them with the estimates to fill; see `run_inertial_filter`.
 
     Args:
         model: assumptions of the filter.
@@ -226,9 +228,9 @@ def _accumulate(
 ) -> float:
     """Add one sample to the rest and to the block, in place.
 
-    Returns the time (s) since the block's start, or NaN if the sample is not finite and is skipped. If
-    only the field is not finite, as between two samples of a slower magnetometer, the rest of the sample
-    is used.
+    Returns the time in s since the start of the block, or NaN if the sample is skipped because it is not
+    finite. If only the field is not finite, as between two samples of a slower magnetometer, the rest of
+    the sample is used.
     """
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
@@ -274,7 +276,7 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
 
 
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
-    """Predict over the block and update with its attitude, in place."""
+    """Predict over the block and update with its attitude; change the state in place."""
     axes, z = state.axes[run], state.concentrations[run]
     moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
@@ -304,7 +306,7 @@ def _dead_reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Write the orientation after the block's increment, and the covariance that it adds."""
+    """Write the orientation after the increment of the block, and the covariance with its noise."""
     increment, covariance = state.increment[run], estimates.covariance[row]
     compose(state.axes[run, :, 3], increment, estimates.orientation[row])
     covariance[:, :] = state.covariance[run]

@@ -1,7 +1,7 @@
 """Magnetometers with their own topic, for estimators of nine-axis samples.
 
-A field is assigned to the unit's next sample, as if it were part of that message; the samples between
-two fields have no field. So a magnetometer may have any rate.
+A field is assigned to the next sample of the unit, as if it were part of that message; samples between
+two fields have no field. The magnetometer may therefore have any rate.
 """
 
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
 
 
 def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> str:
-    """Find the magnetometer of a unit: in its namespace, or the only one if the log has one unit."""
+    """Find the magnetometer of a unit: in its namespace, or the only one if there is only one unit."""
     own = f"{unit.rpartition('/')[0]}/magnetic_field"
     kind = schemas.MAGNETIC_FIELD.full_name
     there = [name for name, topic in topics.items() if topic.schema_name == kind]
@@ -90,7 +90,7 @@ def _averaging(bound: Bound) -> Bound:
 
 
 def with_means(samples: Ragged) -> Ragged:
-    """Return inertial samples, in time order, with samples of equal stamps replaced by their mean."""
+    """Sort inertial samples by time, and replace samples with equal stamps by their mean."""
     stream, run = samples.stream, run_of_rows(samples.offsets)
     is_new = (np.diff(stream.publish_time_ns, prepend=-1) != 0) | (np.diff(run, prepend=-1) != 0)
     if is_new.all():
@@ -168,7 +168,7 @@ def _joined(block: Block, streams: tuple[str, str], waiting: Floats | None) -> t
     begin = events.offsets[:-1]
     sampled = np.maximum.accumulate(np.where(is_sample, places, -1)) if count else places
     felt = np.maximum.accumulate(np.where(events.topic == of_fields, places, -1)) if count else places
-    before = np.append(-1, sampled[:-1])[:count]  # the sample before each event, of whatever run
+    before = np.append(-1, sampled[:-1])[:count]  # the sample before each event, in any run
     is_new = is_sample & (felt > before) & (felt >= begin[run])
     runs = len(begin)
     waiting = np.full((runs, 3), np.nan) if waiting is None else waiting.copy()

@@ -1,4 +1,4 @@
-"""Dead reckoning from the gyro only, from the attitude of the initial rest on; see `inertial`."""
+"""Dead reckoning with the gyro only, starting at the attitude of the initial rest; see `inertial`."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ NS = 1e-9
 
 
 class ReckoningState(NamedTuple):
-    """State of dead reckoning between samples, first axis runs.
+    """State of dead reckoning between samples; the first axis is the run.
 
     Attributes:
         orientation: (runs, 4), zero until the rest is over, NaN after a gap.
@@ -62,7 +62,7 @@ def run_dead_reckoning(
     *,
     unbiased: bool,
 ) -> tuple[ReckoningState, OrientationEstimates]:
-    """Integrate the gyro from the attitude of the rest on, minus its mean during the rest if `unbiased`.
+    """Integrate the gyro from the attitude at rest; if `unbiased`, subtract its mean during the rest.
 
     There are no estimates before the end of the rest or after a gap. Args and errors as for
     `run_inertial_filter`.
@@ -94,7 +94,7 @@ def _reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Process one sample; skip it if force or turn rate is not finite, or only its field."""
+    """Process one sample; skip it if force or rate is not finite, skip its field if only that is not."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
     if not all_finite(rate, force, force):

@@ -26,10 +26,10 @@ from fuselog.replay.families.directional.orientation.magnetometers import with_m
 from fuselog.replay.inference.run.first_messages import Fact, started
 
 REST = "rest"  # the key under which `start` finds the samples of the rest
-LONGEST_S, LEAST_S = 20.0, 1.0  # more is not needed; less is too short to estimate a bias
+LONGEST_S, LEAST_S = 20.0, 1.0  # longest and shortest rest to use; a shorter one cannot determine a bias
 WINDOW_S = 0.25
-SIGMAS = 6.0  # of noise, above which a window's mean counts as different
-LEAST_RATE_RADPS, LEAST_ANGLE_RAD = 0.02, np.radians(2.0)  # below this there is no motion
+SIGMAS = 6.0  # of the noise; above this, the mean of a window counts as different
+LEAST_RATE_RADPS, LEAST_ANGLE_RAD = 0.02, np.radians(2.0)  # smaller values are not motion
 LARGEST_BIAS_RADPS = 0.35
 
 
@@ -51,7 +51,7 @@ def resting(stream: Stream) -> int:
             moves |= _differing(values, of_window, len(moves), is_rate=is_rate)
     if not moves.any():
         return len(stream)
-    last = int(np.argmax(moves)) - 1  # the motion may begin slowly in this window
+    last = int(np.argmax(moves)) - 1  # the motion may already begin slowly in this window
     return int(np.count_nonzero(of_window < last))
 
 
@@ -68,7 +68,7 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
     with np.errstate(invalid="ignore", divide="ignore"):
         mean, usual = sums / sizes[:, None], of_before / before[:, None]
         within = np.maximum(squares / sizes[:, None] - mean**2, 0.0).sum(axis=1)
-        # the noise at rest is that of the quietest window so far
+        # the noise at rest is the noise of the quietest window so far
         variance = np.minimum.accumulate(np.where(sizes > 1, within, np.inf))
         noise = SIGMAS * np.sqrt(variance * (1.0 / sizes + 1.0 / before))
         apart = np.linalg.norm(mean - usual, axis=1)
@@ -137,7 +137,7 @@ def _first_ns(samples: Stream) -> int:
 
 
 def rests_of(given: Mapping[str, Ragged], runs: int) -> Floats:
-    """Return the rest's duration of every run (runs,), in s; infinite if it was not detected."""
+    """Return the duration of the rest in every run (runs,), in s; infinite if it was not detected."""
     if REST not in given:
         return np.full(runs, np.inf)
     rest = given[REST]

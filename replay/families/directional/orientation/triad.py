@@ -1,4 +1,4 @@
-"""Rotations of vectors and quaternions, and matrices that orientation filters start from."""
+"""Rotations of vectors and quaternions, and initial matrices of orientation filters."""
 
 import math
 
@@ -23,8 +23,8 @@ def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
     """Write isotropic concentrations about the identity, in the order of a quaternion's components.
 
     Args:
-        sigma_rad: standard deviation of a turn about each axis.
-        z: (4,), overwritten; the first is 0, the mode's.
+        sigma_rad: standard deviation of a rotation about each axis.
+        z: (4,), overwritten; the first, that of the mode, is 0.
     """
     z[:] = -2.0 / sigma_rad**2
     z[0] = 0.0

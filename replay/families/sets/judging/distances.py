@@ -26,7 +26,7 @@ class Gospa(NamedTuple):
 
 
 def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 1.0) -> float:
-    """Compute OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the points' unit.
+    """Compute the OSPA of point sets, from 0 to the cutoff, in the unit of the points.
 
     Raises BadInput as `gospa` does.
 
@@ -34,7 +34,7 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
         estimates: (n, d).
         truths: (m, d).
         cutoff: upper limit of a distance.
-        order: of the mean, at least 1.
+        order: order of the mean, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     most = max(costs.estimates, costs.truths)
@@ -47,10 +47,10 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
 def gospa(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0, alpha: float = 2.0
 ) -> Gospa:
-    """Compute GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
+    """Compute the GOSPA of point sets, and its parts to the power of the order.
 
-    With alpha = 2, points that are as far apart as the cutoff are not paired: they count as one missed
-    and one false point. With another alpha only the surplus of one set over the other is missed or
+    With alpha = 2, points are not paired if their distance reaches the cutoff: they count as one missed
+    and one false point. With any other alpha, only the surplus points of the larger set are missed or
     false.
 
     Raises BadInput if the points are not finite or have different dimensions, the cutoff is not
@@ -82,7 +82,7 @@ def gospa(
 def gospa_pairs(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0
 ) -> tuple[Integers, Integers]:
-    """Find the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
+    """Find the pairs of GOSPA with alpha = 2, as indices (m,) of estimates and of truths.
 
     Raises BadInput as `gospa` does.
 
@@ -108,7 +108,7 @@ class _Costs(NamedTuple):
 
 
 def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
-    """Form the greatest number of pairs at the least cost."""
+    """Form as many pairs as possible with the smallest total cost."""
     from scipy.optimize import linear_sum_assignment  # slow to import
     from scipy.spatial.distance import cdist
 

@@ -1,7 +1,8 @@
 """Comparison of estimated sets with true ones, step by step: OSPA, and GOSPA with its parts.
 
 A set estimate is a pair of streams: its size, and its elements (see `schemas.ESTIMATE_SIZE`). The true
-set at a time consists of all targets with a truth that has the estimate's components and is known then.
+set at a given time consists of all targets whose truths have the components of the estimate and are
+known at this time.
 """
 
 from abc import ABC
@@ -31,11 +32,11 @@ ORDER = 2.0
 
 
 class SetErrors(NamedTuple):
-    """Errors of a set estimate over an ensemble: one row (n,) per run and step.
+    """Errors of a set estimate over an ensemble, with one row (n,) per run and step.
 
     Attributes:
         estimator: the estimator's label.
-        case: what it estimates; may be empty.
+        case: name of the estimated quantity; may be empty.
         run, time_ns, elapsed_s: the number of the run, the stamp, and the time since the run's epoch.
         ospa, gospa: the distances, in m.
         localisation, missed, false: GOSPA's parts, in m^2.
@@ -64,11 +65,11 @@ def set_errors(
     gap_limit_s: float = 0.2,
     first_run: int = 0,
 ) -> dict[str, SetErrors]:
-    """Judge every set estimate among a replay's outputs, or a block of them, by topic.
+    """Judge every set estimate in the outputs of a replay, or in a block of them, by topic.
 
     Targets are transformed into the frame of the estimates. Estimates are left out if their targets have
-    no truths in some run, or are in a frame without a known pose (see `unjudged_sets`). `first_run` is
-    the number of the first run.
+    no truths in some run, or if their frame has no known pose (see `unjudged_sets`). `first_run` is the
+    number of the first run.
     """
     found = {}
     for topic, sizes in outputs.items():
@@ -105,7 +106,7 @@ def targets_in(source: Source, components: Sequence[str]) -> list[str]:
 
 
 def unjudged_sets(sizes: Stream, sources: Sequence[Source]) -> str:
-    """Explain why sets cannot be compared with the targets of some run; return "" if they can."""
+    """Explain why sets cannot be compared with the targets of a run; return "" if they can."""
     reasons = (
         not_comparable(sizes.metadata, targets_in(source, sizes.components), source.topics)
         for source in sources
@@ -122,7 +123,7 @@ def _judge_run(
     cutoff_m: float,
     gap_limit_s: float,
 ) -> Floats:
-    """Compute rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
+    """Compute OSPA, GOSPA, its three parts, and the estimated and true numbers (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
     frame, at_ns = frame_of(sizes.metadata), sizes.publish_time_ns
@@ -161,7 +162,7 @@ class SetsJudge(KindJudge):
 
 
 class AnySets(ABC):  # noqa: B024  # named tuples have no base of their own
-    """Anything that the metrics of sets judge: sets of targets, and regions of one."""
+    """Base of the results that the metrics of sets judge: sets of targets, and regions of one target."""
 
 
 AnySets.register(SetErrors)

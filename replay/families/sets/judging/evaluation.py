@@ -20,11 +20,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class JudgedSets:
-    """The sets of one estimator and case, a row per frame.
+    """Sets of one estimator and case, with one row per frame.
 
-    `inside` marks sets that contain the truth, if it is `known`; `in_arena` marks frames at which the
-    robot is in its assumed arena; `bound_holds` marks frames whose relative bearings all keep their
-    bound. An empty set has area 0.
+    `inside` marks sets that contain the truth, if it is `known`; `in_arena` marks frames in which the
+    robot is in its assumed arena; `bound_holds` marks frames in which the errors of all relative
+    bearings are within the bound. An empty set has area 0.
     """
 
     estimator: str
@@ -40,12 +40,12 @@ class JudgedSets:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although bounds and arena hold, 0 for guaranteed sets."""
+        """Count the sets that miss the truth although bounds and arena hold; 0 for guaranteed sets."""
         return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
 
     @property
     def outside_arena(self) -> int:
-        """Count how often the robot was outside its assumed arena, so that nothing is guaranteed."""
+        """Count the frames without a guarantee because the robot is outside its assumed arena."""
         return int((self.known & ~self.in_arena).sum())
 
 
@@ -92,7 +92,7 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Test whether the positions are in each frame's arena, and keep its bound: (2, frames).
+    """Test whether the positions are in each frame's arena and satisfy its bound: (2, frames).
 
     Args:
         sizes: the sets of one run, a message per frame.

@@ -1,4 +1,4 @@
-"""Evaluation of guaranteed sets over time: if their premises hold, they must contain the robot."""
+"""Evaluation of guaranteed sets over time, which must contain the robot if the bounds hold."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,17 +33,18 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 @dataclass(frozen=True)
 class JudgedFilter:
-    """The sets of one robot over time, a row per frame of all runs.
+    """Sets of one robot over time, with one row per frame of all runs.
 
     Attributes:
         sets: area, and whether the truth is inside.
         pose: the true pose (n, 3), NaN if it is unknown.
-        frame_holds: whether bearings and arena keep their bounds at the truth.
-        odometry_holds: whether odometry kept its bounds since the set from which this one was moved.
+        frame_holds: whether bearings and arena satisfy their bounds at the truth.
+        odometry_holds: whether the odometry has kept its bounds since the set from which this one was
+            moved.
         guaranteed: whether the set must contain the truth: an earlier set contained it, and all bounds
             have held since then.
-        growth: factor by which the form L = 8 enlarges sets.
-        finding: indices in `frames.FINDINGS`, -1 if nothing was wrong.
+        growth: factor by which the form L = 8 enlarges the set.
+        finding: indices in `frames.FINDINGS`, or -1 without a finding.
     """
 
     sets: JudgedSets
@@ -56,7 +57,7 @@ class JudgedFilter:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although they must contain it, 0 for guaranteed sets."""
+        """Count the sets that miss the truth although they must contain it; 0 for guaranteed sets."""
         return int((self.guaranteed & ~self.sets.inside).sum())
 
 
@@ -91,7 +92,7 @@ def judge_filter(
 def _judge(
     steps: Stream, diagnosed: Stream, source: Source, inside: Booleans, gap_limit_s: float
 ) -> tuple[NDArray, ...]:
-    """Compute the columns of JudgedFilter for one run, from `pose` on."""
+    """Compute the columns of JudgedFilter for one run, starting with `pose`."""
     pose = reference(Truths(source), steps.metadata["truth"], POSE, steps, gap_limit_s)
     stamps = steps.publish_time_ns
     anchor = np.searchsorted(stamps, steps["anchor_time_ns"])
@@ -131,13 +132,13 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Compute errors (n, 2) of displacements (m) and turns (rad) between true poses.
+    """Compute errors (n, 2) of the odometry's displacements (m) and turns (rad) between true poses.
 
     Args:
-        odometry: of the robot.
-        first_ns: (n,), beginning of each span.
+        odometry: odometry of the robot.
+        first_ns: (n,), start of each span.
         last_ns: (n,), end of each span.
-        first: (n, 3), true pose at the beginning.
+        first: (n, 3), true pose at the start.
         last: (n, 3), true pose at the end.
     """
     true = relative_pose(first, last)
@@ -158,7 +159,7 @@ def bearing_errors(seen: Bearings, pose: Floats) -> Floats:
 
 
 def _bearings_hold(steps: Stream, source: Source, pose: Floats, bound_rad: float) -> Booleans:
-    """Test whether the single bearings of each frame keep their bound."""
+    """Test whether the errors of the single bearings of each frame are within their bound."""
     measured = steps.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     row_of = {time_ns: row for row, time_ns in enumerate(steps.publish_time_ns.tolist())}

@@ -18,7 +18,7 @@ PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 
 class Regions(NamedTuple):
-    """The regions (n,) of one estimator and case, of an ensemble or a block of it.
+    """Regions (n,) of one estimator and case, for an ensemble or a block of it.
 
     `holds` marks regions that contain the truth, if it is `known`; an empty region has area 0.
     """
@@ -33,7 +33,7 @@ class Regions(NamedTuple):
 def regions_of(
     outputs: Mapping[str, Ragged], truths: Sequence[Truths], gap_limit_s: float
 ) -> dict[str, Regions]:
-    """Judge the regions among a replay's outputs, or a block of them, by the topic of their sizes."""
+    """Judge the regions in the outputs of a replay, or in a block of them, by the topic of sizes."""
     found = {}
     for topic, sizes in outputs.items():
         base = topic.removesuffix("size")
@@ -78,7 +78,7 @@ def areas_of(regions: Sequence[Sequence[Floats]]) -> Floats:
 
 
 def inside(regions: Sequence[Sequence[Floats]], places: Floats) -> NDArray[np.bool_]:
-    """Test for each region whether it contains its position.
+    """Test whether each region contains its position.
 
     Args:
         regions: n lists of rings, (vertices, 2) in m each.

@@ -1,4 +1,4 @@
-"""Regions from bounded errors: exact sets, pseudo-ellipsoids, sets that move.
+"""Regions from bounded errors: exact sets, pseudo-ellipsoids and moving sets.
 
 Begin with `feasible_sets`.
 """

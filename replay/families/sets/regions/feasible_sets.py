@@ -1,8 +1,9 @@
-"""Exact sets of positions that bounded relative bearings allow: areas, boxes, borders.
+"""Exact sets of the positions that agree with bounded relative bearings: areas, boxes, borders.
 
 Briechle, Hanebeck, Localization of a Mobile Robot Using Relative Bearing Measurements (2004), (2)-(4),
 (20), (21). Every set is an intersection of generalised discs a |x|^2 + b'x + c <= 0: discs, their
-complements, half-planes. With |b|^2 - 4 a c = 1 the left side is the distance near the border.
+complements, half-planes. With |b|^2 - 4 a c = 1, the left side approximates the distance from the
+border.
 """
 
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from fuselog.replay.engine.arrays import Floats, Integers
 class Pairs(NamedTuple):
     """Relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), and bound.
 
-    angle = bearing of first - bearing of second, wrong by at most `bound_rad`.
+    angle = bearing of first - bearing of second, with an error of at most `bound_rad`.
     """
 
     first: Floats
@@ -48,16 +49,16 @@ class Arcs(NamedTuple):
     length: Floats
 
     def at(self, distance: Floats) -> Floats:
-        """Compute the points at `distance` (m,) along the arcs."""
+        """Compute the points (m, 2) at `distance` (m,) along the arcs."""
         pose = (*self.start.T, self.heading_rad)
         return np.stack(drive(pose, (1.0, self.curvature), distance)[:2], axis=-1)
 
 
 def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_rad: float) -> Pairs:
-    """Check the relative bearings of a frame.
+    """Make the relative bearings of a frame after checking them.
 
     Raises BadInput if shapes differ, a number is not finite, two landmarks coincide, or the bound is not
-    above 0 and below pi / 2 (beyond that the set is not an intersection of discs).
+    above 0 and below pi / 2 (with a larger bound, the set is not an intersection of discs).
 
     Args:
         first: (n, 2), a landmark of each pair, in m.
@@ -100,7 +101,7 @@ def arena_around(points: ArrayLike, margin_m: float) -> Arena:
 
 
 def excess_rad(pairs: Pairs, points: Floats) -> Floats:
-    """Compute the excess of each pair's error over its bound at points: (..., n), feasible where <= 0.
+    """Compute the excess of each pair's error over its bound at points; it is <= 0 in the set.
 
     This is the exact membership test, (4). It is NaN at a landmark itself, where the angle is undefined.
 
@@ -120,11 +121,11 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
 
 
 def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
-    """Compute the discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
+    """Compute the coefficients a, b_x, b_y, c (n, 4) of the discs D(g) of (20), (21) for angles g.
 
     In D(g), sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
-    chord, sees the chord at the angle g. The sign of (20) requires Delta_perp to be turned by +90
-    degrees, which the paper does not state. A sine of zero gives the half-plane.
+    chord, subtends the chord at the angle g. The sign of (20) requires that Delta_perp is rotated by +90
+    degrees, which the paper does not state. If the sine is zero, the disc is a half-plane.
 
     Args:
         pairs: the n relative bearings of a frame.
@@ -142,10 +143,10 @@ def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
 
 
 def discs(pairs: Pairs) -> Floats:
-    """Compute the two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
+    """Compute two generalised discs per pair (n, 2, 4); their intersection is the exact set.
 
-    With g1 = angle - bound and g2 = angle + bound, the set is D(g1) without D(g2). That is a lune, a
-    lens if g2 passes pi, and the outside of two discs if g1 passes 0; no case needs its own formula.
+    With g1 = angle - bound and g2 = angle + bound, the set is D(g1) without D(g2). This is a lune, or a
+    lens if g2 exceeds pi, or the outside of two discs if g1 is below 0; all cases use the same formula.
     """
     lower = circles(pairs, pairs.angle_rad - pairs.bound_rad)
     upper = circles(pairs, pairs.angle_rad + pairs.bound_rad)
@@ -174,17 +175,17 @@ def evaluate(constraints: Floats, points: Floats) -> Floats:
 
 
 def exact_set(pairs: Pairs, arena: Arena) -> Arcs:
-    """Compute the exact feasible set (4) of a frame inside an arena; no arcs if it is empty."""
+    """Compute the exact feasible set (4) of a frame inside an arena; an empty set has no arcs."""
     constraints = np.concatenate([discs(pairs).reshape(-1, 4), half_planes(arena)])
     return intersection(constraints, arena)
 
 
 def intersection(constraints: Floats, arena: Arena) -> Arcs:
-    """Compute the border of an intersection of generalised discs, the arena's sides among them.
+    """Compute the border of an intersection of generalised discs and the arena.
 
     Args:
         constraints: (k, 4), a, b_x, b_y, c.
-        arena: whose sides are among the constraints.
+        arena: arena whose sides are among the constraints.
     """
     pieces = _cut(constraints, arena)
     middle = pieces.at(0.5 * pieces.length)
@@ -192,7 +193,7 @@ def intersection(constraints: Floats, arena: Arena) -> Arcs:
     owner = np.repeat(np.arange(len(constraints)), len(pieces.length) // len(constraints))
     value = evaluate(constraints, middle)
     other = np.arange(len(constraints))
-    # a border that two constraints share belongs to the first of them
+    # if two constraints share a border, it belongs to the first
     good = (value < -tolerance) | ((value <= tolerance) & (other > owner[:, None]))
     good[np.arange(len(owner)), owner] = True
     kept = good.all(axis=1) & (pieces.length > tolerance)
@@ -202,9 +203,10 @@ def intersection(constraints: Floats, arena: Arena) -> Arcs:
 def _cut(constraints: Floats, arena: Arena) -> Arcs:
     """Cut each circle at its intersections with all others, into 2 k + 1 pieces.
 
-    A circle is traversed from its point nearest the arena's centre. With tau = tan(h s) / h, where h is
-    half its curvature and s the distance, another constraint along it is a quadratic in tau, for discs
-    and lines alike. Its own constraint is zero everywhere, so roots of it would only be rounding errors.
+    A circle is traversed from its point nearest to the centre of the arena. With tau = tan(h s) / h,
+    where h is half the curvature and s the distance along the circle, any other constraint is quadratic
+    in tau, for discs and for lines. The circle's own constraint is zero everywhere, so its roots would
+    only be rounding errors.
     """
     centre = 0.5 * (arena.low + arena.high)
     reach = 4.0 * float(np.linalg.norm(arena.high - arena.low))
@@ -239,7 +241,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
-    """Find both real roots (..., 2) of quadratics, without cancellation; NaN or infinite if missing."""
+    """Find the real roots (..., 2) of quadratics without cancellation; NaN or infinite if missing."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(linear**2 - 4.0 * quadratic * constant)
         half = -0.5 * (linear + np.where(linear < 0, -root, root))
@@ -247,7 +249,7 @@ def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
 
 
 def area(border: Arcs) -> float:
-    """Compute the area inside by Green's theorem: chords and circular segments."""
+    """Compute the area inside by Green's theorem, from chords and circular segments."""
     end = border.at(border.length)
     chords = border.start[:, 0] * end[:, 1] - border.start[:, 1] * end[:, 0]
     turn = border.curvature * border.length
@@ -264,7 +266,7 @@ def box(border: Arcs) -> Arena:
     points = [border.start, border.at(border.length)]
     turn = border.curvature * border.length
     for quarter in range(4):
-        # the distance after which the arc is parallel to an axis, where a coordinate is extreme
+        # the distance at which the arc is parallel to an axis and a coordinate has an extremum
         wanted = quarter * 0.5 * np.pi - border.heading_rad
         ahead = np.where(turn < 0, -((-wanted) % (2 * np.pi)), wanted % (2 * np.pi))
         reached = np.abs(ahead) <= np.abs(turn)
@@ -275,10 +277,10 @@ def box(border: Arcs) -> Arena:
 
 
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
-    """Compute closed polygons (n, 2) around the set, which is on their left.
+    """Compute closed polygons (n, 2) around the set; the set is on their left.
 
-    The polygons contain the set: vertices are on concave arcs and outside convex ones. Together they are
-    larger than the set by at most the tolerance, in units of its area.
+    The polygons contain the set: vertices are on concave arcs and outside convex ones. Their area
+    exceeds that of the set by at most the relative tolerance.
     """
     tolerance_m = relative_tolerance * max(area(border), 1e-12) / max(border.length.sum(), 1e-12)
     end = border.at(border.length)
@@ -307,7 +309,7 @@ def signed_area(ring: Floats) -> float:
 
 
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """Compute vertices along an arc without its end; tangents meet outside convex arcs."""
+    """Compute vertices along an arc without its end; outside convex arcs, tangents meet there."""
     length, curvature = border.length[index], border.curvature[index]
     pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
     pieces = max(pieces, int(np.ceil(abs(length * curvature))))
@@ -327,8 +329,8 @@ def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
 def to_blame(pairs: Pairs, arena: Arena) -> Integers:
     """Find the pairs that contradict the others, worst first; none if the exact set is not empty.
 
-    They are the pairs that are violated at the point in the arena with the fewest violations. Among all
-    points where circles intersect, this is the one with the least excess.
+    These are the pairs that are violated at the point in the arena with the fewest violations. The point
+    is the intersection of two circles with the smallest excess.
     """
     if len(exact_set(pairs, arena).length):
         return np.empty(0, np.int64)

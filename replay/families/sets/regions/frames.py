@@ -26,7 +26,7 @@ NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 
 
 class Known(NamedTuple):
-    """Bound of the bearings, and where the robot can be.
+    """Bound of the bearings, and limits on the robot's position.
 
     `arena_m` is (low x, low y, high x, high y), or None if the arena follows from the sensor's maximum
     range. `maximum_range_m` is None if it is the longest measured range.
@@ -48,7 +48,7 @@ class Known(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
+    """Relative bearings of one stamp, with the numbers (n, 2) of their landmarks and the arena."""
 
     time_ns: int
     pairs: Pairs
@@ -57,10 +57,11 @@ class Frame(NamedTuple):
 
 
 def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
-    """Yield the frames of a bearing, range-bearing or relative-bearing stream with enough landmarks.
+    """Yield the frames that have enough landmarks, from a stream of bearings of any type.
 
-    Landmarks that are not on the map are left out, and so are pairs of one landmark seen twice. Raises
-    BadInput if the distance between the robot and the landmarks that it sees is not bounded.
+    The stream has bearings, ranges and bearings, or relative bearings. Landmarks that are not on the map
+    and pairs of the same landmark are left out. Raises BadInput if the distance between the robot and
+    the landmarks that it sees is not bounded.
     """
     places_m = read_vectors(landmarks, "position_m", PLANE)
     place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
@@ -86,7 +87,7 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
 
 
 def _maximum_range_m(stream: Stream, known: Known) -> float:
-    """Return the sensor's range as stated, or else the longest range that it measured."""
+    """Return the stated range of the sensor or, without one, the longest range that it measured."""
     if known.maximum_range_m is not None:
         return known.maximum_range_m
     if "range_m" not in stream.columns:
@@ -103,9 +104,9 @@ def _arena(corners_m: tuple[float, ...]) -> Arena:
 
 
 def _within(places: Floats, range_m: float) -> Arena:
-    """Return the rectangle of positions no farther than a range from any landmark (n, 2).
+    """Return the rectangle around positions within a range of all landmarks (n, 2).
 
-    If there are no such positions, a landmark is misidentified; then the rectangle contains all
+    If there are no such positions, a landmark was misidentified; the rectangle then contains all
     positions within the range of at least one landmark.
     """
     low, high = places.max(axis=0) - range_m, places.min(axis=0) + range_m
@@ -130,7 +131,7 @@ STATED = (*ERRORS, "bearing_bound_rad")
 
 
 class Bearings(NamedTuple):
-    """The bearings (n,) of one stamp, and the positions (n, 2) of their landmarks."""
+    """Bearings (n,) of one stamp, and the positions (n, 2) of their landmarks."""
 
     place_m: Floats
     bearing_rad: Floats
@@ -139,7 +140,7 @@ class Bearings(NamedTuple):
 def frames_with_bearings(
     stream: Stream, landmarks: Stream, known: Known
 ) -> Iterable[tuple[Frame, Bearings]]:
-    """Yield a stream's frames and the single bearings of each; a relative-bearing stream has none."""
+    """Yield frames and their single bearings; a stream of relative bearings has no single bearings."""
     places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
     for frame in frames(stream, landmarks, known):
         bearings = Bearings(np.empty((0, 2)), np.empty(0))

@@ -1,8 +1,8 @@
 """Motion of sets of positions and headings that contain a robot, by odometry with bounded errors.
 
-A position set is a shapely geometry, which may have several pieces; headings are in one interval. Every
-computed set contains the exact result: disc offsets are polygons around it, and a margin covers rounding
-errors.
+A set of positions is a shapely geometry, which may have several pieces; a set of headings is one
+interval. Every computed set contains the exact result: offsets by a disc are polygons around the exact
+offset, and a margin covers rounding errors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ else:
     shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
 
 ROUNDING_M = 1e-7
-ON_A_LINE_M = 1e-10  # a vertex this near to the line between its neighbours is removed
+ON_A_LINE_M = 1e-10  # a vertex is removed if it is closer than this to the line between its neighbours
 # Segments of an offset per quarter circle. GEOS rounds their number, so that a segment may span 1.5
 # times the angle, and simplifies its input by up to 1 % of the distance, so offsets are widened.
 QUARTER_SEGMENTS = 8
@@ -46,7 +46,7 @@ ALL_HEADINGS = Headings(0.0, np.pi)
 
 
 class Odometry(NamedTuple):
-    """Poses (n, 3) by odometry only, and velocities (n, 2) from their stamps on."""
+    """Poses (n, 3) by odometry only, and velocities (n, 2) that apply from each stamp to the next."""
 
     time_ns: Integers
     pose: Floats
@@ -60,18 +60,18 @@ class Odometry(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """Bound of the error of odometry over a span: `offset` + `rate` times its length in s."""
+    """Bound of the error of odometry over a span of time: `offset` + `rate` × length in s."""
 
     offset: float
     rate: float
 
     def over(self, span_s: Any) -> Any:
-        """Compute the largest error over a span, or over each of several."""
+        """Compute the largest error over a span, or over each of several spans."""
         return self.offset + self.rate * span_s
 
 
 class Motion(NamedTuple):
-    """Motion of a robot from one stamp to another, relative to its pose at the first.
+    """Motion of a robot between two stamps, relative to its pose at the first.
 
     The true displacement is within `position_error_m` of `displacement_m` (2,), and the true turn within
     `turn_error_rad` of `turn_rad`.
@@ -102,11 +102,11 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
 
 def relative_pose(first: Floats, second: Floats) -> Floats:
-    """Compute the second of two poses relative to the first: displacement and turn, not wrapped.
+    """Compute a second pose relative to a first one: displacement and turn, not wrapped.
 
     Args:
         first: (..., 3), x, y in m and heading in rad.
-        second: (..., 3), likewise.
+        second: (..., 3), in the same units.
 
     Returns:
         (..., 3), in the axes of the first.
@@ -144,7 +144,7 @@ def all_headings_of(one: Headings, other: Headings) -> Headings:
 
 
 def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
-    """Compute headings after a motion, or before it with the direction -1."""
+    """Compute headings after a motion or, with direction -1, before it."""
     middle = float(wrap_angle(headings.middle_rad + direction * motion.turn_rad))
     return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
 
@@ -152,10 +152,11 @@ def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
 def moved(
     places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
 ) -> shapely.Geometry:
-    """Compute the positions of a robot after a motion, or before it with the direction -1.
+    """Compute the positions of a robot after a motion or, with direction -1, before it.
 
-    `headings` are those before the motion. All their displacements are on an arc, which is contained in
-    a disc; if they span half a circle or more, the disc is around the origin.
+    `headings` apply before the motion. The displacements for all of them are on an arc, which is
+    contained in a disc; if the headings span half a circle or more, the centre of the disc is the
+    origin.
     """
     half = min(headings.half_rad, 0.5 * np.pi)
     length = float(np.hypot(*motion.displacement_m))
@@ -170,7 +171,7 @@ def moved(
 
 
 def directions(places: shapely.Geometry, target: Floats) -> Headings:
-    """Compute the directions of a point from a set; all directions if the point is in its hull.
+    """Compute the directions from a set to a point; all directions if the point is in its hull.
 
     Args:
         places: the set.
@@ -197,7 +198,7 @@ def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
 
 
 def corners_of(places: shapely.Geometry) -> shapely.Geometry:
-    """Remove a set's vertices that are on straight edges, whose presence depends on rounding."""
+    """Remove vertices on straight edges of a set, because their presence depends on rounding."""
     return shapely.simplify(places, ON_A_LINE_M)
 
 
@@ -216,9 +217,9 @@ def to_rings(places: shapely.Geometry) -> list[Floats]:
 def within_l8(places: shapely.Geometry) -> shapely.Geometry:
     """Enclose a set in a pseudo-ellipsoid with L = 8, as a polygon.
 
-    It is the level set of the smallest ellipsoid around the monomials T of the set's points (with the
-    weights of Titterington, 1976, which need no step length), enlarged until it contains the set. A set
-    that is too thin for the grid of the border is returned as it is.
+    The result is the level set of the smallest ellipsoid around the monomials T of the set's points,
+    enlarged until it contains the set. The ellipsoid has the weights of Titterington, 1976, which need
+    no step length. A set that is too thin for the grid of the border is returned without a change.
     """
     low, high = np.reshape(places.bounds, (2, 2))
     origin, scale_m = 0.5 * (low + high), 0.5 * float(np.max(high - low))

@@ -1,10 +1,10 @@
-"""Pseudo-ellipsoids: position sets that are ellipsoids in a space of monomials.
+"""Pseudo-ellipsoids: sets of positions that are ellipsoids in a space of monomials.
 
-Briechle, Hanebeck (2004), III and IV. For each of its two generalised discs, a pair's exact set is
-between two circles: with u = (z - centre) / half width, |u| <= 1, and u is linear in the monomials
-[x, y, x^2, y^2] of L = 4. With L = 8, [x, y, x^2, y^2, xy, x s, y s, s^2] and s = x^2 + y^2, u^2 is
-linear as well, and the parabola (u, u^2) is inside an ellipse. Every fused set is {sum of weighted
-slacks >= 0}.
+Briechle, Hanebeck (2004), III and IV. For each of the two generalised discs of a pair, the exact set is
+between two circles: with u = (z - centre) / half width, |u| <= 1, and u is linear in the monomials [x,
+y, x^2, y^2] of L = 4. With L = 8, [x, y, x^2, y^2, xy, x s, y s, s^2] and s = x^2 + y^2, u^2 is linear
+as well, and the parabola (u, u^2) is inside an ellipse. Every fused set is {sum of weighted slacks >=
+0}.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ ROUNDING = 1e-11
 class PseudoEllipsoid(NamedTuple):
     """The set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
 
-    Zero information, the prior of V, is all zeros; a huge covariance would only lose digits.
+    Zero information, the prior of V, is represented by zeros; a huge covariance would lose digits.
     """
 
     information: Floats
@@ -39,7 +39,7 @@ class PseudoEllipsoid(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
+    """Nodes x (n,) and y (n,), and points (n, n, 2), whose rows are along y."""
 
     x: Floats
     y: Floats
@@ -47,7 +47,7 @@ class Grid(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Border of a set as closed polygons (n, 2), with holes the other way round, and the area."""
+    """Border of a set as closed polygons (n, 2), with holes in the opposite direction, and its area."""
 
     rings: list[Floats]
     area_m2: float
@@ -69,10 +69,10 @@ def monomials(points: Floats, order: Order) -> Floats:
 
 
 def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
-    """Compute rings u = a |x|^2 + b'x + c, |u| <= 1 on each pair's exact set: (2 n, 4), two per pair.
+    """Compute two rings u = a |x|^2 + b'x + c per pair (2 n, 4), with |u| <= 1 on the exact set.
 
     If the set is bounded, these are the rings of (22), (23), clamped at a centre in the set; (23) omits
-    the offset -d^2/4 of its interval. Otherwise the arena bounds the values.
+    the offset -d^2/4 of its interval. Otherwise, the arena limits the values.
     """
     flipped = pairs.angle_rad < 0
     first = np.where(flipped[:, None], pairs.second, pairs.first)
@@ -89,10 +89,10 @@ def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
 
 
 def _least_on_axis(pairs: Pairs) -> Floats:
-    """Find the least values (n, 2) of both discs over bounded sets, on the bisector of the chord.
+    """Find the smallest values (n, 2) of both discs over bounded sets, on the bisector of the chord.
 
-    At height t over the chord of length c, f_g = (sin g (t^2 - c^2/4) - cos g c t) / c; the set spans
-    the heights c/2 cot(g/2) of both circles' tops.
+    At height t above the chord of length c, f_g = (sin g (t^2 - c^2/4) - cos g c t) / c; the set extends
+    between the tops of both circles, at the heights c/2 cot(g/2).
     """
     angle = pairs.angle_rad[:, None] + pairs.bound_rad * np.array([-1.0, 1.0])
     chord = np.linalg.norm(pairs.second - pairs.first, axis=1)[:, None]
@@ -159,12 +159,12 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """Fuse a ring by (18) in information form: one sum per parameter.
+    """Fuse a ring by (18) in information form, which is one sum per parameter.
 
     Args:
-        prior: the set before.
+        prior: the set before the fusion.
         ring: coefficients of u, (4,), in the prior's scaled positions.
-        weight: of the ring, 0 or more.
+        weight: weight of the ring, 0 or more.
     """
     rows, value, size = measurement(ring, order_of(prior))
     weighted = weight * np.linalg.inv(size)
@@ -196,7 +196,7 @@ def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
 
 
 def most_room(ellipsoid: PseudoEllipsoid) -> float:
-    """Compute the greatest fused slack over all monomials, s of (7), at least its rounding error.
+    """Compute the greatest fused slack over all monomials, s of (7), or its rounding error if greater.
 
     Raises BadInput if it is negative beyond rounding: the sets have no common point.
     """
@@ -217,9 +217,9 @@ def fit(
         pairs: the frame.
         arena: rectangle that is known to contain the robot.
         order: the number L of monomials, 4 or 8.
-        weighting: "area" minimises the set's area at every step, "batch" over all weights together,
-            "determinant" the determinant of C^e, from a wide prior; "equal" uses equal weights. The
-            paper names "area" without a procedure.
+        weighting: "area" minimises the area of the set at every step, "batch" over all weights together;
+            "determinant" minimises the determinant of C^e, starting from a wide prior; "equal" uses
+            equal weights. The paper mentions "area" without a procedure.
         sweeps: number of times that the rings are fused; fusing a set repeatedly is valid.
 
     Returns the set, which contains the exact set for any weights. Raises BadInput if the filter finds
@@ -311,11 +311,11 @@ def _fused(rings: Floats, weights: Floats, points: Floats, order: Order) -> Floa
 
 
 def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllipsoid:
-    """Fuse by (7), (18) with the lambda that minimises the determinant of C^e.
+    """Fuse by (7) and (18), with the lambda that minimises the determinant of C^e.
 
     C^e is s A^-1, with the information A and the greatest slack s, and a weight is lambda times s. The
-    prior is wide but proper, because the first determinants would be infinite otherwise; it remains part
-    of the set.
+    prior is wide but proper, because the first determinants would otherwise be infinite; it remains part
+    of the result.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
@@ -331,7 +331,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
         ) -> float:
             after = fuse(before, ring, most * float(np.exp(logarithm)))
             sizes = np.linalg.eigvalsh(after.information)
-            # with a narrow ring, some eigenvalues of the wide prior are lost to rounding
+            # with a narrow ring, some eigenvalues of the wide prior are lost by rounding
             sizes = np.maximum(sizes, np.finfo(float).eps * sizes[-1])
             return float(order * np.log(most_room(after)) - np.log(sizes).sum())
 
@@ -353,7 +353,7 @@ def _grid(window: Arena, nodes: int) -> Grid:
 
 
 def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Arena:
-    """Zoom in from the arena to the area with values >= 0, plus a margin."""
+    """Zoom in from the arena to the area where values are >= 0, plus a margin."""
     window = arena
     for _ in range(8):
         grid = _grid(window, nodes)
@@ -372,7 +372,7 @@ def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Are
 
 
 def _outline(values: Floats, grid: Grid) -> Outline:
-    """Compute the outline of the area with values >= 0, cut off at the grid's border."""
+    """Compute the outline of the area where values are >= 0, clipped at the border of the grid."""
     tiny = 1e-9 * (grid.x[-1] - grid.x[0])
     x, y = (np.concatenate([[a[0] - tiny], a, [a[-1] + tiny]]) for a in (grid.x, grid.y))
     closed = np.pad(values, 1, constant_values=-float(np.abs(values).max()))

@@ -1,13 +1,13 @@
-"""Association of a scan's detections with tracks: greedy, by the best assignment, or by all of them.
+"""Association of detections with tracks: greedy, by the best assignment, or by all assignments.
 
-An assignment gives every track a detection of its own or none; detections without a track are clutter.
-With Poisson clutter of density lambda it has the weight
+An assignment gives every track at most one detection of its own; detections without a track are clutter.
+With Poisson clutter of density lambda, an assignment has the weight
 
     prod over detected tracks (P_D r_i g_ij / lambda)  *  prod over missed ones (1 - P_D P_G r_i),
 
-where g_ij is the density of detection j under track i's prediction and r_i the probability that track i
-exists (1 in JPDA). All functions here take these weights, 0 outside a gate, and fill in the probability
-that each track has each detection, which is 0 or 1 if one assignment is chosen.
+where g_ij is the density of detection j under track i's prediction and r_i is the probability that track
+i exists (1 in JPDA). All functions of this module read these weights (0 outside a gate) and fill the
+probability that each track has each detection, which is 0 or 1 if a single assignment is chosen.
 
 JPDA: Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Eng. 8(3), 1983. JIPDA: Musicki, Evans, IEEE TAES
 40(3), 2004. Shortest augmenting paths: Crouse, IEEE TAES 52(4), 2016. Belief propagation: Williams, Lau,
@@ -36,7 +36,7 @@ from fuselog.replay.families.tracking.association.clusters import (
 def nearest(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Choose one assignment greedily: the most likely pair first, then the most likely one of the rest.
+    """Choose an assignment greedily: the most likely pair first, then the most likely remaining pair.
 
     Args:
         weights: of pairs and of misses.
@@ -47,7 +47,7 @@ def nearest(
         memory: scratch memory.
 
     Returns:
-        0, as no cluster is approximated.
+        0, because no cluster is approximated.
     """
     memory.is_seen[:detections] = False
     memory.column_of[:tracks] = NONE
@@ -70,7 +70,7 @@ def nearest(
 def hungarian(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Choose the assignment of the greatest weight by shortest augmenting paths (Crouse, fig. 3).
+    """Choose the assignment with the greatest weight by shortest augmenting paths (Crouse, fig. 3).
 
     Column j of the assignment problem is detection j, and column detections + i is a miss of track i.
 
@@ -82,7 +82,7 @@ def hungarian(
         memory: scratch memory.
 
     Returns:
-        0, as no cluster is approximated.
+        0, because no cluster is approximated.
     """
     columns = detections + tracks
     memory.price[:columns], memory.row_of[:columns] = 0.0, NONE
@@ -142,9 +142,10 @@ ASSOCIATIONS: dict[str, Associate] = {"nearest": nearest, "hungarian": hungarian
 
 
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
-    """Compute the existence of a track after a scan in which `none` is the probability of a miss.
+    """Compute the existence of a track after a scan; `none` is the probability of a miss.
 
-    Musicki and Evans' (15): a miss lowers it the more, the more probable a detection was.
+    This is (15) of Musicki and Evans: the more probable a detection was, the more a miss lowers the
+    existence.
     """
     missed = 1.0 - detection_probability
     if_missed = missed * existence / (1.0 - detection_probability * existence)
@@ -152,14 +153,14 @@ def existence_after(existence: float, none: float, detection_probability: float)
 
 
 def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda") -> Floats:
-    """Compute the probabilities (tracks, 1 + n) of no detection, the first, the second ...
+    """Compute each track's probabilities (tracks, 1 + n) of no detection and of each detection.
 
     Args:
         detected: (tracks, n), the weights of pairs; 0 outside a gate.
         missed: (tracks,), the weights of misses.
         association: one of ASSOCIATIONS; "nearest" and "hungarian" choose one assignment.
 
-    Raises BadInput if the weights are invalid, or if there is no such association.
+    Raises BadInput if the weights are invalid, or if the association is unknown.
 
     A detection between two tracks:
 

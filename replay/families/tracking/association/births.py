@@ -1,4 +1,4 @@
-"""Beginning of tracks at unassociated detections, and end of tracks."""
+"""Start of tracks at unassociated detections, and end of tracks."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from fuselog.replay.inference.linear_algebra.tuples import tuple_of
 
 
 class Births(NamedTuple):
-    """Functions with which detections begin tracks, by kind of sensor.
+    """Functions that begin tracks at detections, by kind of sensor.
 
     Attributes:
         begins: whether detections of a kind begin tracks.
@@ -81,7 +81,8 @@ def ending(tracker: Tracker) -> Callable[[int, Tracks, Settings], None]:
     return end_tracks
 
 
-# (run, scan, count, scans, tracks, newborn, parameters, memory) -> number of tracks without room.
+# (run, scan, count, scans, tracks, newborn, parameters, memory) -> number of tracks for which there is
+# no room.
 BeginTracks = Callable[[int, int, int, Scans, Tracks, Newborn, Settings, ScanMemory], int]
 
 
@@ -99,7 +100,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         correlate = choosing(correlations)
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Settings) -> bool:
-        """Test whether a confirmed track is too near for another one to begin."""
+        """Test whether a confirmed track is so near that no other track may begin."""
         for place in range(tracks.used[run]):
             apart = np.hypot(
                 at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
@@ -117,7 +118,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> float:
-        """Compute the probability that a detection belongs to a new target; 0 to begin no track."""
+        """Compute the probability that a detection belongs to a new target; 0 if no track may begin."""
         if p.undetected_per_m2 > 0.0:
             share = memory.undetected[detection] / memory.clutter[detection]
             existence = memory.left[detection] * share
@@ -135,7 +136,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> int:
-        """Begin tracks with unassociated detections; return the number of those without room."""
+        """Begin tracks at unassociated detections; return how many of these have no room for a track."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
             measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])

@@ -6,7 +6,7 @@ import numpy as np
 
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers, varying
 
-# Clusters with more tracks and more detections than this are left to belief propagation.
+# Belief propagation is used for clusters with more tracks and more detections than this.
 MOST_ENUMERATED = 12
 PROPAGATED = 1e-10  # messages that change less have converged
 MOST_ROUNDS = 1000
@@ -33,13 +33,13 @@ class AssociationMemory(NamedTuple):
     Attributes:
         rows, columns: the tracks and detections of a cluster.
         is_seen: whether a detection is already in a cluster.
-        pair, alone, spare: weights of items with slots, of items without a slot, and of slots without an
-            item.
-        forward, backward: sums over the assignments of the first items, and of the others, by the set of
-            occupied slots.
-        message: from detections to tracks.
-        price, row_of, distance, before, is_done: of the columns of an assignment problem; `potential`
-            and `column_of` of its rows.
+        pair, alone, spare: weights of pairs of item and slot, of items without a slot, and of slots
+            without an item.
+        forward, backward: sums over the assignments of the first items and over those of the other
+            items, by the set of occupied slots.
+        message: messages from detections to tracks.
+        price, row_of, distance, before, is_done: quantities of the columns of an assignment problem;
+            `potential` and `column_of` are those of its rows.
     """
 
     rows: Integers
@@ -87,11 +87,12 @@ def memory_for(tracks: int, detections: int) -> AssociationMemory:
 def jpda(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Fill the marginals (tracks, 1 + detections) of all joint associations; column 0 is for a miss.
+    """Fill the marginals (tracks, 1 + detections) over all joint associations; column 0 is a miss.
 
-    Tracks that share no detection, not even through others, are independent. Each cluster is summed on
-    its own: exactly if it has at most MOST_ENUMERATED tracks or at most as many detections, and by
-    belief propagation otherwise. Returns the number of tracks in clusters with approximated marginals.
+    Tracks are independent if they share no detection, either directly or through other tracks. Each
+    cluster of connected tracks is summed separately: exactly if it has at most MOST_ENUMERATED tracks or
+    at most that many detections, and by belief propagation otherwise. Returns the number of tracks in
+    clusters with approximated marginals.
 
     Args:
         weights: of pairs and of misses.
@@ -158,14 +159,14 @@ def enumerate_maps(
 ) -> None:
     """Compute the marginals of one cluster by summing over all of its assignments.
 
-    The smaller group, tracks or detections, are slots, which the others, the items, occupy one after
-    another. The choices of the later items depend on the set of occupied slots, not on which items
-    occupy them, so sums over assignments become sums over these 2^slots sets.
+    The smaller group (tracks or detections) are the slots; the others are the items, which occupy slots
+    one after another. The choices of later items depend only on the set of occupied slots, so sums over
+    assignments become sums over these 2^slots sets.
 
     Args:
         weights: of pairs and of misses.
         rows, columns: numbers of tracks and detections of the cluster.
-        probability: (tracks, 1 + detections), filled for these.
+        probability: (tracks, 1 + detections), filled for the tracks of the cluster.
         memory: with the cluster that `gather_cluster` found.
     """
     tracks_are_slots = rows <= columns
@@ -199,7 +200,7 @@ def enumerate_maps(
 
 
 def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemory) -> float:
-    """Fill a cluster's sums `forward`, and `backward` after the last item; return the sum of all."""
+    """Fill the sums `forward` of a cluster, and `backward` after its last item; return the total."""
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
     memory.alone[:items] = 1.0
@@ -295,7 +296,7 @@ def propagate_beliefs(
 
 
 def choose(row: int, column: int, detections: int, probability: Floats) -> None:
-    """Fill a track's row with 1 for the chosen detection and 0 otherwise.
+    """Fill the row of a track with 1 for the chosen detection and 0 otherwise.
 
     Args:
         row: index of the track.

@@ -18,18 +18,20 @@ from fuselog.replay.inference.model.bound_model import BoundModel
 
 @varying(2)
 class TrackOutputs(NamedTuple):
-    """Outputs of a tracker after every scan; scan s of run r has the rows of that number.
+    """Outputs of a tracker after every scan.
 
     Attributes:
         end: (runs, 2), number of rows of tracks and of associations that a run has filled.
         confirmed: (scans,), number of confirmed tracks; NEVER if the scan was too old to be used.
         approximated: (scans,), number of tracks in clusters too large for enumeration.
-        turned_away: (scans,), number of detections that begin no track because there is no room.
+        turned_away: (scans,), number of detections that could not begin a track because there was no
+            room.
         number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
             `probability` is that of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), their probability.
-        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation in its
-            likeliest mode, and the Cholesky factor of the innovation covariance; a bearing comes first.
+        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), the whitened innovation of a pair in its
+            most likely mode, and the Cholesky factor of the innovation covariance; a bearing is the
+            first component.
     """
 
     end: Integers
@@ -48,7 +50,7 @@ class TrackOutputs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Destination of one run's estimates, as `Steps.estimate` fills them in."""
+    """Rows for the estimates of one run, which `Steps.estimate` fills."""
 
     mean: Floats
     covariance: Floats
@@ -112,7 +114,7 @@ BY_PAIR = ("associated", "white", "factor")
 
 
 def blank_outputs(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> TrackOutputs:
-    """Make memory for all possible outputs; pages that are not written take no memory."""
+    """Allocate arrays for all possible outputs; pages that are never written use no memory."""
     modes, n, t = sizes
     counts = np.diff(scans.offsets)
     detections = np.add.reduceat(np.append(scans.end - scans.first, 0), scans.offsets[:-1])

@@ -1,20 +1,20 @@
-"""Predicted measurements of tracks, and updates of tracks by a scan: the sensors' part of a tracker.
+"""Predicted measurements of tracks, and updates of tracks by a scan.
 
-A kind of sensors states what it measures of a target, the probability of detection and the density of
-clutter. With probabilities b_j of a scan's detections and b_0 of no detection, a track's mean moves by
-the mean of the innovations v_j, and its covariance is
+A kind of sensor defines its measurement of a target, the probability of detection and the density of
+clutter. If the detections of a scan have the probabilities b_j, and a miss has the probability b_0, the
+update uses the mean v of the innovations v_j, and the covariance of the track becomes
 
     P - (1 - b_0) K S K' + K (sum_j b_j v_j v_j' - v v') K',   v = sum_j b_j v_j
 
 (Bar-Shalom, Fortmann, Tracking and Data Association, 1988, 6.4). If one assignment is chosen, this is
-the covariance of the Kalman filter. A track with several modes has a Gaussian for each. A detection's
-density is the mean of their densities, weighted by the modes' probabilities, and a detection of the
-track changes these by Bayes' rule: the probability of mode i becomes
+the covariance of the Kalman filter. A track with several modes has one Gaussian for each mode. The
+density of a detection is the mean of their densities, weighted by the probabilities of the modes. A
+detection of the track changes these probabilities by Bayes' rule: the probability of mode i becomes
 
     mu_i b_0 + sum_j b_j mu_i g_ij / sum_k mu_k g_kj,
 
-and the terms of this sum, normalised, are the probabilities with which the mode's Gaussian is updated
-(Blom, Bloem, IEEE TAC 45(2), 2000).
+and the normalised terms of this sum are the probabilities for the update of the mode's Gaussian (Blom,
+Bloem, IEEE TAC 45(2), 2000).
 """
 
 from collections.abc import Callable
@@ -44,24 +44,24 @@ class ScanMemory(NamedTuple):
     """Scratch memory of one core; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
-        motion: of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
-        step: of the derivatives of sensors.
-        pool: of the errors that all tracks share.
-        place: (detections, 2), the detections of a scan after joining.
+        motion: memory of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
+        step: memory of the derivatives of sensors.
+        pool: memory of the errors that all tracks share.
+        place: (detections, 2), the detections of a scan after near ones are joined.
         group: (detections,), the group in which each detection is joined.
         clutter: (detections,), density of clutter and of targets that were never detected.
         undetected: (detections,), density of targets that were never detected.
-        difference, spread, cross: (tracks, modes, ...), of innovations; see `Innovation`.
+        difference, spread, cross: (tracks, modes, ...), terms of the innovations; see `Innovation`.
         predicted: (tracks, modes, 2), predicted measurements.
         detectable: (tracks,), probability that each track is detected.
         white: (tracks, modes, detections, 2), whitened innovations.
         likelihood: (tracks, modes, detections), joint likelihood of a mode and a detection.
         weights, probability, association: see `association.association`.
-        is_free: (detections,), outside all gates; left: (detections,), probability of belonging to no
-            track.
-        given: (1 + detections,), a track's associations in one mode.
-        after: (modes,), the probability of each mode of a track after them.
-        moment: (2, 2), and `shift` (2,), of the weighted innovations.
+        is_free: (detections,), whether a detection is outside all gates; left: (detections,),
+            probability that it belongs to no track.
+        given: (1 + detections,), probabilities of a track's associations in one mode.
+        after: (modes,), the probability of each mode of a track after these associations.
+        moment: (2, 2), second moment of the weighted innovations; `shift` (2,) is their mean.
     """
 
     motion: CoreMemory
@@ -134,7 +134,7 @@ def target_of(model: Model) -> Callable[[Numbers], Numbers]:
 
 @lru_cache(maxsize=64)
 def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
-    """Make the model's sensor for a kind of scan sensors, which may read parameters with these names."""
+    """Make the model's sensor for a kind of scan sensor, which may read the parameters `names`."""
     target, inner = target_of(model), kind.measure
 
     def measure(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
@@ -145,9 +145,9 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
 
 
 def errors_at(component: int) -> OfParameters:
-    """Make `errors(parameters)`: the indices in the state of the errors of a measured component.
+    """Make `errors(parameters)`, which returns the state indices of a measured component's errors.
 
-    An index of -1 means no such error.
+    An index of -1 means that there is no such error.
     """
     names = (f"registration_at_{component}", f"correlated_at_{component}")
 
@@ -182,8 +182,8 @@ UpdateTrack = Callable[[int, int, int, Floats, Floats, ScanMemory], None]
 def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe:
     """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`, which predicts a scan.
 
-    It fills the prediction of a track's mode and its whitened innovation covariance, and returns the
-    density's factor before exp(-d2 / 2), or NaN if the covariance is not positive definite.
+    `observe` fills the prediction and the whitened innovation covariance of a mode. It returns the
+    factor of exp(-d2 / 2) in the density, or NaN if the covariance is not positive definite.
     """
     m, read_state, read_origin = len(kind.measured), tuple_of(model.size), tuple_of(2)
     linearise, noise = sensor_derivative(model, measuring(model, kind, names)), kind.noise
@@ -229,10 +229,10 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe
 def correlating(
     model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
 ) -> Correlate:
-    """Make `correlate(mean, covariance, origin, parameters, work)`: adds sensor errors to a new track.
+    """Make `correlate(mean, covariance, origin, parameters, work)`, for sensor errors of a new track.
 
-    The error db of a detection shifts the position by -H^-1 db. H is the derivative of the measurement
-    by the position, whose components are at the indices `corner`.
+    An error db of a detection shifts the position by -H^-1 db, where H is the derivative of the
+    measurement with respect to the position. The position has the indices `corner` in the state.
     """
     x, y = corner
     read_state, read_origin = tuple_of(model.size), tuple_of(2)
@@ -267,7 +267,7 @@ def correlating(
 
 
 def comparing(kind: ScanSensor) -> Callable[[int, int, int, ScanMemory], float]:
-    """Make `compare(track, mode, detection, memory)`: whitens an innovation, and returns d2."""
+    """Make `compare(track, mode, detection, memory)`, which whitens an innovation and returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
     def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
@@ -328,7 +328,7 @@ def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
 def split_by_mode(
     run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
 ) -> float:
-    """Fill a track's associations in one of its modes; return the mode's probability after them."""
+    """Fill the associations of a track in one mode; return the mode's probability after them."""
     probability, given = memory.probability[track], memory.given
     given[0] = probability[0] * tracks.mode[run, track, mode]
     after: float = given[0]
@@ -347,7 +347,7 @@ def split_by_mode(
 
 
 def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
-    """Fill the detections of a scan, with each chain of near detections replaced by its mean.
+    """Fill the detections of a scan; replace each chain of near detections by its mean.
 
     Chains are in the order of their first detections. Returns the number of joined detections.
     """

@@ -1,4 +1,4 @@
-"""Unordered scans of detections in columns, and the kinds of sensors that record them."""
+"""Columns of unordered scans of detections, and the kinds of sensors that record scans."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from fuselog.replay.engine.vectors.components import Components
 
 # (target, origin, parameters) -> numbers of a detection. A target is (x_m, vx_mps, y_m, vy_mps).
 OfTarget = Callable[[Numbers, Numbers, Settings], Numbers]
-# A position, the lower triangle of its covariance, and m^2 of the plane for each unit that is measured.
+# A position, the lower triangle of its covariance, and the area in m^2 for each unit of the measurement.
 Born = tuple[Numbers, Numbers, float]
 
 
@@ -20,11 +20,11 @@ Born = tuple[Numbers, Numbers, float]
 class ScanSensor:
     """A kind of sensor that records unordered scans.
 
-    Its functions take a target as (x_m, vx_mps, y_m, vy_mps), for every state of the model, and
-    `origin`, the position of the sensor when it scans.
+    Its functions have the arguments `target`, (x_m, vx_mps, y_m, vy_mps) for any state of the model, and
+    `origin`, the position of the sensor during the scan.
 
     Attributes:
-        leaf, schema, fields: of the topic with its detections, next to that of its scans.
+        leaf, schema, fields: last part of the name, schema and fields of the topic with its detections.
         measured: the components of a detection.
         measure: (target, origin, parameters) -> the measurement of a target.
         noise: (target, origin, parameters) -> variances, or the rows of a lower triangle.
@@ -47,12 +47,12 @@ class ScanSensor:
 
 
 class Scans(NamedTuple):
-    """The scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
+    """Scans of all runs in time order; scans offsets[r]:offsets[r + 1] belong to run r.
 
     Attributes:
         offsets: (runs + 1,).
         time_ns, sensor, kind, number: (scans,), stamp, index of the sensor, index of its kind, and the
-            scan's number at that sensor.
+            number that the sensor gave the scan.
         first, end: (scans,), bounds of its detections.
         origin: (scans, 2), position of the sensor.
         detection: (detections, 2), the measurements.
@@ -73,10 +73,10 @@ BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
 
 
 def take_scans(scans: Scans, rows: Integers) -> Scans:
-    """Return some of the scans, in the given order, as those of one run.
+    """Return selected scans, in the given order, as the scans of one run.
 
     Args:
-        scans: of any runs.
+        scans: scans of any runs.
         rows: (k,), indices of the scans.
     """
     own = {name: getattr(scans, name)[rows] for name in BY_SCAN}

@@ -1,14 +1,15 @@
 """Estimation of sensor errors that all tracks share, as part of every track's state.
 
-Given the errors b, targets are independent, so a joint Gaussian of all of them consists of one of b and,
-for every track, one of its target given b. A track's Gaussian is of its target and of b, and the
-marginal of b is the same in all tracks. The information of a scan about b is summed over the tracks,
+Given the errors b, targets are independent, so a joint Gaussian of all targets and b consists of a
+Gaussian of b and, for every track, a Gaussian of its target given b. Each track has a Gaussian of its
+target and b; the marginal of b is the same in all tracks. The information of a scan about b is summed
+over the tracks,
 
     B+^-1 = B^-1 + sum_i (B_i^-1 - B^-1),   B+^-1 b+ = B^-1 b + sum_i (B_i^-1 b_i - B^-1 b),
 
-with B_i, b_i after the update of track i only. Then every track gets the new marginal, and its
-conditional Gaussian of the target given b stays. States are flat. For constant b and certain
-associations this is the joint Kalman filter.
+where B_i and b_i are those after the update of track i only. Then every track gets the new marginal and
+keeps its conditional Gaussian of the target given b. States have no rotations. For constant b and
+certain associations, this is the joint Kalman filter.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import invert
 
 @varying(0, is_updated=1)
 class Pool(NamedTuple):
-    """Scratch memory for k shared errors: matrices (k, k), vectors (k,), and a track's gain (t, k).
+    """Scratch memory for k shared errors: matrices (k, k), vectors (k,), and the gain (t, k) of a track.
 
     `is_updated` (tracks,) marks the tracks that a scan has updated.
     """
@@ -53,10 +54,10 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
 
 
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Fuse the errors that the confirmed tracks of a run have estimated, and give the result to all.
+    """Fuse the errors that the confirmed tracks of a run have estimated, and update all tracks.
 
-    The errors are the components of every track's state from `first` on. If associations are so
-    ambiguous that the fused information is not positive definite, the shared errors stay as they were.
+    The errors are the components of every track's state from index `first`. If associations are so
+    ambiguous that the fused information is not positive definite, the shared errors are not changed.
     """
     mean, covariance = tracks.shared_mean[run], tracks.shared_covariance[run]
     size = len(mean)
@@ -88,7 +89,7 @@ def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
 
 
 def conform(run: int, place: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Give a track the shared errors, and keep its conditional estimate of the target given them."""
+    """Set the shared errors in a track, and keep its estimate of the target given the errors."""
     shared_mean, shared = tracks.shared_mean[run], tracks.shared_covariance[run]
     mean, covariance = tracks.mean[run, place, 0], tracks.covariance[run, place, 0]
     size, t = len(shared_mean), len(covariance)

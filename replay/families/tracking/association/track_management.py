@@ -1,11 +1,11 @@
-"""Confirmation and end of tracks, by counts or by probabilities of existence, for any association.
+"""Confirmation and end of tracks by existence, hits or score, for any association.
 
     existence   the probability that the target exists (Musicki, Evans, IEEE TAES 40(3), 2004)
-    hits        detected in M of its first N chances, see Bar-Shalom, Li, Kirubarajan, 2001, 7.8
+    hits        detections in M of the first N chances, see Bar-Shalom, Li, Kirubarajan, 2001, 7.8
     score       the log-likelihood ratio of a target and clutter in Wald's sequential test: Blackman,
                 Popoli, Design and Analysis of Modern Tracking Systems, 1999, 6.2
 
-All of them end a track that has been silent for too long.
+All three also end a track that has been silent for too long.
 """
 
 from collections.abc import Callable
@@ -26,8 +26,9 @@ class Management(NamedTuple):
     """Functions that manage tracks.
 
     Attributes:
-        wait: (run, place, duration_s, tracks, parameters), the change due to elapsed time.
-        judge: (run, place, evidence, tracks, parameters), the change due to a scan; may confirm a track.
+        wait: (run, place, duration_s, tracks, parameters); applies the effect of elapsed time.
+        judge: (run, place, evidence, tracks, parameters); applies the effect of a scan, and may confirm
+            a track.
         is_over: (run, place, tracks, parameters) -> whether a track ends.
     """
 
@@ -41,9 +42,9 @@ class Evidence(NamedTuple):
 
     Attributes:
         detectable: probability of a detection in the gate, if the target exists.
-        probability: (1 + detections,), of no detection and of each, see
+        probability: (1 + detections,), of no detection and of each detection, see
             `fuselog.replay.families.tracking.association.association`.
-        weights: of all tracks.
+        weights: weights of all tracks.
     """
 
     detectable: float
@@ -60,7 +61,7 @@ def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
 
 
 def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
-    """Leave a track unchanged by elapsed time."""
+    """Leave a track unchanged, because elapsed time has no effect."""
     return
 
 
@@ -73,12 +74,12 @@ def confirm(run: int, place: int, tracks: Tracks) -> None:
 
 
 def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Settings) -> None:
-    """Lower the existence by the probability that the target vanished meanwhile."""
+    """Lower the existence by the probability that the target has vanished in the elapsed time."""
     tracks.existence[run, place] *= np.exp(-duration_s / p.survival_s)
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Update the existence by Bayes' rule; a confirmed track stays so down to `keeping_existence`."""
+    """Update the existence by Bayes' rule; a track stays confirmed down to `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
     needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
@@ -116,8 +117,8 @@ def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Settings) -> boo
 def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
     """Add sum_j b_j log(w_j / b_j), with the weights w of a target that exists.
 
-    For a single assignment this is the log of its weight; for all assignments of one track, log sum_j
-    w_j.
+    For a single assignment, the sum is the log of its weight; for all assignments of one track, it is
+    log sum_j w_j.
     """
     weights, existence = evidence.weights, tracks.existence[run, place]
     gain = 0.0
@@ -136,7 +137,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Set
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether a track is silent, or its score has fallen too far from its birth or best."""
+    """Test whether a track is silent, or its score is too far below zero (if confirmed, its best)."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

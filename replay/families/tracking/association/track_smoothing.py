@@ -1,8 +1,8 @@
-"""Backward smoothing of tracks, so that each estimate uses later detections too.
+"""Backward smoothing of tracks: each estimate also uses later detections.
 
-The association of detections with tracks stays as the tracker found it. Given that association, a
-track's states are a chain of Gaussians connected by one motion, and
-`fuselog.replay.inference.smoothing.backward_pass` smooths them.
+The association of detections with tracks is not changed. Given this association, the states of a track
+are a chain of Gaussians connected by one motion, and `fuselog.replay.inference.smoothing.backward_pass`
+smooths them.
 """
 
 from functools import partial
@@ -34,7 +34,7 @@ def smooth_tracks(
 ) -> tuple[Floats, Floats]:
     """Smooth the filtered estimates of tracks: means (n, size) and covariances (n, size, size).
 
-    The motion of the model must be linear and without a control.
+    The motion of the model must be linear and must not have a control.
 
     Args:
         bound_model: the bound model of the targets.
@@ -104,7 +104,7 @@ def _motion(
         moved = bound_model.motion.move(tuple(unit), (), duration_s, parameters)
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
-    noise_of: ModelFunction = bound_model.motion.noise  # of many durations together
+    noise_of: ModelFunction = bound_model.motion.noise  # for many durations together
     lower = noise_of(state, duration_s, parameters)
     rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
     for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):

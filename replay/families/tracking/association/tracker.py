@@ -1,4 +1,4 @@
-"""Assembly of a tracker: the model of its targets, its kinds of sensors, and the motion of tracks."""
+"""Assembly of a tracker from the model of its targets, its kinds of sensors, and track motion."""
 
 from collections.abc import Callable
 from typing import Concatenate, NamedTuple, ParamSpec, TypeVar, cast
@@ -17,7 +17,7 @@ from fuselog.replay.inference.modes.mixture import ModeBelief
 
 
 class Tracker(NamedTuple):
-    """A tracker as an assembly of its parts.
+    """Tracker as an assembly of its parts.
 
     Attributes:
         bound_model: the targets' bound model, with one of its motions or with all modes.
@@ -46,10 +46,10 @@ class Tracker(NamedTuple):
 
 
 class Newborn(NamedTuple):
-    """A target of which only the position is known.
+    """New target of which only the position is known.
 
     Attributes:
-        mean, covariance: (n,), (t, t); their entries of the position are placeholders.
+        mean, covariance: (n,), (t, t); the entries of the position are placeholders.
         mode: (modes,), the modes' probabilities.
     """
 
@@ -59,7 +59,7 @@ class Newborn(NamedTuple):
 
 
 def moving(bound_model: BoundModel) -> Steps:
-    """Make the prediction of tracks; tracks with several modes move as interacting multiple models."""
+    """Make the prediction of tracks; with several modes, a track is an interacting multiple model."""
     if not bound_model.modes:
         return gaussian_filter(bound_model, linear_motion(bound_model), ())
     alone = (bound_model._replace(motion=motion, modes=()) for motion in bound_model.modes)
@@ -68,12 +68,12 @@ def moving(bound_model: BoundModel) -> Steps:
     )
 
 
-# (run, tracks) -> the tracks of a run as the filters' belief, first axis = place.
+# (run, tracks) -> the tracks of a run as the belief of filters; the first axis is the place.
 BeliefOf = Callable[[int, Tracks], Belief]
 
 
 def believing(bound_model: BoundModel) -> BeliefOf:
-    """Make `belief(run, tracks)`, which returns the tracks of a run as the filters' belief.
+    """Make `belief(run, tracks)`, which returns the tracks of a run as the belief of filters.
 
     The first axis of the belief is the place of the track.
     """

@@ -1,9 +1,9 @@
-"""Multi-target tracking: prediction, association, update, beginning and end of tracks, scan by scan.
+"""Multi-target tracking scan by scan: prediction, association, update, birth and end of tracks.
 
-A model's motion moves every track; with several modes, each track is an IMM. Sensors predict what a
-scan measures of a track (see `association.scanning`). An association computes the probability that each
-track has each detection (`association`), and unassociated detections may begin tracks. A management
-decides which tracks are confirmed, and which end (`track_management`).
+The motion of a model predicts every track; with several modes, each track is an IMM. Sensors predict the
+measurement of each track (`association.scanning`). An association computes the probability that each
+track has each detection (`association`), and unassociated detections may begin tracks. The track
+management confirms and ends tracks (`track_management`).
 """
 
 from collections.abc import Callable
@@ -76,7 +76,7 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
         outputs: TrackOutputs,
         memory: ScanMemory,
     ) -> int:
-        """Process one scan of a run; a scan before the tracks' time has no effect."""
+        """Process one scan of a run; a scan that is older than the tracks has no effect."""
         scans = inputs.events
         p = read(inputs.settings, scans.sensor[scan])
         if scans.time_ns[scan] < tracks.time_ns[run]:
@@ -103,7 +103,7 @@ def tracking(tracker: Tracker, read: ReadSettings) -> Follow:
     def record(
         run: int, scan: int, _: ScanInputs, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
     ) -> int:
-        """Fill in the tracks after a scan."""
+        """Write the tracks after a scan to the outputs."""
         write_tracks(run, scan, tracks, outputs, memory)
         return ALL_WELL
 
@@ -128,7 +128,7 @@ def advancing(tracker: Tracker) -> Callable[[int, int, Tracks, Settings, ScanMem
     return advance
 
 
-# (run, scan, count, scans, tracks, parameters, memory): processes the detections of a scan.
+# (run, scan, count, scans, tracks, parameters, memory) processes the detections of a scan.
 TakeDetections = Callable[[int, int, int, Scans, Tracks, Settings, ScanMemory], None]
 
 
@@ -202,7 +202,7 @@ def processing(tracker: Tracker) -> TakeDetections:
     begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
 
     def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: ScanMemory) -> None:
-        """Update a track's Gaussians and the probabilities of its modes by its associations."""
+        """Update the Gaussians and the mode probabilities of a track by its associations."""
         for mode in range(modes):
             after = split_by_mode(run, place, mode, count, tracks, memory)
             memory.after[mode] = after
@@ -238,7 +238,7 @@ def processing(tracker: Tracker) -> TakeDetections:
     return process
 
 
-# Scans of a run per pass of the loop, which bounds the memory for their outputs.
+# Number of scans of a run per pass of the loop, which limits the memory for their outputs.
 BATCH = 1000
 
 
@@ -255,7 +255,7 @@ def track_scans(
 
     Args:
         tracker: the assembled tracker.
-        scans: of all runs.
+        scans: scans of all runs.
         settings: (sensors, names), the parameters for each sensor.
         newborn: the state of a new target.
         before: the tracks before these scans.

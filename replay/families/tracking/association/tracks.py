@@ -1,7 +1,7 @@
 """Tracks of many targets in columns.
 
-A track is a Gaussian for each of its model's modes, with the modes' probabilities; a model with one
-motion has one mode of probability 1.
+A track has a Gaussian and a probability for each mode of its model; a model with one motion has one mode
+of probability 1.
 """
 
 from typing import NamedTuple
@@ -16,21 +16,22 @@ NEVER = -1
 
 @varying(2)
 class Tracks(NamedTuple):
-    """The tracks of all runs, the oldest first: axes run and place; the first `used` places are taken.
+    """Tracks of all runs, oldest first; axes are run and place; the first `used` places are occupied.
 
     Attributes:
-        used, met: (runs,), number of tracks now, and ever begun, from which tracks are numbered.
-        time_ns: (runs,), of all states; NEVER before the first scan.
+        used, met: (runs,), numbers of current tracks and of all tracks so far; the latter numbers new
+            tracks.
+        time_ns: (runs,), stamp of all states; NEVER before the first scan.
         number, existence, is_confirmed: (runs, places).
         mean, covariance: (runs, places, modes, ...).
         mode, log_mode: (runs, places, modes), the modes' probabilities, and their logarithms.
-        hits, chances: (runs, places), scans since its birth in which it was, or could have been,
-            detected.
+        hits, chances: (runs, places), numbers of scans since the birth in which the track was, or could
+            have been, detected.
         score, best_score: (runs, places), the log-likelihood ratio since its birth, and its maximum.
-        seen_ns: (runs, places), when a sensor that begins tracks last detected it.
-        updated_ns: (runs, places, sensors), when each sensor last updated it.
-        shared_mean, shared_covariance: (runs, ...), of the errors that all tracks share:
-            `fuselog.replay.families.tracking.association.shared_bias`.
+        seen_ns: (runs, places), time at which a sensor that begins tracks last detected the track.
+        updated_ns: (runs, places, sensors), time at which each sensor last updated the track.
+        shared_mean, shared_covariance: (runs, ...), mean and covariance of the errors that all tracks
+            share: `fuselog.replay.families.tracking.association.shared_bias`.
     """
 
     used: Integers

@@ -1,1 +1,1 @@
-"""Comparison of tracks with the targets that they should follow; begin with `tracks`."""
+"""Evaluation of tracks against the targets that they should follow; begin with `tracks`."""

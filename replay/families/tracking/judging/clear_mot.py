@@ -1,8 +1,8 @@
 """Pairs of targets and tracks as in CLEAR MOT: a pair is kept while it is within the cutoff.
 
 Source: Bernardin, Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT
-metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. As in motmetrics, a target
-remembers its track while it is missed, so that a target that returns with its track has not switched.
+metrics", EURASIP J. on Image and Video Processing, 2008, section 2.1. As in motmetrics, a missed target
+keeps its last track, so a target that returns with the same track has not switched.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ NONE = -1
 
 
 def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff: float) -> Integers:
-    """Pair the targets with tracks at k instants.
+    """Pair targets with tracks at k instants.
 
     Args:
         tracks: at each instant, the numbers (n,) of the tracks and their positions (n, axes).
@@ -50,7 +50,7 @@ def clear_mot(tracks: Sequence[tuple[Integers, Floats]], truths: Floats, cutoff:
 
 
 def switches_and_breaks(pairs: Integers, present: Booleans) -> tuple[int, int]:
-    """Count how often targets switch to another track, and how often they are lost in between.
+    """Count how often targets switch to another track, and how often they are lost temporarily.
 
     Args:
         pairs: (targets, k), from `clear_mot`.

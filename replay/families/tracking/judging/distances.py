@@ -1,6 +1,6 @@
 """Distances between tracks and targets' trajectories: trajectory GOSPA, HOTA and IDF1.
 
-Tracks and trajectories are (targets, steps, axes), NaN at the steps at which one is absent.
+Tracks and trajectories are arrays (targets, steps, axes), which are NaN at steps without the target.
 
 Sources: Garcia-Fernandez, Rahmathullah, Svensson, "A metric on the space of finite sets of trajectories
 for evaluation of multi-target tracking algorithms", IEEE TSP 68, 2020 (trajectory GOSPA); Luiten et al.,
@@ -20,7 +20,7 @@ from fuselog.recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
 
-# Limit on the assignments of estimates to truths at one step that are enumerated.
+# Largest number of assignments of estimates to truths that are enumerated at one step.
 MOST_ASSIGNMENTS = 500
 THRESHOLDS = np.arange(1, 20) / 20.0
 
@@ -52,23 +52,23 @@ def trajectory_gospa(
     *,
     exactly: bool = False,
 ) -> TrajectoryGospa:
-    """Compute trajectory GOSPA of tracks and trajectories, and its parts.
+    """Compute the trajectory GOSPA of tracks and trajectories, and its parts.
 
-    Two estimates that swap their truths cost the switch penalty to the power of the order each; an
-    estimate that begins or ceases to be paired costs half of that. By default the metric is computed by
-    linear programming, in which an estimate may be split among truths; `exactly` goes through all
-    assignments step by step, which is feasible for small cases.
+    If two estimates swap their truths, each costs the switch penalty to the power of the order; an
+    estimate that begins or ceases to be paired costs half of that. By default, the metric is computed by
+    linear programming, in which an estimate may be split among truths; with `exactly`, all assignments
+    are enumerated step by step, which is feasible for small cases.
 
-    Raises BadInput if the shapes do not agree, a cutoff or penalty is not positive, the order is below
-    1, or there are more than MOST_ASSIGNMENTS assignments to go through.
+    Raises BadInput if the shapes do not match, a cutoff or penalty is not positive, the order is below
+    1, or there are more than MOST_ASSIGNMENTS assignments to enumerate.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
         truths: (m, steps, axes), NaN when a target is absent.
         cutoff: upper limit of a distance, in the unit of the points.
-        switch_penalty: in the same unit.
+        switch_penalty: penalty of a switch, in the same unit.
         order: of the sum, at least 1.
-        exactly: whether to go through all assignments.
+        exactly: whether to enumerate all assignments.
     """
     if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
@@ -95,8 +95,9 @@ def trajectory_gospa(
 def _paired(gain: Floats, half_switch: float) -> Floats:
     """Find the weights (steps, n, m) of pairs by linear programming.
 
-    Weights w >= 0, whose rows and columns sum to at most 1, minimise sum w * gain, which is negative,
-    plus half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
+    The weights w >= 0, whose rows and columns sum to at most 1, minimise the sum of w * gain (which is
+    negative) and of half_switch * e over all changes e >= |w[k + 1] - w[k]|. Pairs that never reduce the
+    cost have no weight.
     """
     steps, n, m = gain.shape
     row, column = np.nonzero((gain < 0.0).any(axis=0))
@@ -119,7 +120,7 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
 
 
 def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
-    """Find the best pairs (steps, n, m), 0 or 1: the shortest path through all steps' assignments."""
+    """Find the best pairs (steps, n, m), 0 or 1, by the shortest path through the assignments."""
     steps, n, m = gain.shape
     choices = _assignments(n, m)
     changes = np.abs(choices[:, None] - choices[None]).sum(axis=(2, 3)) * half_switch
@@ -164,17 +165,17 @@ def hota(
     *,
     others: int = 0,
 ) -> Hota:
-    """Compute HOTA of tracks and trajectories, at every threshold.
+    """Compute the HOTA of tracks and trajectories at every threshold.
 
-    The similarity of two points is 1 - distance / cutoff, and at least 0; they match if it reaches the
+    The similarity of two points is max(0, 1 - distance / cutoff); they match if it reaches the
     threshold. The pairs of a step are those with the best match over the whole span. The usual single
     figure is the mean over the thresholds 0.05, 0.10, ..., 0.95. Raises BadInput if the shapes do not
-    agree or the cutoff is not positive.
+    match or the cutoff is not positive.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
         truths: (m, steps, axes), NaN when a target is absent.
-        cutoff: distance from which on two points are not similar, in their unit.
+        cutoff: distance at which the similarity of two points becomes zero, in their unit.
         thresholds: of the similarity, 0 to 1.
         others: number of points of further tracks, none of which is ever within the cutoff.
     """
@@ -201,11 +202,11 @@ def hota(
 
 
 def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float, *, others: int = 0) -> float:
-    """Compute IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
+    """Compute the IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
 
-    IDTP is the number of trajectory points that are nearer than the cutoff to the one track that each
-    trajectory is assigned to; the assignment maximises it. NaN if there are no points. Raises BadInput
-    as `hota` does.
+    Each trajectory is assigned to at most one track. IDTP is the number of trajectory points closer than
+    the cutoff to the assigned track; the assignment maximises it. The result is NaN if there are no
+    points. Raises BadInput as `hota` does.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
@@ -233,7 +234,7 @@ def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def _present(tracks: Floats) -> NDArray[np.bool_]:
-    """Test at which steps each target is present, (targets, steps)."""
+    """Test whether each target is present at each step: (targets, steps)."""
     return np.asarray(np.isfinite(tracks).all(axis=2))
 
 

@@ -1,13 +1,14 @@
-"""Comparison of tracks with the trajectories of targets, at instants that do not depend on sensors.
+"""Comparison of tracks with trajectories of targets at instants that do not depend on sensors.
 
-At every instant the tracks, predicted to it, are paired with the targets that are present (GOSPA with
-alpha 2). The pairs give the distance of a track from its target, and the share of the time for which a
-target is followed. Switches to another track, and breaks, are counted with the pairs of CLEAR MOT, which
-are kept while they are within the cutoff.
+At every instant, the tracks are predicted to this instant and paired with the targets that are present
+(GOSPA with alpha 2). The pairs determine the distance of a track from its target, and the share of time
+in which a target is followed. Switches to another track, and breaks, are counted with the pairs of CLEAR
+MOT, which are kept while they are within the cutoff.
 
-By default every track counts. If the metadata of a truth says that truths cover some of the targets
-(`COVERS`), a track of another target is not a false track: tracks farther than a limit from all targets
-with a truth are counted separately, as unreferenced, and figures without them have their own names.
+By default, every track counts. If the metadata of a truth states that truths cover only some of the
+targets (`COVERS`), a track of another target is not a false track: tracks that are farther than a limit
+from all targets with a truth are counted separately as unreferenced, and figures that exclude them have
+separate names.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +27,7 @@ from fuselog.replay.judging.errors.truths import COVERS, SOME_TARGETS
 
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
-# Time of the first instant, which lets tracks begin, and the period of the instants.
+# Time of the first instant, before which tracks can begin, and the period of the instants.
 BURN_IN_S = 10.0
 PERIOD_S = 0.5
 SOME_ARE_KNOWN = (
@@ -38,23 +39,23 @@ VELOCITY = ("vx_mps", "vy_mps")
 
 
 class TracksAt(NamedTuple):
-    """The tracks at one instant: their numbers (n,) and positions (n, 2)."""
+    """Tracks at one instant: their numbers (n,) and positions (n, 2)."""
 
     number: Integers
     place: Floats
 
 
 class TrackErrors(NamedTuple):
-    """Tracks of one run compared with truths at k instants; distances in m, GOSPA's parts in m^2.
+    """Errors of the tracks of one run at k instants; distances are in m, the parts of GOSPA in m^2.
 
     Attributes:
-        gospa_all: (k,), of all tracks.
+        gospa_all: (k,), GOSPA of all tracks.
         gospa, localisation, missed, false: (k,), without unreferenced tracks.
         unreferenced: (k,), number of unreferenced tracks; None if the truths cover all targets.
-        track: (targets, k), the track that GOSPA pairs each target with, or NONE.
+        track: (targets, k), the track with which GOSPA pairs each target, or NONE.
         distance: (targets, k), NaN if a target has no track.
         present: (targets, k), whether the target is present.
-        kept: (targets, k), the track that CLEAR MOT pairs each target with, or NONE.
+        kept: (targets, k), the track with which CLEAR MOT pairs each target, or NONE.
     """
 
     gospa_all: Floats
@@ -70,7 +71,7 @@ class TrackErrors(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2).
+    """Instants (k,) at which the tracks of a run are judged, and truths (targets, k, 2).
 
     `unreferenced_m` is the distance from all truths beyond which a track belongs to a target without a
     truth; infinite if the truths cover all targets.
@@ -87,7 +88,7 @@ class Judged(NamedTuple):
 
 
 def target_topics(topics: Mapping[str, Topic]) -> list[str]:
-    """List the truths that are positions of targets, not poses of sensors that scan."""
+    """List the truths that are positions of targets, not poses of scanning sensors."""
     return [
         topic
         for topic in topics_of(topics, schemas.TRUTH_STATE)
@@ -97,7 +98,7 @@ def target_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
-    """Choose instants from a burn-in after the epoch to the earliest end of scans and truths.
+    """Choose instants from the end of the burn-in to the earliest end of scans and truths.
 
     Truths are interpolated linearly. Raises BadInput if there are no scans or no truths of positions, or
     if they end before the first instant.
@@ -133,13 +134,13 @@ def unreferenced_m(truths: Iterable[Stream]) -> float:
 
 
 def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
-    """Return a run's tracks at instants: the last estimates before each, predicted by their velocities.
+    """Return the tracks of a run at instants: the last estimates, predicted by their velocities.
 
-    `sizes` gives the number of messages in `tracks` for each scan. A tracker that waits for late scans
-    reports each one `delay_ns` after its stamp. Tracks without velocities are not moved.
+    `sizes` has the number of messages in `tracks` for each scan. A tracker that waits for late scans
+    reports each scan `delay_ns` after its stamp. Tracks without velocities are not predicted.
 
     Args:
-        sizes: of the sets of tracks, a message per scan.
+        sizes: sizes of the sets of tracks, one message per scan.
         tracks: all tracks after each scan.
         at_ns: (k,), the instants.
         delay_ns: time from a scan's stamp to its report.
@@ -171,7 +172,7 @@ def track_errors(
     Args:
         tracks: the tracks at each of the k instants.
         truths: (targets, k, 2), in m, NaN when a target is absent.
-        cutoff_m: of GOSPA.
+        cutoff_m: cutoff of GOSPA.
         unreferenced_m: distance from all targets beyond which a track is unreferenced.
     """
     targets_in_all, instants, _ = truths.shape
@@ -207,10 +208,11 @@ def track_errors(
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """Return the means over the instants, and RMSE and coverage of each target, numbered from 1.
+    """Compute means over the instants, and RMSE and coverage of each target, numbered from 1.
 
     Missed and false are numbers of targets. The RMSE of a target that is never followed is NaN. If the
-    truths cover some targets, GOSPA of all tracks and the number of unreferenced ones are included.
+    truths cover only some targets, the GOSPA of all tracks and the number of unreferenced tracks are
+    included.
     """
     alone = cutoff_m**2 / 2.0
     figures = {"gospa_m": float(errors.gospa.mean())}
@@ -238,17 +240,17 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 def figures_of_whole_tracks(
     tracks: Sequence[TracksAt], truths: Floats, unreferenced_m: float = np.inf
 ) -> dict[str, float]:
-    """Compute HOTA and IDF1 with cutoff 20 m.
+    """Compute HOTA and IDF1 with a cutoff of 20 m.
 
-    They are of all tracks. If truths cover some targets, they are of the tracks that are ever within the
-    cutoff of a target, under their own names.
+    By default, all tracks count. If truths cover only some targets, only tracks that are ever within the
+    cutoff of a target count, and the figures have other names.
 
     Args:
         tracks: the tracks at each of k instants.
         truths: (targets, k, 2), in m, NaN when a target is absent.
         unreferenced_m: see `Judged`.
     """
-    from fuselog.replay.families.tracking.judging.distances import (  # imports SciPy, which is slow
+    from fuselog.replay.families.tracking.judging.distances import (  # slow: it imports SciPy
         hota,
         idf1,
     )
@@ -270,7 +272,7 @@ def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int
         truths: (targets, k, 2), in m, NaN when a target is absent.
 
     Returns:
-        These tracks (tracks, k, 2), NaN where one is absent, and the number of points of all others.
+        These tracks (tracks, k, 2), NaN when one is absent, and the number of points of all others.
     """
     near: set[int] = set()
     for at, true in zip(tracks, truths.transpose(1, 0, 2), strict=True):
@@ -285,7 +287,7 @@ def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
-    """Arrange the tracks at k instants as (tracks, k, 2), NaN where absent; see `judging.distances`."""
+    """Arrange the tracks at k instants as (tracks, k, 2), NaN when absent; see `judging.distances`."""
     numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
     found = np.full((len(numbers), len(tracks), 2), np.nan)
     for instant, at in enumerate(tracks):

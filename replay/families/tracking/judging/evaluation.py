@@ -1,8 +1,8 @@
-"""Evaluation of a replay's tracks against the truths of targets in its log, block by block.
+"""Evaluation of the tracks of a replay against the targets in its log, block by block.
 
-Instants, pairs and distances are those of `errors`, with which experiments judge trackers too. A target
-is present from the first to the last stamp of its truth. The judged span begins a while after the start
-of the log and ends with the last scan that the tracker processed.
+Instants, pairs and distances are defined in `errors`, as in experiments with trackers. A target is
+present from the first to the last stamp of its truth. The judged span begins a while after the start of
+the log and ends with the last scan that the tracker processed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,12 +38,12 @@ from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.kinds import JudgedRuns, KindJudge
 from fuselog.replay.judging.metrics.measuring import Metric
 
-# Greatest burn-in as a share of the run: in short runs, tracks have less time to begin.
+# Greatest burn-in as a share of the run; in short runs, tracks have less time to begin.
 BURN_IN_SHARE = 0.25
 
 
 class TrackBlock(NamedTuple):
-    """A block of a tracker's sets of tracks: their sizes, the tracks, and each run's targets."""
+    """Block of the sets of tracks of a tracker: sizes, tracks, and targets of each run."""
 
     estimator: str
     case: str
@@ -54,7 +54,7 @@ class TrackBlock(NamedTuple):
 
 
 def targets_of(source: Source, frame: str) -> Judged | None:
-    """Return a run's targets in a frame at its instants, NaN where absent; None if there are no targets.
+    """Return the targets of a run in a frame at its instants, NaN when absent; None without targets.
 
     Instants are PERIOD_S apart, from BURN_IN_S after the epoch to the end of the last truth.
     """
@@ -75,7 +75,7 @@ def targets_of(source: Source, frame: str) -> Judged | None:
 
 
 def unjudged_tracks(tracks: Stream, sources: Sequence[Source]) -> str:
-    """Explain why tracks cannot be compared with the targets of some run; return "" if they can."""
+    """Explain why tracks cannot be compared with the targets of a run; return "" if they can."""
     reasons = (
         not_comparable(tracks.metadata, target_topics(source.topics), source.topics)
         for source in sources
@@ -94,9 +94,9 @@ def _places(truth: Stream, at_ns: Integers) -> Floats:
 def track_blocks(
     outputs: Mapping[str, Ragged], targets: Mapping[str, Sequence[Judged | None]], first_run: int
 ) -> dict[str, TrackBlock]:
-    """Collect the sets of tracks among a replay's outputs or a block of them, by topic of the tracks.
+    """Collect the sets of tracks in the outputs of a replay, or in a block of them, by topic.
 
-    `targets` are those of the runs, by frame; tracks in other frames are left out.
+    `targets` has the targets of the runs, by frame; tracks in other frames are left out.
     """
     found = {}
     for topic, tracks in outputs.items():
@@ -110,7 +110,7 @@ def track_blocks(
 
 
 class TracksJudge(KindJudge):
-    """Judge for sets of tracks, which reads the targets of each run once for every frame."""
+    """Judge for sets of tracks; it reads the targets of each run once per frame."""
 
     def __init__(self, runs: JudgedRuns) -> None:
         super().__init__(runs)
@@ -125,7 +125,7 @@ class TracksJudge(KindJudge):
         return [*track_blocks(outputs, self._targets, self.runs.first_run).items()]
 
     def _find_targets(self, topic: str, tracks: Stream) -> None:
-        """Find the targets for new tracks, and whether the tracks can be judged."""
+        """Find the targets for new tracks, and check that the tracks can be judged."""
         self.unjudged[topic] = unjudged_tracks(tracks, self.runs.sources)
         frame = frame_of(tracks.metadata)
         if self.unjudged[topic] or frame in self._targets:
@@ -173,7 +173,7 @@ class Followed:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Return figures of the tracks at the instants so far; {} without tracks or targets."""
+        """Compute figures of the tracks at the instants so far; {} without tracks or targets."""
         begin = self.first or 0
         truths = self.targets.truths[:, begin : begin + len(self.sets)]
         if not self.sets or not np.isfinite(truths).any():
@@ -194,7 +194,7 @@ class Followed:
         }
 
 
-# State of a run: its tracks while more may follow, then only their figures.
+# State of a run: its tracks while more may follow, afterwards only their figures.
 State = dict[int, Followed | dict[str, float]]
 
 
@@ -216,7 +216,7 @@ def _figures(state: State) -> dict[int, dict[str, float]]:
 
 
 def _finish(state: State) -> dict[str, float]:
-    """Return the means of the figures over the runs in which they are known."""
+    """Compute the means of the figures over the runs for which they are known."""
     runs = [figures for figures in _figures(state).values() if figures]
     found = {}
     for name in dict.fromkeys(name for figures in runs for name in figures):

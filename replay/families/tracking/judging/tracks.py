@@ -1,7 +1,7 @@
-"""Comparison of tracks with targets by reports: the share of a target's reports in one track.
+"""Evaluation of tracks by the share of each target's reports that are in one track.
 
-Tracks are assigned to targets one to one, so that the greatest number of reports is in the track of
-their target. A track that contains two targets counts for one of them.
+Tracks are assigned to targets one to one, such that as many reports as possible are in the track of
+their target. A track that contains two targets counts for only one of them.
 """
 
 import operator
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 Integers = NDArray[np.int64]
 IDENTITY = "identity"
-# Only targets with more reports are judged, because a few reports say little about a track.
+# Only targets with more reports are judged, because a few reports are too little evidence.
 MANY_REPORTS = 50
-# Share of its reports from which on a target has kept its track.
+# A target has kept its track if at least this share of its reports is in the track.
 KEPT_SHARE = 0.95
 
 
 class KeptTracks(NamedTuple):
-    """Number of judged targets, share of them that kept a track, and mean share of reports in it."""
+    """Number of judged targets, share of targets that kept a track, and mean share of reports in it."""
 
     targets: int
     kept_share: float
@@ -36,10 +36,10 @@ class KeptTracks(NamedTuple):
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
     """Make a table with one row per target of reports, most reports first.
 
-    Columns: target; reports, their number; track, its own, -1 if it has none; share of its reports in
-    that track; largest_share in any track; tracks, the number of tracks with a report of it; switches,
-    the number of successive reports in different tracks; others, the number of reports of other targets
-    in its track.
+    The columns are `target`; `reports`, the number of its reports; `track`, its own track, or -1;
+    `share`, the share of its reports in that track; `largest_share`, the largest share in any track;
+    `tracks`, the number of tracks with one of its reports; `switches`, the number of successive reports
+    in different tracks; `others`, the number of reports of other targets in its track.
 
     Args:
         targets, tracks: (n,), the numbers of target and track of every report, in order of time.
@@ -75,7 +75,7 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
 
 
 def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> KeptTracks:
-    """Summarise how the targets with more than `reports` reports kept their tracks."""
+    """Summarise the shares of reports for targets with more than `reports` reports."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
         return KeptTracks(0, np.nan, np.nan)
@@ -83,12 +83,12 @@ def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPOR
 
 
 def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:
-    """Count the senders heard within the last `live_s`: times (m,) of changes, counts (m,).
+    """Count the senders heard within the last `live_s`; return times (m,) of changes and counts (m,).
 
     Args:
         time_ns: (n,), sorted.
         numbers: (n,), number of the sender.
-        live_s: time for which a sender counts after it was heard.
+        live_s: time for which a sender counts after its last report, in s.
     """
     order = np.lexsort((time_ns, numbers))
     sorted_ns, sorted_numbers = time_ns[order], numbers[order]
@@ -106,9 +106,9 @@ Reports = dict[int, list[tuple[Integers, Integers]]]
 
 
 def reports_of(output: Output) -> Reports:
-    """Return every run's true targets and tracks (n,) of its reports; {} if identities are unknown.
+    """Return the true targets and the tracks (n,) of each run's reports; {} if identities are unknown.
 
-    The rows of the stream correspond to the reports in the replayed span, and so to the identities.
+    The rows of the stream correspond to the reports in the replayed span and thus to the identities.
     Raises BadInput if the estimates do not belong to the log.
     """
     stream = output.rows.stream
