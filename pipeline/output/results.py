@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# Longer tables are written only as Parquet, because nobody reads them as text.
+# Longer tables are written only as Parquet, because they are too long to read as text.
 CSV_ROWS = 20_000
 # Increased when result.json changes incompatibly; a file without it has format 1.
 FORMAT = 1
