@@ -1,4 +1,4 @@
-"""Alterations of a run's topics at the source of any replay, to correct a fault or to plant one.
+"""Alterations of a run's topics, which correct a fault or plant one before any replay.
 
 Begin with `sources`.
 """

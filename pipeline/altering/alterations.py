@@ -1,7 +1,7 @@
-"""Alterations that plant faults in streams or correct them; each is a function of streams and a number.
+"""Alterations that plant or correct faults in streams; each is a function of streams and a number.
 
-The opposite number corrects a fault, except for lost data. The same functions thus define the faults
-that a diagnosis assumes and those that the experiment plants in logs.
+Except for lost data, the opposite number corrects a fault. Therefore the same functions define the
+faults that a diagnosis assumes and those that the experiment plants in logs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,7 +41,7 @@ def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.
 
     Args:
         field: a field of n messages.
-        entry: an entry of a vector; None stands for the whole vector.
+        entry: an entry of a vector; None means the whole vector.
         stream: the messages.
         by: in the field's unit: one number, or (n,), one per message.
 
@@ -84,7 +84,7 @@ def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]
 
 
 def spread(field: str) -> Alteration:
-    """Multiply a covariance so that standard deviations become e^value times as large."""
+    """Multiply a covariance by e^(2 value), and standard deviations thus by e^value."""
     return partial(_spread, field)
 
 
@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Reorder the entries of a vector and of its covariance; the number of the alteration is ignored."""
+    """Reorder the entries of a vector and of its covariance; the alteration's number is ignored."""
     return partial(_permuted, field, tuple(order))
 
 
@@ -168,11 +168,11 @@ def _permuted(field: str, order: tuple[int, ...], stream: Stream, _: float) -> S
 
 
 def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream:
-    """Rotate the orientations of a stream, or those of Gaussian estimates, about the vertical.
+    """Rotate orientations, or the orientations in Gaussian estimates, about the vertical.
 
     Args:
         stream: n messages with a quaternion, or with means that contain one.
-        angle: in rad, anticlockwise seen from above: one, or (n,), one per message.
+        angle: rotation in rad, anticlockwise seen from above: one number, or (n,), one per message.
 
     Returns:
         The altered stream.
@@ -188,12 +188,12 @@ def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream
 
 
 def heading_multiplied(stream: Stream, factor: float) -> Stream:
-    """Multiply the headings of orientations; all other rotation stays."""
+    """Multiply the headings of orientations, without changing roll and pitch."""
     return heading_turned(stream, (factor - 1.0) * heading(stream["quaternion"]))
 
 
 def heading_ramped(first_ns: int) -> Alteration:
-    """Let orientations rotate about the vertical at a constant rate from the start of the run."""
+    """Make an alteration that rotates orientations about the vertical at a constant rate."""
     return lambda stream, rate: heading_turned(stream, rate * _since_s(stream, first_ns))
 
 
@@ -203,7 +203,7 @@ def heading_from_north(stream: Stream, _: float) -> Stream:
 
 
 def spread_stated(name: str) -> Alteration:
-    """Multiply a channel's variances so that standard deviations become e^value times as large."""
+    """Make an alteration that multiplies a channel's standard deviations by e^value."""
     return partial(_spread_stated, name)
 
 
@@ -213,7 +213,7 @@ def _spread_stated(name: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def spread_variances(stated: str, factor: float) -> str:
-    """Multiply variances in a channel's text."""
+    """Multiply the variances in a channel's text by a factor."""
     return ",".join(repr(float(each) * factor) for each in stated.split(","))
 
 
@@ -238,7 +238,7 @@ def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
 
 
 def thinned(seed: int) -> Alteration:
-    """Drop a random share of the stamps with all their messages."""
+    """Make an alteration that drops a random share of the stamps with all their messages."""
     return partial(_thinned, seed)
 
 
@@ -249,7 +249,7 @@ def _thinned(seed: int, stream: Stream, share: float) -> Stream:
 
 
 def strayed(seed: int, field: str) -> Alteration:
-    """Move a random share of a vector's messages by up to STRAY in every entry."""
+    """Make an alteration that moves a random share of a vector's messages, each entry by up to STRAY."""
     return partial(_strayed, seed, field)
 
 

@@ -1,4 +1,4 @@
-"""The parser of `--set /TOPIC.WHAT=VALUE`: which alteration, of which field, by how much."""
+"""Parser of `--set /TOPIC.WHAT=VALUE`, which alters the topics of a run."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ ENDINGS = ("scale", "bias", "drift", "axes", "matrix", "turn")  # endings of alt
 STATED_ENTRIES = ("mean", "state", "value")  # vectors whose entries are named by the channel
 STATED = "covariance_rad2"  # variances that a channel of orientations states
 ALL_TOPICS = "/*"
-# Alterations of a topic with their meanings; each corrects a fault and takes its number.
+# Alterations of a topic with their meanings; each corrects the fault that its number describes.
 WHATS = {
     "delay_s": "The delay of the stamps, which is subtracted; messages that would be before 1970 "
     "are left out.",
@@ -66,7 +66,7 @@ class _Setting(NamedTuple):
         return BadInput(f"--set {self.key}={self.value}: expected {expected}")
 
     def number(self, name: str, example: str) -> float:
-        """Parse the value in the unit that `name` ends with, or in its own unit, such as `300 ms`."""
+        """Parse the value, which may have a unit such as `300 ms`; otherwise it is in that of `name`."""
         found = _NUMBER.fullmatch(str(self.value))
         if isinstance(self.value, bool) or found is None:
             raise self.refused(example)
@@ -80,7 +80,7 @@ class _Setting(NamedTuple):
         return number
 
     def several(self, counts: Sequence[int], example: str) -> list[str]:
-        """Parse the value as a list, which may be text with commas."""
+        """Parse the value as a list; it may also be text with commas."""
         is_list = isinstance(self.value, list | tuple)
         parts = list(self.value) if is_list else str(self.value).strip("[] ").split(",")
         if len(parts) not in counts:
@@ -94,11 +94,11 @@ class Change:
 
     Attributes:
         topic: its name.
-        stored: the topic of the log from which it is read: the other one for swapped topics.
-        first_ns: the start of the run, from which a clock drifts.
+        stored: the topic of the log from which it is read, which differs if topics are swapped.
+        first_ns: the start of the run, at which the drift of a clock begins.
         columns: alterations of its columns, in their order.
         metadata: metadata in addition to those in the log.
-        gain, delay_ns: its stamps lose `delay_ns`, and what a clock has gained since `first_ns`.
+        gain, delay_ns: the gain of the clock since `first_ns`, and the delay; both are subtracted.
     """
 
     topic: str
@@ -111,7 +111,7 @@ class Change:
 
     @property
     def is_moving(self) -> bool:
-        """Test whether its stamps move."""
+        """Test whether the change affects its stamps."""
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -120,18 +120,18 @@ class Change:
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
     def before(self, stamp_ns: int) -> int:
-        """Return the stamp that is moved to this one, up to rounding."""
+        """Return the stamp from which a corrected stamp was computed, up to rounding."""
         since_ns = (stamp_ns - self.first_ns + self.delay_ns) * alter.pace(self.gain)
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
-        """Return the altered topic for the stored one."""
+        """Return the altered topic for a stored topic."""
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
         """Alter the messages of the stored topic.
 
-        Messages that would be before 1970 are left out, because no log has such stamps.
+        Messages that would be before 1970 are omitted, because logs have no such stamps.
         """
         metadata = {**stream.metadata, **self.metadata}
         stream = replace(stream, topic=self.topic, metadata=metadata)
@@ -144,14 +144,14 @@ class Change:
 
 
 def is_of_topic(key: str) -> bool:
-    """Test whether a setting belongs to a topic, in contrast to an estimator or experiment."""
+    """Test whether a setting belongs to a topic, not to an estimator or experiment."""
     return key.startswith("/")
 
 
 def is_parameter(key: str) -> bool:
     """Test whether a setting of a topic is a parameter of its sensor, not an alteration of the log.
 
-    No name is both: parameters of sensors are never named like a field of their messages with an ending.
+    Parameters of sensors are never named like a field of their messages with such a suffix.
     """
     _, dot, what = key.rpartition(".")
     if not (is_of_topic(key) and dot) or what in (*WHATS, "delay"):
@@ -160,7 +160,7 @@ def is_parameter(key: str) -> bool:
 
 
 def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Move the parameters of topics into tables: `/TOPIC.NAME` into that of `/TOPIC`."""
+    """Move the parameters of topics to tables: `/TOPIC.NAME` to the table `/TOPIC`."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         found = merge(found, nested(key, value) if is_parameter(key) else {key: value})
@@ -193,7 +193,7 @@ def bare(name: str) -> str:
 
 
 def names_in(stream: Stream, field_: str) -> list[str]:
-    """Name a vector's entries: by the channel, or `position_x_m` and so on for `position_m`."""
+    """Name a vector's entries as its channel does, or `position_x_m` and so on for `position_m`."""
     if field_ in STATED_ENTRIES and stream.components:
         return stream.components
     stem = bare(field_)
@@ -201,12 +201,11 @@ def names_in(stream: Stream, field_: str) -> list[str]:
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
-    """Find the alterations that settings of topics make in a run, by topic, in the order of settings.
+    """Parse settings of topics into changes of a run, by topic, in the order of the settings.
 
-    `WHATS` lists the possible settings. A field is given by its full name, without its unit, or by the
-    beginning of its name if that is unambiguous; an entry of a vector with its axis, such as
-    `position_x_bias`; an entry of a state by its component. A number may have a unit, such as `300 ms`
-    or `4.5 deg`.
+    `WHATS` lists the possible settings. Fields are given by their full name without the unit, or by an
+    unambiguous prefix of it, entries of vectors with their axis, such as `position_x_bias`, and entries
+    of states by their component. A number may have a unit, such as `300 ms` or `4.5 deg`.
 
     Raises BadInput if the topic or field does not exist, or if a value is invalid.
     """
@@ -235,7 +234,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield settings of single topics; a setting of all topics is repeated for each one it concerns."""
+    """Yield settings of single topics; repeat a setting of all topics for each that it concerns."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:
@@ -352,7 +351,7 @@ def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:
 
 
 def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
-    """Find the field, or entry of one, that a name means; raises BadInput if there is none."""
+    """Find the field or entry that a name denotes; raise BadInput if there is none."""
     fields: dict[str, tuple[str, int | None]] = {}
     for each in given.empty.schema:
         if each.kind not in ("real", "vector") or each.name not in given.empty.columns:

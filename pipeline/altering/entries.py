@@ -1,4 +1,4 @@
-"""The numbers in a topic's messages that an estimator reads."""
+"""The numbers in a topic's messages that an estimator uses."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,17 +10,17 @@ from fuselog.pipeline.altering.changes import AXES, names_in
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Reading
 
-PROBED = 64  # messages with which this is determined
+PROBED = 64  # number of messages with which they are determined
 
 
 class Entry(NamedTuple):
-    """A number in a topic's messages that is read.
+    """A number in a topic's messages that an estimator uses.
 
     Attributes:
-        field, place: its field, and its index there; a heading belongs to the field `quaternion`.
-        name: its name in a setting, with its unit.
+        field, place: its field, and its index in the field; a heading belongs to the field `quaternion`.
+        name: its name in a setting, with the unit.
         is_angle: whether it is a measured angle.
-        number: its index among the numbers that are read; None if it affects several.
+        number: its index among the numbers that the reading returns; None if it affects several.
         varies: its standard deviation over the log.
     """
 
@@ -33,12 +33,12 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Test whether it is the heading of orientations."""
+        """Test whether the number is the heading of orientations."""
         return self.field == "quaternion"
 
 
 def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
-    """List the numbers of a topic that are read: those whose change changes what is read.
+    """List the numbers of a topic that an estimator uses, because they change its readings.
 
     If the reading is unknown, all numbers are listed, with the entries of positions and velocities.
     """
@@ -70,7 +70,7 @@ def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
 
 
 def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
-    """Yield the numbers of a topic, except covariances and orientations."""
+    """Yield the numbers of a topic except covariances and orientations."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or entry.name.startswith(("covariance", "quaternion")):
@@ -83,7 +83,7 @@ def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
 
 
 def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
-    """List which of the numbers that are read change."""
+    """List the readings that change."""
     same = np.isclose(
         reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
     )

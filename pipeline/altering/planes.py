@@ -1,4 +1,4 @@
-"""The conversion of a run whose positions are in several tangent planes to one plane."""
+"""Conversion of a run with positions in several local tangent planes to a single plane."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,16 +14,16 @@ from fuselog.replay.engine.streams.planes import into_plane_of
 def in_one_plane(
     name: str, topics: Mapping[str, Topic], changes: Mapping[str, Change]
 ) -> dict[str, Change]:
-    """Add to the changes of topics those that move all of them into one tangent plane.
+    """Extend the changes of topics so that all positions are in one local tangent plane.
 
-    This is the plane of the truth, so that estimates are in its coordinates, or that of the first topic.
+    The plane is that of the truth, because errors are computed in it, or that of the first topic.
 
     Args:
         name: the run's name.
-        topics: the topics as the run states them.
-        changes: other alterations, by topic, which come first.
+        topics: the topics as stored in the run.
+        changes: other alterations, by topic, which are applied first.
 
-    Raises BadInput if planes differ and a topic with positions does not state which plane is its own.
+    Raises BadInput if planes differ and a topic with positions does not state its local tangent plane.
     """
     stating = {
         topic: changes[topic].stated(topics[changes[topic].stored]) if topic in changes else own

@@ -1,7 +1,7 @@
-"""Runs with altered topics, such as `--set /fix.delay_s=0.3`; files stay as they are.
+"""Runs with altered topics, such as `--set /fix.delay_s=0.3`; the log files are not changed.
 
-A log is altered block by block. A topic whose stamps move is read separately and merged with the others
-by its new stamps: memory holds a block of each, however far the stamps move.
+A log is altered block by block. A topic whose stamps change is read separately and merged with the
+others by its new stamps. Memory holds one block of each, even if the stamps change by hours.
 """
 
 import json
@@ -31,7 +31,7 @@ def alter(source: MemorySource, settings: Settings) -> MemorySource: ...
 @overload
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource: ...
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
-    """Alter the topics of a run; alterations are added to those that it already has.
+    """Alter the topics of a run, in addition to the alterations that it already has.
 
     If its topics state different tangent planes, they are converted to one; see `in_one_plane`.
 
@@ -65,7 +65,7 @@ def alter_all(
 ) -> list[LogSource | MemorySource]:
     """Alter the topics of runs; messages left out because they would be before 1970 are logged.
 
-    Raises BadInput as `alter`.
+    Raises BadInput in the same cases as `alter`.
     """
     made = [alter(source, settings) for source in sources]
     for source in made:
@@ -109,7 +109,7 @@ def setting_of(source: Source) -> dict[str, dict[str, Any]]:
 
 
 def stated_alterations(estimates: Source) -> dict[str, Any]:
-    """Return the alterations of an estimates log's run; raises BadInput if they cannot be read."""
+    """Return the alterations of an estimates log's run; raise BadInput if they cannot be read."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get(NOTE, "{}"))
@@ -123,7 +123,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split settings into alterations of topics, and parameters, which may belong to single topics.
+    """Split settings into alterations of topics, and parameters, which may belong to one topic.
 
     >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1, "/fix.lever_x_m": 0.4})
     ({'/fix.delay_s': 0.3}, {'gate_probability': 1, '/fix': {'lever_x_m': 0.4}})
@@ -198,7 +198,7 @@ class AlteredLog(LogSource):
         }
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return a span in ns that contains all stamps of a clock, before and after alteration."""
+        """Return a span in ns that contains all stamps of a clock, before and after the alteration."""
         ends = np.array(super().extent(clock))
         moved = [ends, *(each.moved(ends) for each in self.changes.values() if clock == "publish_time")]
         return max(0, int(np.min(moved))), int(np.max(moved))
@@ -213,7 +213,7 @@ class AlteredLog(LogSource):
         return replace(stream, topic=topic, metadata=self.topics[topic].metadata)
 
     def whole(self) -> "AlteredLog":
-        """Return the source over the whole log."""
+        """Return the source without its limits in time."""
         return replace(self, start_ns=None, end_ns=None)
 
     def blocks(
@@ -244,7 +244,7 @@ class AlteredLog(LogSource):
         return found
 
     def _moved_blocks(self, topic: str, block_messages: int) -> Iterator[dict[str, Stream]]:
-        """Yield blocks of a topic whose stamps move."""
+        """Yield blocks of a topic whose stamps change."""
         change = self.changes[topic]
         start_ns, end_ns = (
             None if at_ns is None else max(0, change.before(at_ns) + slack_ns)
@@ -265,7 +265,7 @@ class AlteredLog(LogSource):
 def in_turn(parts: Iterable[Iterator[dict[str, Stream]]], order: Clock) -> Iterator[dict[str, Stream]]:
     """Merge the blocks of several topics, each ordered by time, into one ordered sequence.
 
-    Messages are yielded only up to the time that every part has reached.
+    Messages are yielded only up to the time that every topic has reached.
     """
     running, waiting = dict(enumerate(parts)), dict[int, dict[str, Stream]]()
     while running or waiting:

@@ -1,1 +1,1 @@
-"""The Python interface behind `import fuselog` and the commands; begin with `replays` and `api`."""
+"""The Python functions of `import fuselog` and of the commands; begin with `replays` and `api`."""

@@ -1,7 +1,7 @@
-"""Python functions for what the commands do: logs, recordings, experiments, lists.
+"""Python functions for logs, recordings, experiments and lists, which do the same as the commands.
 
-All of them raise BadInput with the same messages as the commands. docs/python.md shows how to use them;
-the replay is in `fuselog.pipeline.api.replays`.
+All functions raise BadInput with the same messages as the commands. docs/python.md shows how to use
+them. The replay is in `fuselog.pipeline.api.replays`.
 """
 
 from collections import Counter
@@ -43,13 +43,13 @@ from fuselog.replay.foreign.naming import allowed
 
 @without_warnings_of_numbers()
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
-    """Record a run of a scenario in memory; it can be read and replayed like a log, and written.
+    """Record a run of a scenario in memory; it can be replayed and read like a log, and written to one.
 
     Args:
         scenario: a name from `scenarios`, or a TOML file.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         run: number of the run; scenario, parameters, seed and run determine the streams.
-        parameters: values that differ from the scenario's defaults.
+        parameters: values of parameters that differ from the scenario's defaults.
 
     Returns:
         The recording, which maps every topic to its stream.
@@ -65,24 +65,24 @@ def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters
 
 @without_warnings_of_numbers()
 def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySource:
-    """Import real data, in the layout of their publishers, into memory.
+    """Import real data, in the format in which they were published, into memory.
 
     Args:
         importer: a registered name, such as "mrclam"; `fuselog scenarios` lists them.
         path: the file or folder to read.
-        parameters: of the importer.
+        parameters: parameters of the importer.
 
     Returns:
         The recording, which can be read and replayed like a log.
 
-    Raises BadInput for an unknown importer or parameter, or data that it cannot read.
+    Raises BadInput for an unknown importer or parameter, or if the importer cannot read the data.
     """
     return memory_source(*import_run(importer, Path(path), parameters))
 
 
 @without_warnings_of_numbers()
 def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
-    """Write a recording, or streams of your own, as a log; the file appears only when it is complete.
+    """Write a recording or your own streams as a log; the file appears only when it is complete.
 
     Args:
         path: the MCAP file; an existing log that fuselog wrote is replaced.
@@ -131,7 +131,7 @@ class ResultFolder(Showing):
 
     @property
     def claims(self) -> pd.DataFrame:
-        """Return a table with a row per claim: the statement, our measurement, the verdict, and why."""
+        """Return a table with a row per claim: statement, our measurement, verdict and reason."""
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property
@@ -175,13 +175,12 @@ def run(
         executor: any other executor whose workers can read this machine's files.
         set: entries of the experiment, parameters of its scenario, or of its estimators by label:
             `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
-        progress: wraps iterables to report progress.
+        progress: function that wraps iterables to report progress.
 
     Returns:
         The result folder, with metrics, claims and tables.
 
-    Raises BadInput if the experiment cannot be run, or the folder contains something other than a
-    result.
+    Raises BadInput if the experiment cannot be run, or if the folder exists and is not a result.
     """
     stated = _stated(experiment)
     found = stated.with_settings(allowed(set or {}), _given(runs=runs, seed=seed))
@@ -226,7 +225,7 @@ def sweep(
     Args:
         experiment: a name from `experiments`, a TOML file, or an experiment that was read.
         over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`; or
-            ranges from `parse_over`.
+            ranges, as returned by `parse_over`.
         runs: number of runs at each point; by default the experiment's.
         seed: by default the experiment's.
         samples: number of points to sample instead of using the whole grid.
@@ -241,8 +240,7 @@ def sweep(
     Returns:
         The result folder, whose table `sweep` has a row per point, estimator and metric.
 
-    Raises BadInput if the experiment cannot be run, or the folder contains something other than a
-    result.
+    Raises BadInput if the experiment cannot be run, or if the folder exists and is not a result.
     """
     stated, given = _stated(experiment), _given(runs=runs, seed=seed)
     own = allowed(set or {})
@@ -278,7 +276,7 @@ def _pool(
     executor: Executor | None,
     experiments: Sequence[Experiment],
 ) -> PoolFactory:
-    """Choose the workers for experiments; with a scheduler, the default of one process is ignored."""
+    """Choose the workers for experiments; with a scheduler, ignore the default of one process."""
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)
@@ -286,7 +284,7 @@ def _pool(
 
 
 class Catalog(Mapping[str, Entry]):
-    """All entries of a kind by name; an unknown name raises `UnknownName` with similar names."""
+    """All entries of a kind by name; for an unknown name, `UnknownName` suggests similar ones."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind

@@ -1,6 +1,6 @@
-"""Answers to `--set NAME=?`: a parameter's meaning, unit, accepted values and default.
+"""Answers to `--set NAME=?`, which prints a parameter's meaning, unit, accepted values and default.
 
-Every command states what its settings are for by a key of `TAKERS`.
+Every command states which objects its settings belong to, with a key of `TAKERS`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,16 +27,16 @@ from fuselog.replay.inference.estimators import registered_models
 from fuselog.replay.inference.observability import OBSERVABILITY
 
 ASKED, OF_MODEL = "=?", " of "
-Entries = Sequence[Entry]  # entries that receive the same settings
+Entries = Sequence[Entry]  # estimators, topics or scenarios with the same settings
 
 
 def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) -> None:
-    """Print the meaning of the parameters that `NAME=?` asks for; raises BadInput for an unknown name.
+    """Print the meaning of the parameters in `NAME=?` texts; raise BadInput for an unknown name.
 
     Args:
         texts: the settings; those that are not questions are skipped.
         takes: a key of `TAKERS`.
-        options: the command's.
+        options: the options of the command.
     """
     names = [text.removesuffix(ASKED).strip() for text in texts if text.endswith(ASKED)]
     altering = [name for name in names if is_of_topic(name) and not is_parameter(name)]
@@ -52,9 +52,9 @@ def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> d
     """Find the parameters whose names begin with a text, with the meaning of each, for completion.
 
     Args:
-        begin: the beginning of a name.
+        begin: the first letters of a name.
         takes: a key of `TAKERS`.
-        options: those of the command that are known.
+        options: the options of the command that have been parsed so far.
     """
     found: dict[str, str] = {}
     with suppress(BadInput, OSError):
@@ -92,12 +92,12 @@ def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
 
 
 def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
-    """Name the owners of a parameter; models are left out if it is the same for all of them."""
+    """Name the owners of a parameter, without their models if it is the same for all of them."""
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
 def _recorder(options: Mapping[str, Any]) -> Iterator[Entries]:
-    """Yield the parameters of a scenario, of a log to record again, or of data to import."""
+    """Yield the parameters of a scenario, of a log to record again, or of an importer."""
     name, values = options.get("source"), dict[str, Any]()
     if name is None and options["again"] is not None:
         run = open_log(options["again"]).run
@@ -134,7 +134,7 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
 def _by_label(
     estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
 ) -> Iterator[Entries]:
-    """Yield estimators by label: first for settings with a label as prefix, then for all."""
+    """Yield estimators by label, first for settings with a label as prefix, then for all."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
         yield [replace(entry, prefix=f"{label}.") for entry in entries]

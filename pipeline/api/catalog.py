@@ -1,4 +1,4 @@
-"""Details of scenarios, estimators, models, metrics and experiments."""
+"""Descriptions of scenarios, estimators, models, metrics and experiments."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -30,10 +30,10 @@ from fuselog.replay.judging.metrics.measuring import Metric
 
 @dataclass(frozen=True, repr=False)
 class Entry:
-    """One thing to choose: a line of description, further facts, its parameters, and values it sets.
+    """The description of a scenario, estimator, model, metric or experiment, with its parameters.
 
-    `stated` are the parameters that a log's channels state if they are not set; `prefix` precedes the
-    names of all parameters when they are set.
+    `stated` contains the parameters that are read from a log's channels unless they are set. `prefix` is
+    prepended to the names of parameters when they are set.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Entry:
 
 
 PARAMETER_COLUMNS = ("parameter", "default", "unit", "accepts", "meaning")
-Entries = dict[str, Callable[[], Entry]]  # by name; each entry is made on demand
+Entries = dict[str, Callable[[], Entry]]  # functions that make the entries, by name
 
 
 def scenarios() -> Entries:
@@ -113,7 +113,7 @@ def show(kind: str, name: str | None, *, as_json: bool) -> None:
 
 
 def methods() -> dict[str, dict[str, str]]:
-    """Report which methods can estimate each model, or what the model lacks for them."""
+    """Find the methods that can estimate each model, or what the model lacks for them."""
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
@@ -129,7 +129,7 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
 
 
 def _methods_of(model: Model) -> dict[str, str]:
-    """Report "yes" for every method, or what the model lacks for it."""
+    """Return "yes" for every method that can estimate the model, or what the model lacks for it."""
     lacking = {name: method.lacks(model) for name, method in METHODS.items()}
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
@@ -149,7 +149,7 @@ def _files(kind: str, described: Callable[[str, Path], Entry]) -> Entries:
 
 
 def entry_or_why(name: str, make: Callable[[], Entry]) -> Entry:
-    """Make an entry; if it does not load, make one with the error message."""
+    """Make an entry; if its module cannot be loaded, make one with the error message."""
     try:
         return make()
     except BadInput as error:
@@ -198,7 +198,7 @@ def _model(name: str, model: Model) -> Entry:
 
 
 def stated_of(model: Model) -> set[str]:
-    """Return the parameters of a model that a log's channels state if they are not set."""
+    """Return the parameters of a model that are read from a log's channels unless they are set."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
     return own & {*number_fields(model.parameters)}
 

@@ -1,4 +1,4 @@
-"""Judgement of estimates logs against the truth of their source logs, as in `fuselog evaluate`."""
+"""Evaluation of estimates logs against the truth in their source logs, as in `fuselog evaluate`."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -32,11 +32,11 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 
 @dataclass(frozen=True)
 class JudgedLogs:
-    """Estimates logs that were judged against the truth.
+    """Estimates logs that were compared with the truth.
 
     Attributes:
         sources: the estimates logs, then the logs with the truth.
-        estimators: settings by label, as the first estimates log states them.
+        estimators: settings by label, from the first estimates log.
         judge: of all runs.
         compared: the estimates as trajectories, if they are compared.
         coverage: how many messages of every topic were used.
@@ -60,13 +60,13 @@ def judge_estimates(
     recover: bool = False,
     gap_limit_s: float = 0.2,
 ) -> JudgedLogs:
-    """Judge estimates logs, one run each.
+    """Compare estimates logs with the truth, where each log is one run.
 
     Args:
         estimates: the estimates logs.
-        logs: the logs with the truth; by default those that the estimates were replayed from.
-        comparison: entries of a `Comparison`, if any: positions are then also compared as trajectories,
-            and estimates are judged after alignment with the truth.
+        logs: the logs with the truth; by default those from which the estimates were replayed.
+        comparison: entries of a `Comparison`. If given, positions are also compared as trajectories, and
+            estimates are judged after alignment with the truth.
         out: a result folder to write.
         metrics: their names; all if empty.
         errors: whether the folder keeps all individual errors.
@@ -131,7 +131,7 @@ def judge_estimates(
 
 
 def _opened(path: Path, *, recover: bool) -> LogSource:
-    """Open an estimates log; raises BadInput if the file is not one."""
+    """Open an estimates log; raise BadInput if the file is not one."""
     try:
         log = open_log(path, recover=recover)
     except NotMcap as error:

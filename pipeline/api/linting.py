@@ -1,4 +1,4 @@
-"""Check of a log as it is written, before any filter."""
+"""Checks of a log for errors before any filter is run."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,15 +17,14 @@ NOTHING = "nothing found by looking at the log alone"
 
 
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
-    """Find what is wrong with a log as it is written, the worst first and hints last.
+    """List the errors in a log, the worst first and hints last.
 
     Args:
         log: a path, a log or a recording.
-        set: changes of topics to check with, such as {"/imu.delay_s": 0.1}.
+        set: changes of topics for the check, such as {"/imu.delay_s": 0.1}.
 
     Returns:
-        The findings, each with its topic, the evidence in a sentence, and what to do; empty if nothing
-        is wrong.
+        The findings, each with its topic, the evidence and a remedy; empty if nothing is wrong.
 
     Raises BadInput if the log cannot be read or changed in this way.
 
@@ -38,7 +37,7 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
 
 
 def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
-    """Print the findings of a log; returns whether all of them are hints."""
+    """Print the findings of a log; return whether all of them are hints."""
     alterations, others = split_texts(settings)
     if others:
         raise BadInput(

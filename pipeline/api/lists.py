@@ -1,7 +1,7 @@
-"""Lists of what there is to choose from, without importing it.
+"""Lists of names that can be chosen, read without importing the modules that define them.
 
 The descriptions of our modules and files are stored in `data/lists.json`, which `python -m tests.lists`
-writes and a test compares. If another package registers a name, everything is imported instead.
+writes and a test checks. If another package registers a name, everything is imported instead.
 """
 
 import json
@@ -16,7 +16,7 @@ from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.registry import available
 
 KEPT = SHIPPED / "lists.json"
-# The entry-point group of each list; scenarios and experiments are also files.
+# The entry-point group of each list; scenarios and experiments may also be files.
 GROUPS = {
     "scenarios": "recorders",
     "estimators": "estimators",
@@ -77,7 +77,7 @@ def by_family(kind: str) -> Iterator[tuple[str, str]]:
 
 
 def listed(kind: str) -> dict[str, Any]:
-    """Return the description of each name; for the methods, their answers by model."""
+    """Return the description of each name; for methods, whether they can estimate each model."""
     kept, places = json.loads(KEPT.read_text(encoding="utf-8"))[kind], places_of(kind)
     if kept.keys() >= {*places.values()}:
         return {name: kept[place] for name, place in places.items()}
@@ -100,6 +100,6 @@ def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
 
 
 def places_of(kind: str) -> dict[str, str]:
-    """Return the origin of each name: its entry point, or a file of that name."""
+    """Return the origin of each name: its entry point, or the file with that name."""
     registered = available(GROUPS[kind]).items()
     return {name: entry.value for name, entry in registered} | {name: name for name in shipped(kind)}

@@ -1,4 +1,4 @@
-"""Observability of logs: a table for Python, which the command prints."""
+"""Observability of logs, as a table in Python and as the output of the command."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -48,7 +48,7 @@ def observability(
         eigenvalues of the local Gramian in ascending order, the unit direction of the smallest one in
         state units, and its meaning in words.
 
-    Raises BadInput if no model fits, or nothing is measured.
+    Raises BadInput if no model fits, or if the sensors of the model have no measurements.
 
     >>> from fuselog.pipeline.api.api import record
     >>> table = observability(record("landmarks", duration_s=2.0), window_s=1.0)

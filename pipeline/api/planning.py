@@ -1,4 +1,4 @@
-"""Plans of replays (logs, estimators, spans, starts, order), for Python and for the commands.
+"""Plans of replays (logs, estimators, spans, initial states, order), for Python and the commands.
 
 Planning imports nothing slow, so `fuselog replay` starts quickly.
 """
@@ -42,7 +42,7 @@ class Plan:
     Attributes:
         sources: the spans of the runs.
         estimators: settings by label.
-        origins: what each run starts from, or empty; see `origins_of`.
+        origins: the initial state of each run, or empty; see `origins_of`.
         order: the clock that orders the messages.
         late: how out-of-sequence messages are handled.
         gap_limit_s: the longest gap over which the truth is interpolated.
@@ -72,8 +72,8 @@ class Plan:
             estimates: for each run, the path of its estimates and its source log.
             save: the file for the first run's timeline.
             connect: the Rerun viewer to stream the timeline to.
-            mirrors: makes the Foxglove mirror for other viewers, written next to the estimates.
-            progress: reports progress after every block.
+            mirrors: function that makes the Foxglove mirror, which is written next to the estimates.
+            progress: function that reports progress after every block.
 
         Raises BadInput if an estimator cannot replay any run.
         """
@@ -154,9 +154,9 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
 def sources_of(
     logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
 ) -> list[LogSource | MemorySource]:
-    """Open one log or several as sources, with changes of topics if requested.
+    """Open one log or several as sources, with alterations of topics if requested.
 
-    Raises BadInput if there is none, or if one is not a log or cannot be changed in this way.
+    Raises BadInput if there are no logs, or if one cannot be read or altered.
     """
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
@@ -177,7 +177,7 @@ def _source(log: Log) -> LogSource | MemorySource:
 def settings_of(
     estimators: Named | Iterable[Named],
 ) -> dict[str, dict[str, Any]]:
-    """Return the settings of each estimator by its label; raises BadInput if they are invalid."""
+    """Return the settings of each estimator by its label; raise BadInput if they are invalid."""
     are_several = isinstance(estimators, Iterable) and not isinstance(estimators, str | Mapping)
     listed: list[Any] = [*estimators] if are_several else [estimators]  # type: ignore[misc]
     chosen: dict[str, dict[str, Any]] = {}
@@ -213,7 +213,7 @@ def settings_of(
 
 
 def _labelled(named: Named) -> Mapping[str, Kind]:
-    """Map labels to estimators; names and estimators are their own labels."""
+    """Map labels to estimators; a name or an estimator without a label is its own label."""
     if isinstance(named, str):
         return dict([shorthand(named)])
     return {named.label: named} if isinstance(named, Estimator) else allowed(named)

@@ -25,12 +25,12 @@ from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.requirements import names_state
 
 USUAL = ("ekf", "ukf", "smoother:ekf")
-SHORT_S = (2.0, 12.0)  # durations to try; the first that a scenario accepts is used
+SHORT_S = (2.0, 12.0)  # durations to try in s; the first one that a scenario accepts is used
 Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """The result for one model and method: the replayed scenario and its time, or why there is none.
+    """The result for a model and method: the replayed scenario and its run time, or the reason why not.
 
     Attributes:
         model, method: their registered names.
@@ -55,9 +55,9 @@ def precompile(
 ) -> list[Precompiled]:
     """Compile and store the kernels that the first replay of models by methods needs.
 
-    A kernel is specific to the sensors of a log. Therefore short recordings of the registered scenarios
-    that fit a model are replayed. A log with other sensors compiles its own kernels on its first replay,
-    and so does a model that fits no scenario or is not registered.
+    A kernel is specific to the sensors of a log, so short recordings of the registered scenarios that
+    fit a model are replayed. A log with other sensors compiles its own kernels on its first replay, and
+    so does a model that fits no scenario or is not registered.
 
     Args:
         models: names from `models`, all by default.
@@ -111,7 +111,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
 
 
 def show_precompiling(asked: Iterable[str], *, as_json: bool) -> None:
-    """Compile pairs MODEL:METHOD, the usual methods of MODEL, or of all models; print the result."""
+    """Compile kernels for pairs MODEL:METHOD, for the usual methods of MODEL, or for all models."""
     begun_s, before = perf_counter(), set(kept_files())
     pairs = [pair for text in asked for pair in _pairs_of(text)]
     made = precompile_pairs(pairs or _working(registered_models(), USUAL))
@@ -177,7 +177,7 @@ def _fits(scenario: str, models: Iterable[str]) -> tuple[str, dict[str, Any]]:
     for name in models:
         model = load("models", name, Model)
         places = [each for each in topics_of(model, topics) if names_state(each.prior, model)]
-        if model.by_name:  # other models have the same topics, so the prior decides
+        if model.by_name:  # other models have the same topics, and only the prior tells them apart
             places = [each for each in places if each.has_prior]
         if places:
             found[name] = tuple(sorted({tuple(own.topic for own, _ in each.sensors) for each in places}))
@@ -188,7 +188,7 @@ def _replayed(scenario: str, model: str, method: str) -> Precompiled:
     begun_s = perf_counter()
     try:
         replay(_recorded(scenario), {"precompiled": modelled(load("models", model, Model), method)})
-        chi2.sf(1.0, 1)  # compiled by a command's summary of a replay if the gate was used
+        chi2.sf(1.0, 1)  # the summary of a replay compiles this function if the gate was used
     except BadInput as error:
         return Precompiled(model, method, scenario, perf_counter() - begun_s, str(error))
     return Precompiled(model, method, scenario, perf_counter() - begun_s)

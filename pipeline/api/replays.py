@@ -1,7 +1,7 @@
-"""Replay as a function: it takes logs and estimators and returns an object for all questions.
+"""Replay as a function, which returns an object with all estimates, tables and figures.
 
-Estimates are in a scratch folder, which exists as long as the replay or one of its estimates is
-referenced. Memory holds the sums of the metrics, and what is asked for.
+Estimates are stored in a temporary folder as long as the replay or one of its estimates is referenced.
+Memory holds only the sums of the metrics and the tables that were requested.
 """
 
 import hashlib
@@ -116,7 +116,7 @@ def replay(
 
 
 class _Scratch:
-    """A token for a scratch folder, which is removed when the last reference to the token is gone."""
+    """A token for a temporary folder, which is removed with the last reference to the token."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,7 +134,7 @@ class Replay(Showing):
         logs: the runs.
         estimates: for each run a log of its estimates, by topic.
         settings: the estimators by label, as given.
-        done: the pass over the logs: its judge, all parameters, and the time of each estimator.
+        done: the pass over the logs, with its judge, all parameters, and the run time of each estimator.
         gap_limit_s: the longest gap over which the truth is interpolated.
         arrival_order, late: as given.
     """
@@ -149,7 +149,7 @@ class Replay(Showing):
 
     @property
     def judge(self) -> Judge:
-        """Return the judge, which holds the sums of all metrics."""
+        """Return the judge, which contains the sums of all metrics."""
         return self.done.judge
 
     @property
@@ -165,7 +165,7 @@ class Replay(Showing):
     def metrics(self) -> pd.DataFrame:
         """Return a table with a row per metric: estimator, quantity, case, value, low, high.
 
-        `low` and `high` bound 95 % of the values of a consistent estimator; NaN if unknown.
+        Consistent estimators have 95 % of their values between `low` and `high`; NaN if unknown.
         """
         metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
         intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
@@ -183,7 +183,7 @@ class Replay(Showing):
 
     @property
     def times(self) -> pd.DataFrame:
-        """Return a table with a row per estimator, case, run and span of time."""
+        """Return a table with a row per estimator, case, run and time span."""
         return self.judge.times
 
     @cached_property
@@ -225,7 +225,7 @@ class Replay(Showing):
 
     @property
     def coverage(self) -> pd.DataFrame:
-        """Return a table on the use of topics by estimators: messages, used, gated, skipped, why."""
+        """Return a table of counts per topic and estimator: messages, used, gated, skipped, why."""
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
@@ -247,7 +247,7 @@ class Replay(Showing):
         Args:
             run: the number of the run.
             focus: the case to show first, such as `robot3`.
-            save: the file to write; nothing is shown then.
+            save: the file to write, instead of showing the timeline.
 
         Raises BadInput if there is no such run or case, no viewer, or the file cannot be written.
         """
@@ -276,7 +276,7 @@ class Replay(Showing):
     def save(self, folder: str | Path) -> ResultFolder:
         """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
-        Raises BadInput if the folder contains something other than a result of fuselog.
+        Raises BadInput if the folder exists and is not a result of fuselog.
         """
         place = Path(folder)
         check_folder(place, {"input": self.paths})

@@ -1,4 +1,4 @@
-"""Evaluation of trajectories, from two files or from logs: numbers, tables, figures."""
+"""Evaluation of trajectories from two files or from logs, with metrics, tables and figures."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -98,7 +98,7 @@ class Evaluation:
 
     @property
     def pairs(self) -> pd.DataFrame:
-        """Return a table with a row per pair of poses: its last pose and its RPE."""
+        """Return a table with a row per pair of poses, with its last pose and its RPE."""
         done = self.compared
         columns = {"last_pose": done.last, "rpe_translation_m": done.relative_m}
         if done.relative_deg is not None:
@@ -111,13 +111,13 @@ class Evaluation:
         return "\n".join([name, *self.notes, *values])
 
     def figure(self) -> "Figure":
-        """Draw the path with its errors as colours, in matplotlib."""
+        """Draw the path in matplotlib, with its errors as colours."""
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:
         """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
-        Raises BadInput if the folder contains something other than a result of fuselog.
+        Raises BadInput if the folder exists and is not a result of fuselog.
         """
         place = Path(folder)
         names = [self.estimate.name, self.truth.name]
@@ -170,17 +170,17 @@ def evaluate(
 
     Args:
         estimate: a TUM, KITTI or EuRoC file, or a trajectory in memory.
-        truth: likewise.
+        truth: the true trajectory, in the same forms.
         align: the transform that aligns the estimate with the truth: "none", "yaw" (rotation about the
             vertical axis, and translation), "se2" (the same, with the height unchanged), "se3", "sim3".
         delta: the distance over which relative errors are computed.
-        delta_unit: of `delta`: "m" along the estimate's path, "frames" or "s".
-        association: match poses with the "nearest" in time, or with the "interpolated" truth.
+        delta_unit: unit of `delta`: "m" along the estimate's path, "frames" or "s".
+        association: "nearest" matches poses by time, "interpolated" with the interpolated truth.
         max_difference_s: the largest time difference of matched poses, for "nearest".
         gap_limit_s: the longest gap over which the truth is interpolated.
-        time_offset_s: added to the estimate's stamps; "estimate" finds it.
-        format: of the estimate's file: "tum", "kitti", "euroc"; by default detected from the content.
-        truth_format: of the truth's file.
+        time_offset_s: seconds to add to the estimate's stamps; "estimate" determines them.
+        format: format of the estimate's file: "tum", "kitti", "euroc"; by default detected.
+        truth_format: format of the truth's file.
 
     Returns:
         Both trajectories and their errors, absolute (APE) and relative (RPE), in m and degrees.
@@ -224,7 +224,7 @@ class ComparedLogs:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences on the limits of the numbers."""
+        """Return sentences on the limitations of the metrics."""
         return [each for runs in self.compared.values() for run in runs for each in run.doubts]
 
     @property
@@ -242,12 +242,12 @@ class ComparedLogs:
 def compare_logs(
     estimates: Sequence[LogSource], sources: Sequence[LogSource], comparison: Comparison
 ) -> ComparedLogs:
-    """Compare the estimated positions of logs with their truths, and align each run separately.
+    """Compare the estimated positions in logs with the truth, where each run is aligned separately.
 
     Memory holds the poses of all runs.
 
-    Raises BadInput as `compare` does; if an alignment would tilt a planar state out of its plane; or if
-    estimates and truth without alignment are in local tangent planes that cannot be compared.
+    Raises BadInput as `compare` does, if an alignment would tilt a planar state out of its plane, or if
+    unaligned estimates and truth are in local tangent planes that cannot be compared.
     """
     compared: dict[tuple[str, str], list[Compared]] = {}
     aligned: list[Source] = []
@@ -291,7 +291,7 @@ def trajectory_figures(
 
 
 def _plane(truth: Trajectory) -> list[int]:
-    """Find the two axes with the largest extent of the truth: the ground plane, also for a camera."""
+    """Find the two axes with the largest extent of the truth: the ground plane, even for a camera."""
     return sorted(np.argsort(-np.ptp(truth.position_m, axis=0), kind="stable")[:2].tolist())
 
 

@@ -1,5 +1,5 @@
-"""Calibration of mountings, scales, biases and delays of sensors, and which motion determines them.
+"""Calibration of mountings, scales, biases and delays of sensors.
 
-Begin with `calibrating`, which frees the parameters that a model marks for the search in
+Begin with `calibrating`, which searches for the parameters that a model marks, with
 `fuselog.pipeline.tuning`.
 """

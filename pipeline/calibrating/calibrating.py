@@ -1,6 +1,6 @@
-"""Calibration with the search of `tune`: mountings, scales, biases and delays of sensors.
+"""Calibration of mountings, scales, biases and delays of sensors with the search of `tune`.
 
-A model marks the parameters of its calibration, see `fuselog.replay.inference.model.model.Model`.
+A model marks its calibration parameters; see `fuselog.replay.inference.model.model.Model`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from fuselog.recorders.parameters import merge
 from fuselog.replay.engine.replaying.estimator import Recursive, bind
 from fuselog.replay.foreign.naming import allowed
 
-OPTIONS = ("by", "free")  # options of `tune` that a calibration chooses itself
+OPTIONS = ("by", "free")  # options of `tune` that `calibrate` sets itself
 
 
 @without_warnings_of_numbers()
@@ -31,25 +31,25 @@ def calibrate(
     next_motion: bool = False,
     **options: Any,
 ) -> Tuning:
-    """Search for the parameters of mountings, scales, biases and delays of sensors.
+    """Estimate the parameters of mountings, scales, biases and delays of sensors.
 
-    All parameters that the model marks as its calibration, and that something in the logs reads, are
-    searched for together by maximum likelihood. Parameters that the motion does not determine are named,
-    stay at their start, and have no interval.
+    All parameters that the model marks as its calibration, and on which the logs depend, are estimated
+    together by maximum likelihood. Parameters that the motion does not determine are named, keep their
+    start values, and have no interval.
 
     Args:
         logs: one or several logs with the same topics: paths, opened logs, or recordings.
-        estimator: a registered name, or a label of your own with what it stands for; see `replay`.
+        estimator: a registered name, or a label of your own mapped to an estimator; see `replay`.
         set: values of other parameters, and start values; see `tune`.
-        fixed: calibration parameters that are known, and stay as they are set.
+        fixed: calibration parameters that are known and keep the values that are set.
         next_motion: also recommend the next manoeuvre to record, for a robot with wheels and fixes.
         options: as for `tune`, except `free` and `by`.
 
     Returns:
         The parameters with 95 % intervals, and replays of the logs with the start and the found values.
 
-    Raises BadInput if the model marks no parameter, if nothing in the logs depends on those that it
-    marks, or if a next motion is requested for logs without wheels and fixes.
+    Raises BadInput if the model marks no parameter, if the logs do not depend on the marked parameters,
+    or if a next motion is requested for logs without wheels and fixes.
     """
     for name in OPTIONS:
         if name in options:

@@ -1,7 +1,7 @@
-"""The car whose calibration is estimated: its sensor errors, and their names in a model.
+"""The simulated car whose calibration is estimated, with its sensor errors and their names in a model.
 
-Scales and the bias are those of readings relative to the motion; `OURS` has those of the model, of the
-motion relative to readings.
+Scales and the bias of `TRUTH` describe readings relative to the motion. Those of `OURS`, as in the
+model, describe the motion relative to readings.
 """
 
 from typing import Any
@@ -26,15 +26,18 @@ NAMES = (
     *("forward_scale", "turn_scale", "turn_bias_radps"),
     *("lever_x_m", "lever_y_m", "fix_delay_s", "bias_heading_rad"),
 )
-WIDE = {"prior_sigma_m": 1000.0, "prior_sigma_rad": 1.0}  # says nothing about the start
+WIDE = {
+    "prior_sigma_m": 1000.0,
+    "prior_sigma_rad": 1.0,
+}  # a prior so wide that it has no influence on the start
 
 
 def drive(seed: int | None, errors: Floats = TRUTH, **changed: Any) -> Car:
-    """Simulate a drive of the car, and what its sensors measure.
+    """Simulate a drive of the car and the measurements of its sensors.
 
     Args:
-        seed: the seed of the noise and of the first pose; without one there is no noise, and the car
-            starts at zero.
+        seed: the seed of the noise and of the first pose. Without a seed, there is no noise, and the
+            car starts at zero.
         errors: (7,), the sensors' errors, in the order of `TRUTH`.
         changed: parameters of the car.
 
@@ -46,5 +49,5 @@ def drive(seed: int | None, errors: Floats = TRUTH, **changed: Any) -> Car:
 
 
 def recorded(car: Car) -> MemorySource:
-    """Make a log of the car, with a prior around the origin."""
+    """Make a log of a drive, with a prior around the origin."""
     return memory_source(Recording(streams_of(car)), RunMetadata("car C", epoch_ns=0))

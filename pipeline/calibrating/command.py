@@ -20,7 +20,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 def calibrate_logs(
     logs: Sequence[Path], *, fixed: Sequence[str], next_motion: bool, **options: Any
 ) -> None:
-    """Calibrate; `fixed` and `next_motion` are as for `calibrate`, all others as for `tune_logs`."""
+    """Calibrate sensors; the arguments are those of `calibrate` and `tune_logs`."""
     tune_logs(logs, search=partial(calibrate, fixed=fixed, next_motion=next_motion), **options)
 
 

@@ -1,7 +1,7 @@
-"""Calibration of a magnetometer or an accelerometer by rotation: offsets, scales, cross terms.
+"""Calibration of a rotated magnetometer or accelerometer: offsets, scales, cross terms.
 
-The magnetic field and gravity have a constant length in all orientations of a unit. Corrected readings
-are therefore on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.
+The magnetic field and gravity have a constant length in all orientations of a unit. Therefore corrected
+readings are on a sphere, and raw readings on an ellipsoid; see `ellipsoid_fit`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,9 +25,9 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
-FEWEST, MOST = 30, 20_000  # readings; larger sets are thinned out
-_STILL_S = 0.5  # accelerometer readings are means over this time in which it is still
-_STILL = 3.0  # times the spread of the quietest tenth
+FEWEST, MOST = 30, 20_000  # largest number of readings; larger sets are thinned
+_STILL_S = 0.5  # an accelerometer reading is a mean over this time, in which the sensor is still
+_STILL = 3.0  # limit on the spread of a still sensor, as a multiple of that of the quietest tenth
 _DRAWN = 500
 
 
@@ -39,8 +39,8 @@ class Ellipsoid:
         topic, field: the topic and field of the readings.
         logs: the names of the logs.
         length: the length of corrected readings.
-        is_assumed: whether the length comes from the readings, because none was given.
-        unit: the length that is one in the fit.
+        is_assumed: whether the length was computed from the readings, because none was given.
+        unit: the length that equals one in the fit.
         readings: (n, 3) the fitted readings.
         fitted: the ellipsoid.
     """
@@ -69,13 +69,13 @@ class Ellipsoid:
 
     @property
     def left_open(self) -> list[str]:
-        """Return the undetermined numbers: all, if the orientations are too few for an ellipsoid."""
+        """List the undetermined numbers: all, if the orientations are too few for an ellipsoid."""
         places = self.fitted.lacking.places
         return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a row per number: value and 95 % interval, NaN if not determined."""
+        """Return a table with a row per number, with value and 95 % interval; NaN if not determined."""
         factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
         values = self.fitted.numbers * factors
         reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
@@ -105,7 +105,7 @@ class Ellipsoid:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences on what is not determined, how well it fits, and how to apply it."""
+        """Return sentences on undetermined numbers, the quality of the fit, and how to apply it."""
         unit, fitted = unit_of(self.field), self.fitted
         before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
         sentences = []
@@ -177,19 +177,19 @@ class Ellipsoid:
 
 @without_warnings_of_numbers()
 def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
-    """Find offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
+    """Estimate offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
 
-    Accelerometer readings are used while it is still, because it senses only gravity then. The matrix is
+    Only readings of a still accelerometer are used, because it then measures only gravity. The matrix is
     symmetric: readings do not determine the rotation between the sensor's and the body's axes.
 
     Args:
-        logs: paths, opened logs, or recordings, of one unit that is rotated to all sides.
+        logs: paths, opened logs, or recordings of one unit that is rotated to all sides.
         field: the field, such as `/imu.magnetic_field_ut`.
-        length: the vector's length in the field's unit; by default gravity's for a specific force,
-            otherwise the one with which the mean of the scales is one.
+        length: the vector's length in the field's unit. The default is gravity for a specific force,
+            otherwise the length with which the mean of the scales is one.
 
     Returns:
-        Offset (3,) and matrix (3, 3) with 95 % intervals, and how well they fit.
+        Offset (3,) and matrix (3, 3) with 95 % intervals, and the quality of the fit.
 
     Raises BadInput if a log has no such field, or too few readings.
     """

@@ -1,8 +1,8 @@
-"""A fit of the ellipsoid that readings of a constant vector form when the unit is rotated.
+"""Fit of an ellipsoid to readings of a constant vector by a unit that is rotated.
 
 A sensor reads m = A^-1 u + b + n for a vector u of known length, with isotropic noise n. The length
-determines b and the symmetric A, by maximum likelihood; it does not determine a rotation of the sensor's
-axes. Sets of readings that leave something undetermined: Vasconcelos et al., IEEE T-AES 2011.
+determines b and the symmetric A by maximum likelihood, but not a rotation of the sensor's axes.
+Vasconcelos et al., IEEE T-AES 2011, describe sets of readings that do not determine everything.
 """
 
 from typing import NamedTuple
@@ -23,24 +23,24 @@ NAMES = (
 )
 START = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 USEFUL = 0.01  # relative to the length: the standard error that a calibration should reach
-_WIDE = 1.0  # relative to the length: how far a value may be from its start
-_OF_A_CONIC = 5  # numbers that readings in a plane determine at most
-_STEP = 1e-6  # step of differences
+_WIDE = 1.0  # relative to the length: largest change of a value from its start
+_OF_A_CONIC = 5  # largest number of values that readings in a plane determine
+_STEP = 1e-6  # step of the finite differences
 _LEAST_SIGMA = 1e-9  # relative to the length
-# relative to the spread in their plane: readings of rotations about one axis leave it by less
+# relative to the spread in the plane; readings of rotations about one axis deviate less from the plane
 _FLAT = 0.1
 
 
 class Fit(NamedTuple):
-    """The ellipsoid of readings, in units of their length relative to their middle.
+    """The ellipsoid of readings, in units of the vector's length, relative to their middle.
 
     Attributes:
         numbers: (9,) in the order of `NAMES`.
         covariance: (9, 9) of the numbers that are determined; meaningless for others.
-        lacking: what the readings do not determine.
-        turned_about: the axis closest to the only axis of rotation; empty if there were several.
+        lacking: the numbers that the readings do not determine.
+        turned_about: the axis that is closest to the only axis of rotation; empty if there were several.
         sigma: the standard deviation of the noise.
-        correlation: of the noise of successive readings.
+        correlation: correlation of the noise of successive readings.
     """
 
     numbers: Floats
@@ -79,13 +79,15 @@ def fit(readings: Floats) -> Fit:
     is_flat = bool(spreads[0] < _FLAT**2 * spreads[2])
     near, normal = middle(readings)[0], axes[:, 0]
     starts, directions = [START, np.concatenate([near, START[3:]])], np.eye(len(START))
-    if is_flat:  # otherwise noise across the plane would look like the thickness of an ellipsoid
+    if is_flat:  # without this, noise across the plane would look like the thickness of an ellipsoid
         readings = readings - np.outer((readings - readings.mean(axis=0)) @ normal, normal)
-        starts = [np.concatenate([near + normal, START[3:] / np.sqrt(2.0)])]  # a sphere through a circle
+        starts = [
+            np.concatenate([near + normal, START[3:] / np.sqrt(2.0)])
+        ]  # start from a sphere through a circle
         derivatives = _derivatives(starts[0], readings)
         directions = np.linalg.svd(derivatives, full_matrices=False)[2][:_OF_A_CONIC]
     values, left, sigma = START, np.zeros(len(readings)), 0.0
-    for _ in range(2):  # the second time with the noise that the first one found
+    for _ in range(2):  # the second fit uses the noise that the first one estimated
         searches = [_search(start, directions, readings, sigma) for start in starts]
         values = searches[int(np.argmin([cost for cost, _ in searches]))][1]
         left = _distances(values, readings) - sigma**2

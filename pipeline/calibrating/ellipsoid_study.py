@@ -1,6 +1,6 @@
-"""A study of ellipsoids: how often their intervals cover the truth.
+"""A study of how often the intervals of fitted ellipsoids cover the truth.
 
-A magnetometer is rotated steadily, and an accelerometer is put down in many positions; both have
+A magnetometer is rotated steadily, and an accelerometer is put down in many positions. Both have
 offsets, scale errors and cross terms.
 """
 
@@ -83,7 +83,7 @@ def calibrated(unit: str, seed: int) -> Ellipsoid:
 
 
 def recorded(unit: str, seed: int) -> MemorySource:
-    """Make a log of a simulated unit whose other sensors read zero."""
+    """Make a log of a simulated unit, whose other sensors read zero."""
     draw, truth = UNITS[unit]
     rng = np.random.Generator(np.random.Philox(key=seed))
     vectors, noise = draw(rng)
@@ -112,7 +112,7 @@ def turned(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def put_down(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Simulate the specific force (n, 3) of a unit that is moved between positions, and the noise."""
+    """Simulate the specific force (n, 3) of a unit that is moved between positions, and its noise."""
     directions = rng.standard_normal((POSITIONS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     held, moved = round(HELD_S / STEP_S), round(MOVED_S / STEP_S)

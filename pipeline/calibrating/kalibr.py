@@ -1,7 +1,7 @@
-"""A calibration in Kalibr's format: mountings, time shifts and errors of sensors, in YAML.
+"""Output of a calibration in Kalibr's YAML format, with mountings, time shifts and sensor errors.
 
 T_sensor_body converts a point from the body's axes to the sensor's, and a message was measured at its
-stamp plus timeshift_sensor_body; for a camera, Kalibr calls these T_cam_imu and timeshift_cam_imu.
+stamp plus timeshift_sensor_body. For a camera, Kalibr calls these T_cam_imu and timeshift_cam_imu.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ HEADING = "bias_heading_rad"
 
 
 def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
-    """Write the values of a calibration by name, with a comment on those that are not determined.
+    """Format the values of a calibration, with a comment on those that are not determined.
 
     >>> print(kalibr_yaml({"lever_x_m": 1.2, "fix_delay_s": 0.15}, []).removeprefix(HEAD).strip())
     fix:
@@ -66,7 +66,7 @@ def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
 
 
 def _transform(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[str]:
-    """Write the lines of T_sensor_body."""
+    """Format the lines of T_sensor_body."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     rows = [", ".join(f"{entry + 0.0:.6g}" for entry in row) for row in matrix]

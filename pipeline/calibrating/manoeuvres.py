@@ -1,8 +1,8 @@
-"""Advice on the next manoeuvre to record: what each would add to the information on a calibration.
+"""Advice on the next manoeuvre to record, by the information that it would add to a calibration.
 
 Manoeuvres of a wheeled robot are simulated without noise, with the sensors, steps and noise of the log
-and the values found, to compute their information. The best one depends on the criterion: the
-determinant counts all parameters together, the widest interval the least accurate one.
+and the estimated values, to compute their information. The best manoeuvre depends on the criterion: the
+determinant considers all parameters together, the widest interval only the least accurate one.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from fuselog.replay.engine.streams.sources import Source
 
 Floats = NDArray[np.float64]
 DURATION_S = 20.0
-PRIOR = 10.0  # how wrong a parameter may be before anything is recorded, in useful units
+PRIOR = 10.0  # standard deviation of a parameter before anything is recorded, in useful units
 SIMULATED = {
     "/car/odometry": schemas.ODOMETRY,
     "/car/fix": schemas.POSITION_FIX,
@@ -35,11 +35,11 @@ SIMULATED = {
 
 
 class Gain(NamedTuple):
-    """The gain of a manoeuvre.
+    """The information that a manoeuvre adds.
 
     Attributes:
-        nats: half the logarithm of the ratio of determinants, with and without it.
-        sigmas: (m,) the standard deviations with it, in useful units.
+        nats: half the logarithm of the ratio of determinants with and without the manoeuvre.
+        sigmas: (m,) the standard deviations with the manoeuvre, in useful units.
     """
 
     nats: float
@@ -52,7 +52,7 @@ class Gain(NamedTuple):
 
 
 def gain(known: Floats, added: Floats) -> Gain:
-    """Compute what the information of a manoeuvre adds to what is known.
+    """Compute how much information a manoeuvre adds to the known information.
 
     Args:
         known: (m, m), in useful units.
@@ -70,10 +70,10 @@ def gain(known: Floats, added: Floats) -> Gain:
 
 
 def manoeuvres(found: Tuning) -> pd.DataFrame:
-    """Tabulate manoeuvres of 20 s, in ascending order of the widest interval after them.
+    """Tabulate manoeuvres of 20 s, in ascending order of the widest interval that would remain.
 
-    The columns are the manoeuvre, the nats that it gains, and per parameter the standard deviation with
-    it, in its own unit; the row "none" is what the logs already determine.
+    The columns are the manoeuvre, the nats that it adds, and the standard deviation of each parameter
+    with it, in the parameter's unit. The row "none" is the information of the logs.
 
     Raises BadInput if the logs are not those of a robot with wheels.
     """
@@ -97,7 +97,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
 
 
 def advice(found: Tuning) -> list[str]:
-    """Recommend the manoeuvres that are best for the widest interval and for the determinant."""
+    """Recommend the best manoeuvres, by the widest interval and by the determinant."""
     table = manoeuvres(found)
     names = list(table.columns[3:])
     before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
@@ -116,7 +116,7 @@ def advice(found: Tuning) -> list[str]:
 
 
 def _simulated(found: Tuning, log: Source, motion: str) -> Run:
-    """Simulate a manoeuvre as a log of the same topics, with the values found."""
+    """Simulate a log of a manoeuvre with the same topics and the estimated values."""
     streams = _of_kinds(log)
     odometry_s, fix_s, compass_s = (_step_s(streams.get(topic)) for topic in SIMULATED)
     usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}
@@ -147,7 +147,7 @@ def _simulated(found: Tuning, log: Source, motion: str) -> Run:
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
-    """Find the first topic of a schema that the run itself has."""
+    """Find the first topic of a schema that is part of the run itself."""
     for name in topics_of(log.topics, schema):
         if not name.startswith("/estimates/"):
             return log.read([name])[name]
@@ -155,7 +155,7 @@ def _first_of(log: Source, schema: Schema) -> Stream | None:
 
 
 def _of_kinds(log: Source) -> dict[str, Stream]:
-    """Return the log's streams that are simulated, by the topic of the simulation."""
+    """Return the log's streams that are simulated, by the simulation's topic."""
     streams = {topic: _first_of(log, schema) for topic, schema in SIMULATED.items()}
     found = {topic: stream for topic, stream in streams.items() if stream is not None}
     if "/car/odometry" not in found or "/car/fix" not in found:
@@ -173,13 +173,13 @@ def _step_s(stream: Stream | None) -> float:
 
 
 def _errors(values: Mapping[str, Any]) -> Floats:
-    """Compute the errors (7,) of a car, of readings relative to the motion, from a model's values."""
+    """Convert a model's values to the errors (7,) of a car's readings relative to the motion."""
     forward, turn, bias, *others = (float(values[name]) for name in NAMES)
     return np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])
 
 
 def _alike(stream: Stream, like: Stream) -> Stream:
-    """Give a simulated stream the name, the metadata and the covariance of another one."""
+    """Give a simulated stream the name, metadata and covariance of a recorded one."""
     columns = {
         name: np.repeat(like[name][:1], len(stream), axis=0) if "covariance" in name else column
         for name, column in stream.columns.items()

@@ -1,7 +1,7 @@
-"""A study of calibration: how often its intervals cover the truth, and what each motion leaves open.
+"""A study of calibration: the coverage of its intervals, and what each motion leaves undetermined.
 
-Cars are calibrated one by one, from an uninformative start. A log without noise and a prior that is
-practically uninformative show which parameters a motion determines.
+Cars are calibrated one by one, from an uninformative start. Logs without noise and with a practically
+uninformative prior show which parameters a motion determines.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.simulators.car import MOTIONS
 
-# the car's noise is that of its motion, the model's that of the readings
+# the simulated noise is on the car's motion, the model's noise on the readings
 NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * TRUTH[1]}
 
 
@@ -95,7 +95,7 @@ def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> 
 
 
 def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[Any]:
-    """Return the motion, and for each parameter whether it stays undetermined."""
+    """Return a row with the motion and whether each parameter stays undetermined."""
     found = calibrate(recorded(drive(None, TRUTH, motion=motion, **WIDE)), {label: settings})
     held = set(found.found.held)
     return [motion, *(name in held for name in NAMES)]

@@ -1,1 +1,1 @@
-"""Comparison of replays with stored ones, field by field; begin with `checking`."""
+"""Comparison of new replays with stored ones, field by field; begin with `checking`."""

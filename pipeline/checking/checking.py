@@ -1,4 +1,4 @@
-"""Checks of logs and results against a golden: selection of the runs, replay and report."""
+"""Checks of logs and results against a golden."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -42,13 +42,13 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
     Args:
         runs: the runs, by their names in the golden.
         golden: the golden, as returned by `read`.
-        estimators: settings of estimators to replay instead of those that the golden names.
+        estimators: settings of the estimators to replay instead of the golden's.
 
     Raises BadInput if the runs are not those of the golden, or no estimator supports them.
     """
     stored = golden["settings"]
     if not estimators and not stored["estimators"]:
-        raise BadInput("the golden names no estimators; give those that it is of")
+        raise BadInput("the golden names no estimators; give the estimators that produced it")
     replayed = make(
         runs,
         of_file(stored["estimators"]) if estimators is None else estimators,
@@ -69,7 +69,7 @@ def compared(golden: Golden, replayed: Replayed) -> Checked:
 
 
 def runs_of(path: Path) -> Runs:
-    """Return the runs of a log, of a folder of logs, or of the logs that a result keeps.
+    """Return the runs of a log, of a folder of logs, or of the logs in a result folder.
 
     Raises BadInput if there are no logs, or two of them have the same name.
     """
@@ -100,7 +100,7 @@ def update(
 ) -> Golden:
     """Write the golden of the runs at `path` to the file `place`.
 
-    Settings that are not given are taken from the existing golden, or otherwise from the result.
+    Missing settings are taken from the existing golden, or otherwise from the result.
     """
     check_files([(place, GOLDEN)], {"log": [path]})
     before = read(place) if place.exists() else None
@@ -109,7 +109,7 @@ def update(
         stated = read_result(path).settings
     chosen = estimators or of_file(stated.get("estimators", {}))
     if not chosen:
-        raise BadInput(f"{path}: name the estimators that the golden is to have, such as -e ekf")
+        raise BadInput(f"{path}: name the estimators of the new golden, such as -e ekf")
     kept = None if before is None else before["tolerances"]
     golden = make(
         runs_of(path),

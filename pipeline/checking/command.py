@@ -32,12 +32,12 @@ def check_path(
 ) -> bool:
     """Compare the runs at `path` with a golden, or write the golden; return whether all fields agree.
 
-    `in_place` takes the name of a program, the runs and the golden, and returns the settings to replay
-    instead of the golden's estimators.
+    `in_place` is a function of a program's name, the runs and the golden. It returns the settings of
+    the estimators that are replayed instead of the golden's.
     """
     if is_update:
         if junit is not None:
-            raise BadInput("--junit: is for the results of a check; leave it out with --update")
+            raise BadInput("--junit: writes the results of a check; leave it out with --update")
         chosen = settings_of_estimators(labels, settings, settings_file)
         made = update(
             path,
@@ -66,8 +66,8 @@ def check_path(
             or tolerances
         ):
             raise BadInput(
-                f"{golden}: already states what is replayed and which differences are allowed; to "
-                "change that, add --update"
+                f"{golden}: already defines the replay and the allowed differences; to change them, add "
+                "--update"
             )
         sources, stored = runs_of(path), read(golden)
         replaced = in_place(labels[0], sources, stored) if in_place and labels else None
@@ -91,14 +91,14 @@ def check_path(
     for sentence in done.sentences:
         say(sentence)
     if done.found:
-        say(f"{len(done.found)} of {sum(done.fields.values())} fields are not as in {golden}")
+        say(f"{len(done.found)} of {sum(done.fields.values())} fields differ from {golden}")
     else:
-        say(f"all {sum(done.fields.values())} fields are as in {golden}")
+        say(f"all {sum(done.fields.values())} fields agree with {golden}")
     return not done.found
 
 
 def _tolerance(text: str) -> tuple[str, Tolerance]:
-    """Read a pattern and the largest relative difference of matching columns from PATTERN=RELATIVE."""
+    """Parse PATTERN=RELATIVE, a pattern of columns and their largest allowed relative difference."""
     pattern, _, value = text.rpartition("=")
     try:
         relative = float(value)

@@ -1,4 +1,4 @@
-"""Comparison of a replay with its golden: which parts differ, by how much, and from which time."""
+"""Functions that find the parts of a replay that differ from its golden, by how much and since when."""
 
 import base64
 import math
@@ -34,7 +34,7 @@ class Discrepancy(NamedTuple):
         part: the column, or another part of the stream, such as its metadata.
         apart: difference relative to the size of the column; infinite if one of the two is missing.
         allowed: largest allowed difference, relative to the size of the column.
-        row: first kept row that exceeds `allowed`; None if no kept row does.
+        row: first kept row whose difference exceeds `allowed`; None if there is no such row.
         component: component of the column.
         before, after: values of the golden and of the replay in this row.
         stamp_ns: stamp of the row, if the replayed stream is available.
@@ -61,10 +61,10 @@ class Discrepancy(NamedTuple):
             at = f"in row {self.row}" if self.stamp_ns is None else f"at {self.stamp_ns} ns"
             detail = f"{what}{self.after!r} {at}, the golden has {self.before!r}; "
         elif math.isinf(self.apart):
-            return f"{where}: is not as in the golden"
+            return f"{where}: differs from the golden"
         else:
-            detail = "rows between those that the golden keeps differ; "
-        return f"{where}: {detail}{self.apart:.2g} of its size apart, {self.allowed:g} is allowed"
+            detail = "rows between those stored in the golden differ; "
+        return f"{where}: {detail}relative difference {self.apart:.2g}, allowed {self.allowed:g}"
 
 
 def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
@@ -78,13 +78,13 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
         if stored is None or new is None:
             there = some_of(golden["runs"])
             raise BadInput(
-                f"{name}: the golden is of {there}; check the same runs, or write a new one with "
+                f"{name}: the golden contains {there}; check the same runs, or write a new golden with "
                 "--update"
             )
         is_same_input = stored["input"] == new["input"]
         if not is_same_input and (is_same_cpu or not stored["recorded"]):
             raise BadInput(
-                f"{name}: the recorded or imported data have changed, so that estimates cannot be "
+                f"{name}: the recorded or imported data have changed, so estimates cannot be "
                 "compared; check the golden's own data, or write a new one with --update"
             )
     known = {key: Tolerance(**each) for key, each in golden["tolerances"].items()}
@@ -110,7 +110,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
 def _distances(
     golden: Golden, found: Golden, missing: Callable[[str, str, str], Discrepancy]
 ) -> Iterator[Discrepancy]:
-    """Yield the relative difference of every part from the golden's; infinite if one is missing."""
+    """Yield the relative difference of every part from the golden; infinite for a missing part."""
     for key, stored, new in _pairs(golden["metrics"], found["metrics"]):
         before, after = _floats(stored), _floats(new)
         if before.shape != after.shape:
@@ -199,7 +199,7 @@ def _floats(values: Any) -> Floats:
 
 
 def _size(before: Mapping[str, Floats], rows: int) -> Floats:
-    """Compute the root mean square of a column, or its largest number if the squares are infinite."""
+    """Compute the root mean square of a column, or its largest magnitude if the squares overflow."""
     size = np.sqrt(before["sum_of_squares"] / np.maximum(rows - before["missing"], 1))
     finite = np.where(np.isfinite(before["kept"]), np.abs(before["kept"]), 0.0)
     return np.where(np.isinf(size), np.max(finite, axis=0, initial=0.0), size)
@@ -220,7 +220,7 @@ def _relative(difference: Floats, size: ArrayLike) -> Floats:
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """Describe the earliest discrepancy, the time from which bits differ, and the innovation then."""
+    """Describe the earliest discrepancy, the first time at which bits differ, and the innovation."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     sentences = [first.sentence]
@@ -229,7 +229,7 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
     outputs = replayed.outputs[first.run]
     begin_ns = _first_changed(first, replayed, golden)
     if begin_ns is not None:
-        sentences.append(f"bits of {first.topic} differ from {begin_ns} ns on, which may be rounding")
+        sentences.append(f"bits of {first.topic} differ from {begin_ns} ns on, perhaps only by rounding")
     stamp_ns = first.stamp_ns if begin_ns is None else begin_ns
     if stamp_ns is not None:
         sentences += _innovation_at(outputs, split_topic(first.topic), stamp_ns)

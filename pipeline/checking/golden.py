@@ -1,8 +1,9 @@
-"""Creation of goldens: small stored replays with which later replays are compared, field by field.
+"""Creation of goldens, which are small stored replays with which later replays are compared.
 
 A golden is compressed JSON with the settings, a hash of every input and the tolerances. For every output
-stream, it has the number of rows, the metadata, hashes of both clocks and a checksum of each row; for
-every column, some evenly spaced rows in full precision, and sums over all rows. It has no timings.
+stream, it contains the number of rows, the metadata, hashes of both clocks and a checksum of each row.
+For every column, it contains some evenly spaced rows in full precision and sums over all rows. It
+contains no timings.
 """
 
 import base64
@@ -24,10 +25,10 @@ from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.log import Stream, schemas
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
-# A run keeps about NUMBERS numbers; the number of kept rows of each stream follows, within the bounds.
+# About NUMBERS numbers are kept per run, which determines the rows kept per stream, within the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
-# The values of these streams are numbers of sentences, whose wording may change.
+# The values of these streams are indices of sentences, whose wording may change.
 REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name, schemas.STARTED.full_name}
 
 Floats = NDArray[np.float64]
@@ -47,7 +48,7 @@ Tolerances = Mapping[str, Tolerance]
 
 
 class Replayed(NamedTuple):
-    """The golden of a new replay, and the output streams of each run from which it was made."""
+    """The golden of a new replay, together with the output streams of its runs."""
 
     golden: Golden
     outputs: Mapping[str, Outputs]
@@ -62,15 +63,15 @@ def make(
     columns: Sequence[str] = ("*",),
     tolerances: Tolerances | None = None,
 ) -> Replayed:
-    """Replay runs one by one, and make their golden.
+    """Replay runs one by one and make a golden of them.
 
     Args:
         sources: the runs by name.
         estimators: settings by label.
-        late: handling of out-of-sequence messages, as the option `--late`.
+        late: handling of out-of-sequence messages, with the same values as the option `--late`.
         arrival_order: whether messages are replayed in order of log time.
         columns: patterns of the columns to keep, as `TOPIC COLUMN`.
-        tolerances: allowed differences by such patterns.
+        tolerances: allowed differences, by patterns of the same form.
 
     Raises BadInput if an estimator supports none of the runs.
     """
@@ -108,7 +109,7 @@ def golden_of(
     metrics: Mapping[str, Any] | None = None,
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """Return a golden of these parts, in the form in which a file is read."""
+    """Assemble a golden from its parts, in the same form as one that is read from a file."""
     found = {
         "format": FORMAT,
         "arithmetic": arithmetic(),
@@ -127,7 +128,7 @@ def input_hash(source: LogSource | MemorySource) -> str:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Test whether an output belongs in a golden: not coverage, nor empty streams of reasons."""
+    """Test whether an output belongs in a golden; coverage and empty streams of reasons do not."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 
@@ -137,7 +138,7 @@ def _is_kept(topic: str, column: str, patterns: Sequence[str]) -> bool:
 
 
 def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]:
-    """Return the golden's entry of a stream; failures and the like have only a count and times."""
+    """Return the golden's entry for a stream; failures and similar events have only counts and times."""
     has_values = stream.schema.full_name not in REASONS
     kept = kept_rows(len(stream), rows)
     values = {
@@ -161,7 +162,7 @@ def kept_rows(count: int, most: int) -> NDArray[np.int64]:
 
 
 def checksums(columns: Mapping[str, Floats]) -> NDArray[np.uint16]:
-    """Compute a checksum of the bits of each row, (rows,), by which a changed row can be found."""
+    """Compute a checksum of the bits of each row, (rows,), to find changed rows."""
     parts = [
         column.reshape(len(column), math.prod(column.shape[1:])) for _, column in sorted(columns.items())
     ]

@@ -1,4 +1,4 @@
-"""Output of the results of a check as JUnit XML for continuous integration, a test case per topic."""
+"""Output of check results as JUnit XML for continuous integration, with a test case per topic."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,7 +13,7 @@ NAME = "fuselog check"
 def write_junit(path: Path, golden: str, outcome: Checked | Exception) -> None:
     """Write the results of a check, or the error that prevented it.
 
-    The file has no times, so that the same check always gives the same bytes.
+    The file contains no times, so the same check always gives the same bytes.
     """
     cases: dict[tuple[str, str], list[str]] = {}
     kind, element = "difference", "failure"

@@ -1,4 +1,4 @@
-"""Reading and writing of goldens: compressed JSON, whose content is validated when it is read."""
+"""Functions that write goldens as compressed JSON, and that read and validate them."""
 
 import base64
 import json
@@ -25,7 +25,7 @@ from fuselog.recorders.parsing import parse_json
 SUFFIX = ".golden.xz"
 # Version of the format; incremented if this reader would misread new goldens.
 FORMAT = 1
-# Limits of a golden: bytes of its text, and number of values. A small archive may unpack to far more.
+# Limits on a golden's text in bytes and on its values, since a small archive may unpack to far more.
 MOST_BYTES, MOST_VALUES = 64 << 20, 4_000_000
 # Memory limit for unpacking; the best presets of xz need a quarter of it.
 _UNPACKING_BYTES = 256 << 20
@@ -34,11 +34,11 @@ Golden = dict[str, Any]
 
 
 def _numbers(values: Any) -> Any:
-    """Raise ValueError if values are not an array of numbers; null stands for NaN."""
+    """Raise ValueError if values are not an array of numbers; null means NaN."""
     try:
         np.asarray(values, float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError("it is no array of numbers") from None
+        raise ValueError("it is not an array of numbers") from None
     return values
 
 
@@ -46,13 +46,13 @@ Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
 class _Part(BaseModel):
-    """A part of a golden, which may have no other keys than its fields."""
+    """A part of a golden, in which keys other than its fields are errors."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class _Column(_Part):
-    """Some rows of a column; the number of missing values, sums and sums of squares over all rows."""
+    """Some rows of a column, and its number of missing values, sum and sum of squares over all rows."""
 
     kept: Numbers
     missing: Numbers
@@ -65,7 +65,7 @@ class _Column(_Part):
         kept = np.shape(self.kept)
         is_empty = kept == (0,)  # without messages, the list does not show the shape of a row
         if not kept or any(shape != (shapes[0] if is_empty else kept[1:]) for shape in shapes):
-            raise ValueError("its rows and its sums are of different shapes")
+            raise ValueError("its rows and its sums have different shapes")
         return self
 
 
@@ -83,7 +83,7 @@ class _Stream(_Part):
     def _has_rows(self) -> Self:
         checked = len(base64.b64decode(self.checksums, validate=True))
         if checked not in (0, 2 * self.rows):
-            raise ValueError(f"it has checksums of {checked / 2:g} rows, and {self.rows} rows")
+            raise ValueError(f"it has {self.rows} rows, but checksums of {checked / 2:g} rows")
         for column in self.columns.values():
             if not (0 < len(column.kept) <= self.rows or len(column.kept) == self.rows == 0):
                 raise ValueError(f"it keeps {len(column.kept)} of {self.rows} rows")
@@ -127,11 +127,11 @@ class _Golden(_Part):
 
 
 def write(path: Path, golden: Golden) -> None:
-    """Write a golden; equal goldens give the same bytes. Raises BadInput if it is too large."""
+    """Write a golden, the same bytes for equal goldens; raise BadInput if it is too large."""
     text = json.dumps(golden, sort_keys=True, separators=(",", ":")).encode()
     if not _is_small(text):
         raise BadInput(
-            f"{path}: would have {len(text) / 1e6:.0f} MB of text, more than a golden may; take a part "
+            f"{path}: would have {len(text) / 1e6:.0f} MB of text, too much for a golden; take a part "
             "of the log with fuselog cut, or keep fewer columns with --keep"
         )
     with whole_file(path) as part:
@@ -139,11 +139,11 @@ def write(path: Path, golden: Golden) -> None:
 
 
 def read(path: Path) -> Golden:
-    """Read a golden; raises BadInput if it is missing, damaged or of another format."""
+    """Read a golden; raise BadInput if it is missing, damaged or in another format."""
     try:
         golden = parse_json(_unpacked(path).decode(), constants=True)
     except FileNotFoundError:
-        raise BadInput(f"{path}: no such golden; --update writes it") from None
+        raise BadInput(f"{path}: no such golden; --update creates it") from None
     except (OSError, lzma.LZMAError, ValueError) as error:
         raise BadInput(
             f"{path}: is not a golden, or is damaged ({error}); --update writes a new one"
@@ -163,15 +163,15 @@ def read(path: Path) -> Golden:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Unpack the text; raises ValueError if it is larger than a golden may be, or incomplete."""
+    """Unpack the text; raise ValueError if it is incomplete, or too large for a golden."""
     with path.open("rb") as file:
         packed = file.read(MOST_BYTES)
     unpacking = lzma.LZMADecompressor(memlimit=_UNPACKING_BYTES)
     text = unpacking.decompress(packed, MOST_BYTES + 1)
     if not _is_small(text):
-        raise ValueError("it unpacks to more than a golden may have")
+        raise ValueError("it is too large when unpacked")
     if not unpacking.eof or unpacking.unused_data:
-        raise ValueError("it does not end where it should")
+        raise ValueError("it is incomplete or has trailing bytes")
     return text
 
 

@@ -1,6 +1,6 @@
 """The command `fuselog`: its subcommands, their options, and what they do.
 
-Commands import what they need when they run, so that `--help` answers quickly. Begin with `group`.
+Commands import modules only when they run, which keeps `--help` fast. Begin with `group`.
 """
 
 from fuselog.pipeline.command_line.group import fuselog as fuselog

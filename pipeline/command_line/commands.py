@@ -1,7 +1,7 @@
-"""The work of the commands, between the command line and the library.
+"""Functions that the commands call: they use the library, then print and write the results.
 
-Rerun, matplotlib, pandas and scipy are slow to import: only code that draws, tabulates or aligns does
-so.
+Rerun, matplotlib, pandas and scipy are slow to import, so only code that draws, tabulates or aligns
+imports them.
 """
 
 import shutil
@@ -153,7 +153,7 @@ def replay_logs(
 
 
 def say_left_out(path: Path, foxglove: bool) -> None:
-    """Warn about the streams of a new log that have no Foxglove message, if `foxglove` is set."""
+    """If `foxglove` is set, warn about streams of a new log that have no equivalent Foxglove message."""
     if foxglove:
         from fuselog.pipeline.logs.foxglove import left_out
 
@@ -162,7 +162,7 @@ def say_left_out(path: Path, foxglove: bool) -> None:
 
 
 def mirrors_if(foxglove: bool) -> Mirrors | None:
-    """Import and return the Foxglove mirror if it is asked for; the import is slow."""
+    """Import and return the Foxglove mirror only if it is requested, because the import is slow."""
     if not foxglove:
         return None
     from fuselog.pipeline.logs.foxglove import mirrors
@@ -171,7 +171,7 @@ def mirrors_if(foxglove: bool) -> Mirrors | None:
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
-    """Name the estimates log of each log: next to it, the one given file, or in a folder.
+    """Choose the path of each log's estimates log: next to the log, the given file, or in a folder.
 
     Raises BadInput if two of them would have the same path.
     """
@@ -317,7 +317,7 @@ def _print_outcome(
         print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
-    runs = judge.runs_table if judge.runs > 1 else None  # builds on pandas, which is slow to import
+    runs = judge.runs_table if judge.runs > 1 else None  # imports pandas, which is slow
     print_metrics(values, judge.bounds, runs)
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):

@@ -1,4 +1,4 @@
-"""The work of `fuselog run` and `fuselog sweep`, for experiments and for logs."""
+"""Functions that `fuselog run` and `fuselog sweep` call, for experiments and for logs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The group `fuselog`, with all commands in sections by purpose."""
+"""The command group `fuselog`, whose commands are listed in sections by purpose."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""Help texts of commands: the docstring, then example commands; every option has an example value."""
+"""Help texts of commands, with example commands and an example value of every option."""
 
 import inspect
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The commands that judge estimates, compare them, and explain why they are inconsistent."""
+"""The commands that judge estimates, compare estimators, and explain inconsistency."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The commands for one log or several: describe, check, view, export, cut, merge, rename."""
+"""The commands that describe, check, view, export, cut, merge or rename logs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -180,7 +180,7 @@ def view(path: Path, **options: Any) -> None:
 
 
 def _say_next_of_view(path: Path, *, recover: bool) -> None:
-    """Print the command that one would type after viewing a result, a log or an estimates log."""
+    """Suggest the next command after a result, a log or an estimates log was viewed."""
     from fuselog.pipeline.output.terminal import say_next
     from fuselog.pipeline.runs.inputs import shipped
     from fuselog.recorders.log import open_log
@@ -347,7 +347,7 @@ def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **
 
 
 def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Split an option's NAME=VALUE texts into a dictionary; every name may occur once."""
+    """Convert an option's NAME=VALUE texts to a dictionary; reject names that occur more than once."""
     pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.rpartition("=")

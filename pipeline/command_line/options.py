@@ -12,10 +12,10 @@ from fuselog.replay.foreign.naming import allow_programs_of_files
 
 
 class Output(click.Path):
-    """A path that a command writes; the audit of outputs in the tests finds options by this type.
+    """A path that a command writes; a test of all outputs finds options by this type.
 
     Attributes:
-        suffix: of the file; empty for a path that is always a folder.
+        suffix: suffix of the file; empty for a path that is always a folder.
     """
 
     def __init__(self, suffix: str = "", **options: Any) -> None:
@@ -24,7 +24,7 @@ class Output(click.Path):
 
 
 class OutputFile(Output):
-    """A file to write: a new file, or a regular file to replace, but not a device or a folder."""
+    """A file that a command creates or replaces; devices and folders are rejected."""
 
     def __init__(self, suffix: str) -> None:
         super().__init__(suffix, dir_okay=False)
@@ -56,10 +56,10 @@ class Seconds(click.ParamType):
 
 
 class Instant(Seconds):
-    """A time in seconds, or the words for an estimator's worst moment."""
+    """A time in seconds, or `worst` for the moment of the largest NEES or error."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the text to seconds, or return the words as they are."""
+        """Convert the text to seconds, or return it unchanged if it begins with `worst`."""
         is_worst = isinstance(value, str) and value.partition(":")[0] == "worst"
         return value if is_worst else super().convert(value, param, ctx)
 
@@ -121,7 +121,7 @@ FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
 
 def settings_option(function: Callable[..., None]) -> Callable[..., None]:
-    """Add the options --settings and --allow-programs, which permits programs that such files name."""
+    """Add the options --settings and --allow-programs; the latter permits programs in such files."""
 
     def allow(context: click.Context, parameter: click.Parameter, value: bool) -> None:  # noqa: ARG001
         allow_programs_of_files(value)
@@ -215,12 +215,12 @@ _REPLAYING = ("estimators", "experiment")
 
 
 class SetOption(click.Option):
-    """The option --set, which other options complete once all are parsed; see `settle`.
+    """The option --set, to which `settle` adds the values of other options after parsing.
 
     Attributes:
-        takes: what the settings are for, a key of `fuselog.pipeline.api.asking.TAKERS`.
+        takes: kind of object that has the settings, a key of `fuselog.pipeline.api.asking.TAKERS`.
         replays: whether the command replays logs. Such a command also has --origin, which becomes a
-            setting of all their topics.
+            setting of all topics.
     """
 
     def __init__(self, names: Sequence[str], *, takes: str, **options: Any) -> None:
@@ -239,7 +239,7 @@ class SetOption(click.Option):
         return [CompletionItem(name, help=meaning) for name, meaning in found.items()]
 
     def settle(self, context: click.Context) -> None:
-        """Add the origin to the settings; for a question (NAME=?), print the meaning and exit."""
+        """Add the origin to the settings; if a value is `?`, print what the setting means and exit."""
         options = context.params
         if self.replays and (place := options.pop("origin")):
             options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
@@ -251,7 +251,7 @@ class SetOption(click.Option):
 
 
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add the option --set, see `SetOption`, to a command; if it replays logs, --origin as well."""
+    """Add the option --set to a command, and --origin if the command replays logs; see `SetOption`."""
 
     def added(function: Callable[..., None]) -> Callable[..., None]:
         option = click.option(
@@ -269,5 +269,5 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
 
 
 def replay_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that commands replaying logs share: reading, judging, printing and settings."""
+    """Add the options for reading, judging, printing and settings that all replay commands share."""
     return recover_option(gap_option(json_option(settings_option(set_option("estimators")(function)))))

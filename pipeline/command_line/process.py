@@ -27,13 +27,13 @@ from fuselog.recorders.processes import keep_off_settings_here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code: 2, after one sentence, for a user's mistake.
+    """Run the command line and return the exit code, which is 2 after a user's mistake.
 
     FUSELOG_TRACEBACK=1 shows the traceback of an error, for authors of estimators.
 
     Args:
-        arguments: of the command; by default those that this process was started with. In that case
-            the process is ours: it collects garbage less often, and ends here.
+        arguments: of the command. The default is the arguments of this process; the function then
+            collects garbage less often, and ends the process.
     """
     if arguments is None:
         gc.set_threshold(50_000, 20, 100)  # there is no garbage to collect while libraries are imported
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _end(code: int) -> NoReturn:
-    """End the process as Python does, but free no objects, which would take a fifth of a short command.
+    """End the process as Python does, but without freeing objects, which takes 20 % of a short command.
 
     Threads are left running: Python up to 3.13 terminates them, which aborts the process if a thread
     is in NumPy's C++ code or holds the lock of standard error.
@@ -59,12 +59,12 @@ def _end(code: int) -> NoReturn:
 
 
 def _code_of(arguments: Sequence[str] | None) -> int:
-    """Run the command line, print the sentence for an error, and return the exit code."""
+    """Run the command line, print any error as one sentence, and return the exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name may not fit the encoding
     logging.basicConfig(format="fuselog: %(message)s")
-    if sys.stderr.isatty():  # a person is watching
+    if sys.stderr.isatty():  # standard error is a terminal
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals(), without_warnings_of_numbers():
@@ -95,12 +95,12 @@ def _code_of(arguments: Sequence[str] | None) -> int:
     return code or 0
 
 
-# The longest message in characters; a path has up to 4096.
+# The longest message in characters; a path alone may have 4096.
 _LONGEST = 10_000
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the process to end; treated like Ctrl-C."""
+    """The exception for a signal that asks the process to end; it is treated like Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -109,9 +109,9 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[None]:
-    """Let signals that end the process unwind the stack, so that unfinished files are removed.
+    """Convert signals that end the process to exceptions, so that unfinished files are removed.
 
-    A signal that arrives in a finalizer, which no exception can leave, is sent again.
+    A signal that arrives in a finalizer is sent again, because Python ignores exceptions there.
     """
     last_s = -math.inf
     report = sys.unraisablehook
@@ -159,7 +159,7 @@ def _stopped_by_signals() -> Iterator[None]:
 
 
 def _sentence(error: Exception, place: str) -> str:
-    """Describe an error, and where it happened: `place` is for errors that do not name one."""
+    """Describe an error and where it happened; `place` is used if the error names no place."""
     if isinstance(error, OSError):
         place = os.fsdecode(error.filename) if error.filename else place
         return f"{place}: {error.strerror or error}"
@@ -178,7 +178,7 @@ def _fail(sentence: str) -> int:
 
 
 def _drop_output() -> bool:
-    """Test whether standard output can be written to; if not, drop it so that nothing tries again."""
+    """Test whether standard output can be written to; if not, discard all further output."""
     try:
         print(end="", flush=True)
     except OSError:

@@ -1,4 +1,4 @@
-"""The commands that make logs: from simulated scenarios, and from real data."""
+"""The commands that create logs from simulated scenarios or from real data."""
 
 import shlex
 from collections.abc import Iterator, Mapping
@@ -166,7 +166,7 @@ def _import(
     *,
     stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write their log; the log states `stated` in place of the parameters used."""
+    """Import data and write a log, with `stated` instead of the used parameters in its metadata."""
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
@@ -210,7 +210,7 @@ def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
 
 
 def say_written(path: Path, messages: int) -> None:
-    """Print what was written (the log, its messages and its size), then a command to run next."""
+    """Print the path, message count and size of a new log, then a command to run next."""
     from fuselog.pipeline.output.terminal import say, say_next
 
     say(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")

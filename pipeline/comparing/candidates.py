@@ -1,7 +1,7 @@
-"""Candidates of a comparison: their estimates of every run, judged by the truth.
+"""Candidates of a comparison, with estimates of every run that are compared with the truth.
 
-The estimates of a candidate come from logs, as written by `fuselog replay`, from a replay with the
-settings of a result, or from a trajectory file, which is converted to a stream of estimates.
+The estimates of a candidate come from logs written by `fuselog replay`, from a replay with the settings
+of a result, or from a trajectory file, which is converted to a stream of estimates.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 from fuselog.replay.judging.metrics.metrics import rmse_of
 from fuselog.replay.judging.tables import joined
 
-# Relative tolerance for the rows of a result and its replay, since CPUs differ in the last digits.
+# Relative tolerance between a result and its replay, because CPUs differ in the last digits.
 SAME = 1e-6
 # Entries of an experiment that affect its results.
 DECIDING = ("record", "import", "logs", "alterations", "gap_limit_s", "arrival_order", "late")
@@ -51,7 +51,7 @@ Pairs = Mapping[str, tuple[Source, Source]]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The estimates of one estimator, judged run by run.
+    """The estimates of one estimator, compared with the truth run by run.
 
     Attributes:
         name: name in the comparison.
@@ -63,9 +63,9 @@ class Candidate:
         truths: hash of the truth by run.
         pairs: log and estimates by run, for the runs that can be drawn.
         notes: sentences about the origin of the estimates.
-        replay: the replay that made the estimates of `pairs`, if any; it keeps their files.
-        doubts: doubts about truths, by topic.
-        coverage: rows on the use of the messages of every topic.
+        replay: the replay that made the estimates of `pairs`, if any; it keeps their files alive.
+        doubts: reasons to doubt the truth, by topic.
+        coverage: counts of used and unused messages per topic.
     """
 
     name: str
@@ -130,7 +130,7 @@ def measured(
 
 
 def _hash_of_truth(source: Source, estimates: Source) -> str:
-    """Hash the truths of estimates, independent of their division into blocks."""
+    """Hash the truths of estimates; the hash does not depend on how they are divided into blocks."""
     named = {topic.metadata.get("truth", "") for topic in estimates.topics.values()}
     digests: list[str] = []
     for topic in sorted(named & source.topics.keys()):
@@ -151,7 +151,7 @@ def key_of(source: Source) -> str:
 
 
 def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that affect the estimates of a label, by dotted name."""
+    """Return the settings that affect one estimator's estimates, by dotted name."""
     run = source.run or RunMetadata("unknown")
     return flat(
         {"scenario": run.scenario, "parameters": run.parameters, "estimator": parameters(label, stated)}
@@ -159,7 +159,7 @@ def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[s
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an estimator's parameters, including defaults if the estimator is known."""
+    """Return an estimator's parameters, with the defaults if fuselog has this estimator."""
     try:
         return dict(configure(label, stated)[1].model_dump(mode="json"))
     except BadInput:
@@ -184,9 +184,9 @@ def name_of(path: Path) -> str:
 
 
 def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[str] = ()) -> Given:
-    """Return the estimators of a replay, preceded by those whose estimates its logs contain.
+    """Return the estimators of a replay, after those whose estimates were recorded in its logs.
 
-    Raises BadInput if two of the logs have the same run.
+    Raises BadInput if two of the logs are of the same run.
     """
     runs = list(map(key_of, done.logs))
     for run in runs:
@@ -210,20 +210,21 @@ def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[st
 def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
     """Return the estimators of an estimates log, or of a folder with an estimates log for each run.
 
-    Raises BadInput if a log has no estimates, two logs have the same run, or a replayed log is missing.
+    Raises BadInput if a log has no estimates, two logs are of one run, or a replayed log is missing.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if not files:
         raise BadInput(
-            f"{path}: has no estimates logs (*.mcap), and is not a result of fuselog run; give one of "
-            "these"
+            f"{path}: has no estimates logs (*.mcap) and is not a result of fuselog run; give a folder "
+            "of either kind"
         )
     pairs: dict[str, tuple[Source, LogSource]] = {}
     for file in files:
         log = open_log(file, recover=recover)
         if not labels_of(LogSource(log)):
             raise BadInput(
-                f"{file}: has no estimates; name the estimators to replay it with, such as -e ekf -e ukf"
+                f"{file}: has no estimates; name estimators with which to replay it, such as -e ekf -e "
+                "ukf"
             )
         source = source_of_estimates(log, recover=recover)
         check_same_run(LogSource(log), source)
@@ -252,20 +253,21 @@ def of_result(folder: Path, progress: Progress) -> Given:
     """Return the estimators of a result folder, replayed with its settings.
 
     A result contains the RMSE and NEES of every run, but not every metric. If a replay with this version
-    gives the same rows, its other metrics are used too; otherwise only the rows of the result are.
+    reproduces its rows, the other metrics of the replay are used too. Otherwise, only the rows of the
+    result are used.
     """
     result = read_result(folder)
     tables = {name: folder / "tables" / f"{name}.parquet" for name in ("runs", "times")}
     if not all(path.is_file() for path in tables.values()):
         raise BadInput(
-            f"{folder}: its study {result.settings.get('study', result.experiment)} keeps no row for "
-            "each run; compare its estimates logs"
+            f"{folder}: its study {result.settings.get('study', result.experiment)} has no row per run; "
+            "compare its estimates logs instead"
         )
     rows, times = (read_table(path) for path in tables.values())
     if not pd.api.types.is_integer_dtype(rows["run"]):
         raise BadInput(
-            f"{folder}: its runs have names, as those of a comparison; compare the logs or results that "
-            "it was made of"
+            f"{folder}: its runs have names, so it is the result of a comparison; give the logs or "
+            "results that it compared"
         )
     stated = result.settings.get("parameters", {})
     numbers = sorted(set(rows["run"]))
@@ -299,7 +301,7 @@ def _run_of_result(result: Result, number: int) -> str:
 
 
 def _without_replay(folder: Path, why: str) -> str:
-    return f"{folder}: RMSE and NEES are compared as the result has them, without other metrics: {why}"
+    return f"{folder}: only the RMSE and NEES stored in the result are compared: {why}"
 
 
 def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
@@ -310,7 +312,7 @@ def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -
 def _stored(
     rows: pd.DataFrame, times: pd.DataFrame, label: str, name: str, settings: Mapping[str, Any]
 ) -> Candidate:
-    """Make a candidate from a result's own tables."""
+    """Make a candidate from the tables that a result contains."""
     own = rows[rows["estimator"] == label].drop(columns=["estimator", "estimates"])
     components = [column for column in map(str, own) if column.startswith("rmse_")]
     sizes = {
@@ -329,10 +331,10 @@ def _stored(
 
 
 def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate) -> Candidate:
-    """Replay the runs of a result, some at a time, and judge them again."""
+    """Replay the runs of a result in batches, and compare them with the truth again."""
     label = kept.label
     if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
-        raise BadInput("its settings do not say how to replay it; estimates logs can be compared")
+        raise BadInput("its settings are not sufficient for a replay; estimates logs can be compared")
     fields = {each.alias or name for name, each in Experiment.model_fields.items()}
     entries = {key: value for key, value in result.settings.items() if key in fields}
     entries["estimators"] = of_file(entries["estimators"])
@@ -343,7 +345,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
     data = result.settings.get("data")
     setting = Setting(folder, folder, data=Path(data) if data else None)
     if experiment.import_ and setting.data is None:
-        raise BadInput("its settings do not say where its data are")
+        raise BadInput("its settings do not contain the folder of its data")
     runner = Runner(experiment, setting)
     parts: list[Candidate] = []
     chosen = {label: experiment.estimators[label]}
@@ -374,7 +376,7 @@ def _row_that_differs(kept: Candidate, again: Candidate) -> str:
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
     if len(both) < len(kept.rows):
-        return "a replay does not give all of its rows"
+        return "a replay does not reproduce all of its rows"
     if not apart.any():
         return ""
     row = both[apart].iloc[0]
@@ -385,7 +387,7 @@ def _row_that_differs(kept: Candidate, again: Candidate) -> str:
 
 
 def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: float) -> Given:
-    """Return the trajectory in a file as estimates of a run, to be judged by the topic of a truth."""
+    """Return the trajectory in a file as estimates of a run, to be compared with a topic of truth."""
     trajectory = read_trajectory(path)
     name = name_of(path)
     truth = source.read([truth_topic])[truth_topic]

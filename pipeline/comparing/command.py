@@ -43,7 +43,7 @@ def compare_candidates(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> bool:
-    """Compare candidates; print tables and verdicts, and write the result folder and the timeline.
+    """Compare candidates, print tables and verdicts, and write the result folder and the timeline.
 
     Returns False if `fail_if_worse` is set and a candidate is worse than the first (see
     `Differences.worse`), otherwise True.

@@ -1,4 +1,4 @@
-"""Comparison of estimators: paired differences of metrics over the same runs, with verdicts."""
+"""Comparison of estimators by the paired differences of their metrics over the same runs."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -100,19 +100,20 @@ class Differences:
         ]
 
     def worse(self) -> list[Paired]:
-        """Return the metrics of error, consistency and failure in which a candidate is worse.
+        """Return the metrics of error, consistency and failure in which a candidate is clearly worse.
 
-        The interval of their difference from the first candidate is entirely beyond the margin.
+        The whole interval of the difference from the first candidate is then beyond the margin.
 
         Raises BadInput if there are too few runs for an interval, or if a candidate that is not worse in
-        any metric lacks a metric of the first, since it cannot be judged then.
+        any metric lacks a metric of the first candidate, because then it cannot be judged.
         """
         judged = [each for each in self.paired if _is_judged(each.quantity)]
         runs = max((each.found.runs for each in judged), default=0)
         if runs < FEWEST_RUNS:
             raise BadInput(
-                f"{runs_of(runs)} cannot show that a side is worse, since an interval needs "
-                f"{FEWEST_RUNS}; give more runs, or leave out --fail-if-worse"
+                f"an interval needs at least {FEWEST_RUNS} runs, and the comparison has only "
+                f"{runs_of(runs)}; "
+                "give more runs, or leave out --fail-if-worse"
             )
         worse = [
             each for each in judged if each.found.verdict == Comparison.WORSE and not each.is_withheld
@@ -123,9 +124,9 @@ class Differences:
                 lacking = sorted(_judged_by(first) - _judged_by(second))
                 if lacking and second.name not in failing:
                     raise BadInput(
-                        f"{second.name}: has no {', '.join(lacking)}, which {first.name} has, so that "
-                        "nothing shows whether it is worse; let it give the same components and "
-                        "innovations, or leave out --fail-if-worse"
+                        f"{second.name}: has no {', '.join(lacking)}, which {first.name} has, so it "
+                        "cannot be judged; let it output the same components and innovations, or "
+                        "leave out --fail-if-worse"
                     )
         return worse
 
@@ -143,9 +144,9 @@ class Differences:
         }
 
     def draw(self, save: Path) -> None:
-        """Write the first run that all candidates of the first group have to the .rrd file `save`.
+        """Draw the first run that all candidates of the first group share to the .rrd file `save`.
 
-        Raises BadInput if there is no such run.
+        Raises BadInput if they share no run.
         """
         from fuselog.replay.timeline.show import Drawing  # slow to import
 
@@ -196,7 +197,7 @@ class Differences:
 
     @cached_property
     def coverage(self) -> list[Row]:
-        """Return the rows on the use of every topic's messages, for all candidates."""
+        """Return the table of used and unused messages per topic, for all candidates."""
         return [
             row for candidates in self.groups for candidate in candidates for row in candidate.coverage
         ]
@@ -222,7 +223,7 @@ def _is_judged(key: str) -> bool:
 
 
 def _judged_by(candidate: Candidate) -> set[str]:
-    """List the metrics by which a candidate is judged, except `estimates_without_*` (may be absent)."""
+    """List the metrics by which a candidate is judged, except the optional `estimates_without_*`."""
     known = candidate.rows.dropna(subset=["value"])["quantity"]
     return {key for key in known if _is_judged(key) and not key.startswith("estimates_without")}
 
@@ -241,7 +242,7 @@ def _chart(rows: pd.DataFrame) -> Chart:
         panel.series.extend([curve(label, x, of["difference"]), level("no difference", x, 0.0)])
         panel.bands.append(band(label, x, of["low"], of["high"]))
         panels.append(panel)
-    title = f"{case or 'differences'}: {second} less {first}, with 95 % over the runs"
+    title = f"{case or 'differences'}: {second} minus {first}, with 95 % intervals over the runs"
     return Chart(title=title, panels=panels)
 
 
@@ -263,19 +264,19 @@ def compare(
     Args:
         candidates: result folders, estimates logs or folders of them, and trajectory files; with
             `estimators`, logs to replay or folders of them.
-        estimators: estimators to compare, as for `replay`, or labels of estimates that a log contains
-            in addition to its sensors, which come first. By default, those that all candidates have in
-            common, or the only estimator of each.
+        estimators: estimators to compare, in the form that `replay` accepts, or labels of estimates
+            recorded in the logs, which come first. The default is the estimators that all candidates
+            have in common, or the only estimator of each.
         truth: file of the true trajectory, if all candidates are trajectory files.
-        case: case that trajectory files belong to, such as `robot2`, if a log has several truths.
+        case: case to which trajectory files belong, such as `robot2`, if a log has several truths.
         margin: relative difference of a metric that is considered irrelevant.
         gap_limit_s: longest gap over which the truth is interpolated.
-        set: alterations of topics, and parameters of estimators, for logs that are replayed; as for
-            `replay`.
+        set: alterations of topics and parameters of estimators for the replay of logs, in the form
+            that `replay` accepts.
         recover: whether the readable part of truncated or damaged logs is used.
-        stress: whether verdicts are withheld if changes that should not matter move the metric by more
-            than the difference; see `stress`. Requires logs and `estimators`.
-        progress: function that reports the progress of replays of results.
+        stress: whether to withhold a verdict if changes that should not matter (see `stress`) move the
+            metric by more than the difference. Requires logs and `estimators`.
+        progress: function that reports progress while results are replayed.
 
     Returns:
         The difference of every metric for every pair, with its interval and a verdict.
@@ -313,7 +314,7 @@ def compare(
     if stress:
         if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
             raise BadInput(
-                f"--stress: {paths[0]} is no log to replay; give logs, and estimators with -e"
+                f"--stress: {paths[0]} is not a log to replay; give logs, and estimators with -e"
             )
         sources = [LogSource(open_log(path, recover=recover)) for path in paths]
         found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
@@ -325,7 +326,7 @@ def compare(
 def _compared(
     first: Candidate, second: Candidate, margin: float, notes: list[str]
 ) -> tuple[list[Paired], pd.DataFrame]:
-    """Compare two candidates in their common metrics, over their common runs and over time."""
+    """Compare the common metrics of two candidates, over their common runs and over time."""
     keys = ["quantity", "case", "run"]
     both = first.rows.merge(second.rows, on=keys, suffixes=("_first", "_second"))
     of_first, of_second = (set(candidate.rows["quantity"]) for candidate in (first, second))
@@ -336,7 +337,7 @@ def _compared(
     if known.empty:
         raise BadInput(
             f"{first.name} and {second.name} have no metric in common: one of them has estimates "
-            "without truth, or of something else"
+            "without truth, or of other quantities"
         )
     over_time = _over_time(first, second, margin)
     paired: list[Paired] = []
@@ -385,7 +386,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
 
 
 def _span_s(tables: Iterable[pd.DataFrame]) -> float:
-    """Choose a span length: a multiple of that of every table, with at most `SPANS` spans."""
+    """Choose a span length that is a multiple of every table's and gives at most `SPANS` spans."""
     ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
     width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
     longest = max(int(each.max()) for each in ends_ms)
@@ -395,7 +396,7 @@ def _span_s(tables: Iterable[pd.DataFrame]) -> float:
 
 
 def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
-    """Compute NEES and RMSE by span: of position and orientation, or else of the first component."""
+    """Compute NEES and RMSE in each span, of position and orientation or else the first component."""
     columns = [column for column in times if "rmse" in str(column)]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
     parts = []
@@ -412,7 +413,7 @@ def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
 def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
-    """Find the consecutive spans with most of a difference; None if it is not significant."""
+    """Find the consecutive spans that contribute most to a difference; None if it is not significant."""
     if over_time.empty or found.verdict not in DIFFER:
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]

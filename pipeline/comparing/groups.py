@@ -1,4 +1,4 @@
-"""Reading of the inputs of a comparison, and grouping of the estimators to compare."""
+"""Functions that read the inputs of a comparison and group the estimators to compare."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ from fuselog.recorders.trajectories import read_trajectory
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.trajectory_streams import truth_of
 
-# Number of differing settings that a note names.
+# Largest number of differing settings that a note names.
 NAMED = 8
 IN_LOGS = ("estimates", "log")
 
@@ -55,8 +55,8 @@ def inputs_of(
     if logs and len(logs) < len(paths):
         other = next(path for path, kind in zip(paths, kinds, strict=True) if kind != "log")
         raise BadInput(
-            f"{logs[0]}: is a log without estimates; make them with fuselog replay, or leave out "
-            f"{other}, which is no log to replay"
+            f"{logs[0]}: is a log without estimates; create them with fuselog replay, or leave out "
+            f"{other}, which is not a log to replay"
         )
     if logs:
         if not estimators:
@@ -69,7 +69,8 @@ def inputs_of(
         return [of_replay(name_of(logs[0]), done, gap_limit_s, recorded)]
     if set_:
         raise BadInput(
-            f"--set {next(iter(set_))}: is for logs that are replayed; {paths[0]} has estimates already"
+            f"--set {next(iter(set_))}: applies only to logs that are replayed; {paths[0]} already has "
+            "estimates"
         )
     found: dict[int, Given] = {}
     for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
@@ -102,7 +103,7 @@ def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recove
 
 
 def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:
-    """List the labels of recorded estimates, such as an autopilot's, that all of the logs contain."""
+    """List the labels of recorded estimates (such as an autopilot's) that all of the logs contain."""
     logs = [path for path in paths if kind_of(path, recover=recover) in IN_LOGS and path.is_file()]
     found = [recorded_estimators(open_log(path, recover=recover)) for path in logs]
     return [label for label in found[0] if all(label in each for each in found)] if found else []
@@ -126,7 +127,7 @@ def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
 
 
 def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
-    """Return the run of the trajectories: that of the other candidates, or only the true trajectory."""
+    """Return the true trajectory as a run if it is given, or else the run of the other candidates."""
     if truth is not None:
         trajectory = read_trajectory(truth)
         stream = truth_of(trajectory, "/truth")
@@ -150,9 +151,7 @@ def _truth_topic(source: Source, case: str | None) -> str:
         return next(iter(truths.values()))
     if case not in truths:
         known = some_of(truths) or "none"
-        raise BadInput(
-            f"{source.name}: name with --case the truth that trajectories are judged by: {known}"
-        )
+        raise BadInput(f"{source.name}: choose the truth of the trajectories with --case: {known}")
     return truths[case]
 
 
@@ -165,7 +164,7 @@ def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterato
     if len(givens) == 1:
         chosen = list(labels) or list(givens[0].labels)
         if len(chosen) < 2:
-            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give another side to compare with")
+            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give something to compare it with")
         yield [givens[0].candidate(label, label) for label in chosen]
         return
     names = _distinct([each.name for each in givens])
@@ -176,7 +175,7 @@ def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterato
     if not common:
         problem = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
         raise BadInput(
-            f"the sides have no estimator in common: {problem}; name those to compare with -e"
+            f"the inputs have no estimator in common: {problem}; name the estimators to compare with -e"
         )
     for label in common:
         suffix = f":{label}" if len(common) > 1 else ""
@@ -194,7 +193,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 
 def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
-    """Yield sentences about unequal runs, truths and settings; raises BadInput if no run is common."""
+    """Yield sentences about unequal runs, truths and settings; raise BadInput if no run is common."""
     runs = [list(dict.fromkeys(candidate.rows["run"])) for candidate in (first, second)]
     common = [run for run in runs[0] if run in set(runs[1])]
     if not common:
@@ -216,7 +215,7 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         count = runs_of(len(apart))
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
     ours, theirs = first.settings or {}, second.settings or {}
-    # settings that only one of them has belong to its method
+    # settings that only one candidate has belong to its method, so they are not compared
     both = {name: (ours[name], theirs[name]) for name in ours if name in theirs}
     differing = [f"{name} {_stated(a)} and {_stated(b)}" for name, (a, b) in both.items() if a != b]
     if differing:
@@ -226,7 +225,7 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
 
 
 def _stated(value: Any) -> Any:
-    """Return the value of a setting for a sentence."""
+    """Format the value of a setting for a sentence."""
     return "not stated" if value is None else value
 
 

@@ -1,4 +1,4 @@
-"""Verdicts on metrics of two candidates, withheld if stress changes the metric by more."""
+"""Verdicts on the metrics of two candidates, withheld if irrelevant changes move the metric more."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -21,9 +21,9 @@ class Paired(NamedTuple):
         case: case of the estimates; `all` is the mean over the cases of each run.
         target: best value of the metric.
         found: difference over the runs.
-        where: start and end of the time span with most of the difference, in s since the run's epoch;
-            None if there is no such span.
-        stressed: largest change of the metric, of either candidate, by changes that should not matter.
+        where: start and end of the time span that contributes most to the difference, in s since the
+            run's epoch; None if there is no such span.
+        stressed: largest change of either candidate's metric under changes that should not matter.
     """
 
     first: str
@@ -47,7 +47,7 @@ class Paired(NamedTuple):
         of = f" of {self.case}" if self.case else ""
         values = f"{found.second:.4g} against {found.first:.4g}"
         if isinstance(self.target, float):
-            values += f", where {self.target:g} is right"
+            values += f", where {self.target:g} is ideal"
         if found.runs < FEWEST_RUNS:
             equal = "equal in every run; " if found.verdict == Comparison.TIE else ""
             return f"{self.quantity}{of}: {values}; {equal}{too_few(found.runs)}"
@@ -55,7 +55,7 @@ class Paired(NamedTuple):
         of_runs = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
         if found.verdict == Comparison.UNDECIDED:
-            verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
+            verdict = f"{self.second} and {self.first} may or may not differ by more than the margin"
         elif found.verdict == Comparison.TIE:
             verdict = f"no difference beyond the margin between {self.second} and {self.first}"
         if self.is_withheld:
@@ -68,7 +68,7 @@ class Paired(NamedTuple):
 
 
 def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) -> list[Paired]:
-    """Add to each metric its largest change under stress, of either candidate."""
+    """Add to each metric the larger of the two candidates' changes under stress."""
     found = []
     for each in paired:
         key = each.quantity if each.case in ("", ALL) else f"{each.quantity}.{each.case}"

@@ -1,4 +1,4 @@
-"""A view of the estimates of one label under the name that a comparison uses for them."""
+"""Access to the estimates of one label under the name that a comparison uses for them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from fuselog.replay.engine.streams.sources import Source
 
 @dataclass(frozen=True)
 class Renamed:
-    """The estimates of one label under another name, as a source that is read on demand."""
+    """A source that reads the estimates of one label on demand, and gives them another name."""
 
     estimates: Source
     label: str
@@ -39,7 +39,7 @@ class Renamed:
 
     @property
     def rejections(self) -> Rejections:
-        """Return the counts of messages that were rejected in reading the estimates."""
+        """Return the counts of messages that were rejected when the estimates were read."""
         return self.estimates.rejections
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The estimates of several candidates side by side, drawn from above."""
+"""Top views of the estimates of several candidates."""
 
 from collections.abc import Sequence
 
@@ -21,9 +21,9 @@ def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, Mem
 
 
 def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
-    """Draw a run from above, and one second of it enlarged if ellipses are too small to be seen.
+    """Draw a run from above, and enlarge one second of it if the ellipses are too small to be seen.
 
-    The result is empty without truth and estimates of horizontal positions.
+    The result is empty if the truth or the estimates have no horizontal positions.
     """
     from fuselog.pipeline.output.report.first_run import seen_from_above  # slow to import
     from fuselog.pipeline.output.report.scene import lens, plan

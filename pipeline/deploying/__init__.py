@@ -1,5 +1,5 @@
-"""Filters written as C99 for a robot: `fuselog deploy`.
+"""Filters in C99 for a robot, written by `fuselog deploy`.
 
-Begin reading in `deploying`, which chooses and writes. `c_source` writes the filter itself; `c_replay`
-lets fuselog replay it, and `c_test` turns a recorded log into its test.
+Begin with `deploying`, which writes the folder. `c_source` writes the filter itself, `c_replay` an
+interface with which fuselog can replay it, and `c_test` a test from a recorded log.
 """

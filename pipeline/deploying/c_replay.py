@@ -1,4 +1,4 @@
-"""The interface by which fuselog replays a filter in C: an implementation of `fuselog_filter.h`."""
+"""The interface with which fuselog replays a filter in C, an implementation of `fuselog_filter.h`."""
 
 import json
 from typing import Any
@@ -12,7 +12,7 @@ from fuselog.replay.inference.model.model import Map, Sensor
 
 
 def why_no_replay(made: CFilter) -> str:
-    """Explain why fuselog cannot replay the C; "" if it can."""
+    """Explain why fuselog cannot replay the C code; "" if it can."""
     bound_model, found = made.filtering.bound_model, made.filtering.found
     if made.is_interpolated:
         return "its control is interpolated, so that messages have to wait for the next control"
@@ -31,7 +31,7 @@ def why_no_replay(made: CFilter) -> str:
 
 
 def _maps(made: CFilter) -> list[Map]:
-    """List the maps that sensors refer to, without repetitions."""
+    """List the maps to which sensors refer, without repetitions."""
     found = {each.topic: each for _, sensor in made.sensors for each in sensor.maps}
     return list(found.values())
 
@@ -101,7 +101,7 @@ def _description(made: CFilter, reading: Reading) -> str:
 
 
 def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
-    """List the parameters: name, where each is in C, value.
+    """List the parameters by name, with their places in C and their values.
 
     A parameter whose value differs between parts is listed once per part.
     """
@@ -120,7 +120,7 @@ def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
 
 
 def _role(place: str, reading: Reading) -> Role:
-    """Find the role of a parameter by what the model's functions read."""
+    """Determine the role of a parameter from the functions of the model that use it."""
     _, _, name = place.partition(".")
     topics = {identifier(field_of(key)): topic for key, topic in reading.noises.items()}
     if name in topics:
@@ -130,7 +130,7 @@ def _role(place: str, reading: Reading) -> Role:
 
 
 def _literal(text: str) -> str:
-    """Write a string literal of C over several lines."""
+    """Write a C string literal over several lines."""
     pieces = [text[first : first + 90] for first in range(0, len(text), 90)]
     return "\n".join(f"    {json.dumps(each)}" for each in pieces)
 
@@ -320,7 +320,7 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
-    """Write the code that passes the numbers of a sensor's message to the update, in their order."""
+    """Write the code that passes the numbers of a sensor's message to the update."""
     m = len(sensor.measured)
     ids = list(dict.fromkeys(each.of for each in sensor.maps))
     first = len(ids)

@@ -1,4 +1,4 @@
-"""A filter's test on a Cortex-M4F: QEMU emulates one on Arm's board MPS2, image AN386."""
+"""The test of a filter on a Cortex-M4F that QEMU emulates (Arm's board MPS2, image AN386)."""
 
 MACHINE = "mps2-an386"
 TARGET_OPTIONS = (

@@ -1,4 +1,4 @@
-"""A recorded log as a test of a filter in C: its inputs, and the results of fuselog's own filter."""
+"""A test of a filter in C, with a recorded log as input and the results of fuselog's own filter."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -18,18 +18,18 @@ from fuselog.replay.inference.kalman.update import message_layout
 from fuselog.replay.inference.run.filtering import Filter, FilterState
 from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 
-MOST_EVENTS = 400  # more only until every sensor has a message
-FAR = 1e4  # distance of outliers from the measurement, in units of one plus its size
+MOST_EVENTS = 400  # largest number of events, exceeded only until every sensor has a message
+FAR = 1e4  # distance of outliers from the measurement, as a multiple of one plus its magnitude
 
 
 class Vectors(NamedTuple):
-    """A log as a filter takes it, and the filter's results.
+    """The messages of a log in the order in which a filter processes them, with the filter's results.
 
     Attributes:
         start_ns, mean, covariance: the prior.
-        time_ns, source, data: of the events (n,), (n,), (n, width).
-        accepted, nis: of the measurements (n,), -1 and NaN if nothing is measured.
-        judged: (n,) rows of the estimates after events, -1 if there is none.
+        time_ns, source, data: the events (n,), (n,), (n, width).
+        accepted, nis: the measurements (n,), -1 and NaN if the event has no measurement.
+        judged: (n,) rows of the estimates after events, -1 if there is no estimate.
         means, covariances: the estimates.
     """
 
@@ -47,9 +47,9 @@ class Vectors(NamedTuple):
 
 
 def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vectors:
-    """Run a filter over the first messages of a log from its start, with outliers among them.
+    """Run a filter over the first messages of a log after its start, with added outliers.
 
-    Raises BadInput if the filter does not start in the log, estimates nothing, or accepts nothing.
+    Raises BadInput if the filter does not start in the log, or has no estimates or accepted messages.
     """
     start, events = _handed(source, bound, filtering)
     first, sensors = start.carried, filtering.bound_model.sensors
@@ -88,7 +88,7 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
 
 
 def _handed(source: LogSource, bound: Recursive, filtering: Filter) -> tuple[FilterState, FilterEvents]:
-    """Replay a log and return the filter's first state and all its events."""
+    """Replay a log, and return the filter's first state and all its events."""
     handed: list[FilterEvents] = []
     begun: list[FilterState] = []
 
@@ -119,7 +119,7 @@ def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
 
 
 def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:
-    """Select the first events from the start on, and more until every sensor has a message."""
+    """Select the first events after the start, and more until every sensor has a message."""
     rows = np.flatnonzero(events.time_ns >= start_ns)
     found = [np.flatnonzero(events.source[rows] == sensor) for sensor in range(sensors)]
     until = max([MOST_EVENTS, *(int(each[0]) + 1 for each in found if len(each))])
@@ -127,7 +127,7 @@ def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEven
 
 
 def _with_outliers(filtering: Filter, events: FilterEvents) -> FilterEvents:
-    """Add a distant copy of the last message of every sensor with a gate, as an outlier."""
+    """Add a distant copy of the last message of every sensor that has a gate, as an outlier."""
     source, data = events.source, events.data
     rows, far = [np.arange(len(source))], [data]
     for number, sensor in enumerate(filtering.bound_model.sensors):
@@ -248,7 +248,7 @@ def test_text(made: CFilter) -> str:
     factor = "            double own[NAME_TANGENT][NAME_TANGENT];\n"
     kept = "                    own[row][column] = (double)filter.covariance[row][column];\n"
     definite = "is_definite(own)"
-    # its covariance is a square: it is definite if all pivots of the factor are positive
+    # the covariance is L L', so it is positive definite if all pivots of the factor are positive
     if made.is_root:
         factor = (
             "            REAL covariance[NAME_TANGENT][NAME_TANGENT];\n"

@@ -1,4 +1,4 @@
-"""The cost of a step of a filter in C: operations in its graphs, and memory by the compiler."""
+"""The cost of a step of a filter in C: operations in its graphs, and memory used by compiled code."""
 
 import json
 import math
@@ -19,12 +19,12 @@ OPTIONS = ("-std=c99", "-O2", "-ffp-contract=off")
 
 
 class Memory(NamedTuple):
-    """A filter's memory, as the compiler reports it.
+    """A filter's memory, as reported by the compiler.
 
     Attributes:
         compiler: its name, version and target.
         text: bytes of code and constants.
-        stack: bytes of stack in the deepest chain of calls, without libm's own.
+        stack: bytes of stack in the deepest chain of calls, without those of libm.
     """
 
     compiler: str
@@ -33,14 +33,14 @@ class Memory(NamedTuple):
 
 
 class Single(NamedTuple):
-    """The effect of single precision over the recorded log that is the filter's test.
+    """The effect of single precision on the results for the log with which the filter is tested.
 
     Attributes:
         estimates: number of estimates compared with those in double precision.
-        furthest: largest difference of means and covariances, relative to the number itself, or to one
-            if that is larger.
-        lost_event, lost_s: the event, and its time after the start, from which the covariance is no
-            longer positive definite, unlike that in double precision; None if it stays so.
+        furthest: largest difference of means and covariances, relative to the number itself or to one,
+            whichever is larger.
+        lost_event, lost_s: the event, and its time after the start, from which the covariance is not
+            positive definite in single precision only; None if it always is.
     """
 
     estimates: int
@@ -54,11 +54,11 @@ class Certificate(NamedTuple):
 
     Attributes:
         steps: the cost of the C functions, by name.
-        worst: the cost of a prediction and the costliest update after it.
+        worst: the cost of a prediction plus that of the costliest update.
         dense, sparse: flops of the products F P F', P H' and H P H' of all steps (of F L and H L for a
             factor L), with all entries of F and H, and without those known to be zero or one.
-        memory: None if no compiler reports it.
-        single: None in double precision, and without a compiler.
+        memory: None if the compiler does not report it.
+        single: None in double precision, and if there is no compiler.
     """
 
     steps: Mapping[str, Cost]
@@ -70,11 +70,11 @@ class Certificate(NamedTuple):
 
 
 def certificate_of(made: CFilter, files: Mapping[str, str]) -> Certificate:
-    """Count the cost of a filter, compile its C, and test it in single precision.
+    """Count the operations of a filter, compile its C code, and test it in single precision.
 
     Args:
         made: the filter.
-        files: its C and its test, by file name.
+        files: its C code and its test, by file name.
     """
     steps, products = costs_of(made)
     updates = [cost for name, cost in steps.items() if name != "predict"]
@@ -121,7 +121,7 @@ def _output_of(folder: Path, *command: str | Path, check: bool = True) -> str:
 
 
 def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
-    """Compile a filter; None if GCC (before 10) does not report calls and stack."""
+    """Compile a filter and measure its memory; None if GCC is older than 10 and does not report it."""
     try:
         _output_of(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
         version, target = (
@@ -136,7 +136,7 @@ def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
 
 
 def _single(compiler: str, folder: Path, name: str) -> Single | None:
-    """Run a filter's test; None if it cannot be built here."""
+    """Run a filter's test; None if it cannot be built on this machine."""
     program = folder / "tried"
     try:
         _output_of(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)
@@ -158,7 +158,7 @@ def deepest_stack(calls: str) -> int:
 
     Args:
         calls: a call graph with stack usage, as GCC writes it (`-fcallgraph-info=su`). Functions that
-            are not compiled with it, such as libm's, do not count.
+            are compiled without this option, such as libm's, are not counted.
     """
     own = {
         name: int(size)

@@ -1,4 +1,4 @@
-"""The command `fuselog deploy`: it writes a filter as C, and prints how to build it."""
+"""The command `fuselog deploy`, which writes a filter as C and prints how to build it."""
 
 import json
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def deploy_filter(
     single: bool,
     as_json: bool,
 ) -> None:
-    """Write a filter into a folder and print what is in it, or with `as_json` its certificate."""
+    """Write a filter to a folder, and print the contents of the folder or, as JSON, its certificate."""
     chosen = settings_of_estimators([name], settings, settings_file, model=model)
     folder = deploy(log, chosen, out, single=single)
     certificate = json.loads((folder / CERTIFICATE).read_text(encoding="utf-8"))

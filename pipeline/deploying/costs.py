@@ -1,4 +1,4 @@
-"""Operation counts of the steps of a filter in C: those of their graphs, and of their loops."""
+"""Operation counts of the steps of a filter in C, from their graphs and their loops."""
 
 import operator
 from collections.abc import Collection
@@ -43,12 +43,12 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """The largest cost of a step: both sides of every condition count, and every iteration.
+    """The largest cost of a step, which counts both branches of every condition and every iteration.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
         roots: square roots.
-        calls: calls of libm's other functions, such as sin and fmod.
+        calls: calls of other functions of libm, such as sin and fmod.
     """
 
     flops: int
@@ -68,8 +68,8 @@ def added(*costs: Cost) -> Cost:
 def costs_of(made: CFilter) -> tuple[dict[str, Cost], list[Products]]:
     """Count the cost of a filter's functions, by name.
 
-    It also returns, for the motion and every sensor, the cost of products with a Jacobian with all its
-    entries, and without those that are known to be zero or one.
+    The function also returns, for the motion and every sensor, the cost of products with a Jacobian,
+    once with all its entries, and once without those that are known to be zero or one.
     """
     t, steps = made.tangent, made.steps
     products = [_products(steps.predict, "F", t, t, is_root=made.is_root)]
@@ -111,7 +111,7 @@ def _traced(function: Any, *arguments: Argument) -> Cost:
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
-    """Count the loops of the motion (0) or of a sensor: samples, noise, the factor of both."""
+    """Count the loops of the motion (0) or of a sensor over samples, noise, and their factor."""
     step = made.steps.predict if part == 0 else made.steps.innovate[part - 1]
     sampled, t = made.steps.sampled[part], made.tangent
     costs = [_entering(step, size)]
@@ -126,7 +126,7 @@ def _loops(made: CFilter, part: int, size: int) -> Cost:
 
 
 def _entering(step: Step, size: int) -> Cost:
-    """Count the cost of noise that enters through a gain."""
+    """Count the cost of noise that is multiplied by a gain."""
     gains = sum(name == "u" for name, _ in step.outputs)
     if not gains:
         return NOTHING
@@ -134,7 +134,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """Count a function at samples, and the mean of its values, with the largest number of iterations."""
+    """Count a function at samples and the mean of its values, for the largest number of iterations."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -149,7 +149,7 @@ def _sampling(sampled: SampledFunction) -> Cost:
 
 
 def _narrowing(sampled: SampledFunction) -> Cost:
-    """Count the operations that keep angles at samples within half a turn if one is hardly known."""
+    """Count the operations that keep sampled angles within half a turn if an angle is very uncertain."""
     if not sampled.turns:
         return NOTHING
     count, size = sampled.points.shape
@@ -163,7 +163,7 @@ def _narrowing(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """Count a step for every sample; operations that are always the same come before the loop."""
+    """Count a step for every sample; operations with the same result for all samples count once."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     inside = [node for node in needed(outputs, same) if node not in same]
@@ -171,7 +171,7 @@ def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:
-    """Count the operations on the values: covariances, or the rows of a factor."""
+    """Count the operations that turn the values into covariances, or into the rows of a factor."""
     count, v = len(sampled.points), sampled.size
     if is_root:
         return Cost(count * v)
@@ -190,7 +190,7 @@ def _orthogonalising(rows: int, columns: int) -> Cost:
 
 
 def _filling_root(size: int) -> Cost:
-    """Count the factor of a noise; the search for a pivot divides at each larger one."""
+    """Count the factorisation of a noise, in which the search for a pivot also divides."""
     return Cost(size * (1 + 4 * size + size + 2 * size * size), size)
 
 
@@ -211,13 +211,13 @@ def _algebra(m: int, t: int, is_robust: bool) -> Cost:
 
 
 def _factored_algebra(m: int, t: int) -> Cost:
-    """Count the same for a factor: S, the whitened innovation, the step, and the factor of P."""
+    """Count the update of a factor: S, the whitened innovation, the step, and the factor of P."""
     square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
     return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
 
 
 def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) -> Products:
-    """Count products with a Jacobian: with all its entries, and without those that are known."""
+    """Count products with a Jacobian, with all its entries and without those that are known."""
     if not step.has(jacobian):
         return NOTHING, NOTHING
     known = {
@@ -225,7 +225,7 @@ def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) ->
         for (name, place), node in step.outputs.items()
         if name == jacobian
     }
-    # J L with a lower factor L: an entry in column k is multiplied with k + 1 entries of the factor
+    # J L with a lower factor L: an entry in column k is multiplied by k + 1 entries of the factor
     if is_root:
         return Cost(rows * t * (t + 1)), Cost(sum(2 * (column + 1) for _, column in known))
     patterns = None, pattern_of(known, rows)

@@ -29,7 +29,7 @@ from fuselog.replay.inference.run.filtering import Filter
 from fuselog.replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from fuselog.replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-# by the class that makes a method's steps
+# by the class that creates a method's steps
 KINDS = {
     FILTERS["ekf"].steps: EXTENDED,
     FILTERS["iekf"].steps: ITERATED,
@@ -52,15 +52,15 @@ def deploy(
 ) -> Path:
     """Write a filter as C99 for a robot, with a recorded log as its test.
 
-    The C code has the same operations as the filter, in the same order: its estimates are those of
-    `replay`, to the last bit if it is compiled with -ffp-contract=off, in double precision and with the
+    The C code has the same operations as the filter, in the same order. Its estimates equal those of
+    `replay` to the last bit if it is compiled in double precision, with -ffp-contract=off and with the
     same libm.
 
     Args:
-        log: a log that the filter fits. The C code has its sensors, its channels state parameters that
-            are not given, and its first messages are the test.
-        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; or what `modelled`
-            makes of a model of your own and one of these; or a table of settings by label.
+        log: a log that the filter fits. Its sensors become those of the C code, its channels state
+            parameters that are not set, and its first messages are the test.
+        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; or the result of
+            `modelled` for a model of your own and one of these; or a table of settings by label.
         out: the folder to write, which must be empty or not exist; its name is the filter's name in C.
         single: use single precision, `float`.
         parameters: parameters of the estimator, such as `model="robot"`.
@@ -111,10 +111,10 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
     Args:
         name: the program, such as `lib:./robot_ekf.so`.
         runs: the runs of the golden.
-        golden: the golden, as `fuselog.pipeline.checking.stored.read` returns it.
+        golden: the golden, as returned by `fuselog.pipeline.checking.stored.read`.
 
     Returns the program's settings by the golden's label. Raises BadInput if `name` is not a program, if
-    the golden does not have exactly one estimator, and if the program was deployed from another filter.
+    the golden does not have exactly one estimator, or if the program was deployed from another filter.
     """
     _, program = shorthand(name)
     if not program:
@@ -151,7 +151,7 @@ def _made(
 
 
 def _without_clash(made: CFilter, reading: Callable[[], Reading] | None) -> CFilter:
-    """Rename a filter whose name is another word of its C code, such as a variable's."""
+    """Rename a filter whose name is already used in its C code, for example by a variable."""
     alone = made._replace(name="fuselog_filter")
     text = source(alone) + test_text(alone)
     if reading is not None and not why_no_replay(alone):
@@ -166,7 +166,7 @@ def _check_empty(folder: Path) -> None:
 
 
 def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, Filter, str]:
-    """Bind the filter; raises BadInput if it cannot be written as C."""
+    """Bind the filter to a log; raise BadInput if it cannot be written as C."""
     configure(label, settings)
     kind = settings.get("kind", label)
     name = kind if isinstance(kind, str) else label

@@ -1,4 +1,4 @@
-"""Files next to a filter in C: how to build it, and its description."""
+"""Files next to a filter in C: build instructions and a description."""
 
 from collections.abc import Mapping
 from textwrap import fill
@@ -98,7 +98,7 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
 
 
 def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
-    """Describe from when on single precision loses the covariance, and what to use instead."""
+    """Describe when single precision loses the covariance, and what to use instead."""
     remedy = "" if is_root else "; use a square-root form, sqrt:ekf or sqrt:ukf"
     return (
         f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
@@ -107,7 +107,7 @@ def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
 
 
 def _loop(made: CFilter) -> str:
-    """Write a loop over messages: control, prediction, update, and the handling of outcomes."""
+    """Write a loop over messages, with control, prediction, update, and the handling of outcomes."""
     name, upper = made.name, made.name.upper()
     driven = [
         f"filter.control[{upper}_CONTROL_{identifier(each).upper()}] = message.{identifier(each)};"

@@ -1,4 +1,4 @@
-"""Diagnosis of inconsistent estimators by the faults without which they would be consistent.
+"""Diagnosis of inconsistent estimators, which finds the faults whose correction makes them consistent.
 
-Begin with `diagnosis`; `hypotheses` has the faults.
+Begin with `diagnosis`; `hypotheses` contains the possible faults.
 """

@@ -1,4 +1,4 @@
-"""Advice after a diagnosis: settings that correct a fault."""
+"""Advice after a diagnosis, as settings that correct a fault."""
 
 import json
 from collections.abc import Mapping
@@ -15,8 +15,8 @@ class Advice(NamedTuple):
         value: its new value.
         free: the parameter that can be tuned instead.
         otherwise: what else can be done, in words.
-        more: further settings that belong to it, with their keys.
-        is_moved: whether the value is metres along several axes, which are added to those already set.
+        more: further settings that are needed with it, by key.
+        is_moved: whether the value is in metres along several axes, and is added to the one already set.
     """
 
     key: str
@@ -28,7 +28,7 @@ class Advice(NamedTuple):
 
     @classmethod
     def of(cls, setting: str) -> "Advice":
-        """Parse a setting as `--set` takes it."""
+        """Parse a setting in the form that `--set` accepts."""
         key, _, text = setting.partition("=")
         try:
             return cls(key, float(text))
@@ -42,19 +42,19 @@ class Advice(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """Return the settings as `--set` takes them, separated by blanks."""
+        """Return the settings in the form that `--set` accepts, separated by blanks."""
         return " ".join(f"{key}={value}" for key, value in self.settings.items())
 
 
 @dataclass(frozen=True)
 class Trying:
-    """The context in which advice is followed.
+    """The replay for which advice is given.
 
     Attributes:
-        label: the label of the estimator, or what names it in a command.
+        label: the label of the estimator, or its name in a command.
         applied: the alterations that the log already has.
         is_own: whether no command can name the estimator because a Python program defines it.
-        gate: the probability of the gate that is set.
+        gate: the probability of the gate in the settings.
     """
 
     label: str
@@ -63,11 +63,11 @@ class Trying:
     gate: float = 1.0
 
     def is_set(self, advice: Advice) -> bool:
-        """Test whether the advice is a gate and a gate at least as narrow is already set."""
+        """Test whether the advice is a gate, and one that is at least as narrow is already set."""
         return advice.key == "gate_probability" and self.gate <= float(advice.value)
 
     def over(self, advice: Advice) -> Advice:
-        """Combine the advice with the value already set, which it would replace."""
+        """Combine the advice with the value that is already set and would be replaced."""
         before, now = self.applied.get(advice.key), advice.value
         if advice.is_moved and before is not None:
             both = zip_longest(
@@ -80,7 +80,7 @@ class Trying:
         return advice._replace(value=precise(before * now if is_factor else before + now))
 
     def words(self, advice: Advice) -> str:
-        """Return the text to type."""
+        """Return the command or setting to type."""
         if self.is_own:
             line = f"set={json.dumps(advice.settings)}"
             tuning = f'fl.tune(LOG, {{"{self.label}": ...}}, "{advice.free}")'
@@ -94,12 +94,12 @@ class Trying:
 
 
 def rounded(value: float) -> float:
-    """Round a number to three digits, as for parameters."""
+    """Round a number to three digits, as is done for parameters."""
     return float(f"{value:.3g}")
 
 
 def precise(value: float) -> float:
-    """Round a number to four digits, as for settings of topics."""
+    """Round a number to four digits, as is done for settings of topics."""
     return float(f"{value:.4g}")
 
 

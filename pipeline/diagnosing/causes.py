@@ -1,4 +1,4 @@
-"""Search for the most likely causes of an inconsistent filter: the hypotheses with the largest gains."""
+"""Search for the most likely causes of an inconsistent filter, the faults with the largest gains."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -30,34 +30,35 @@ from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.intervals import Interval
 
-FALSE_ALARMS = 0.01  # share of logs without a fault in which a cause may be found nevertheless
-# difference in gain to the most likely cause below which a rival is also named: odds of 20 to 1
+FALSE_ALARMS = 0.01  # share of logs without a fault in which a cause may be found by chance
+# a rival is also named if its gain is less than this below the best: odds of 20 to 1
 RIVAL = 3.0
-# difference in gain from which a likelier name replaces a nearly equal one; avoids endless swaps
+# a nearly equal name replaces another only if its gain is larger by this; avoids endless swaps
 CLEARLY = 0.5
-# relative differences of a delay and its gain between "early" and "late" names of one fault
+# largest relative differences of delay and gain between the "early" and "late" names of one fault
 SAME_SIZE, SAME_GAIN = 0.1, 0.8
-GROSS = float(np.log(20.0))  # a noise stated this many times too small indicates another fault
-SPREADS = 4.0  # standard deviations of the gain by control noise that a cause has to exceed
-# share of the largest gain from which a fault stays a contender while other faults are corrected
+# logarithm of a factor: a noise that is stated more than 20 times too small indicates another fault
+GROSS = float(np.log(20.0))
+SPREADS = 4.0  # a cause must exceed this many standard deviations of its gain by control noise
+# share of the largest gain above which a fault stays a contender while others are corrected
 CONTENDS = 0.5
-# share of the least gain from which a fault is tried together with a new fit of the other causes
+# share of the least gain above which a fault is tried together with a new fit of the others
 HIDDEN = 0.3
-LEADING = 10  # number of the most likely faults that are tried with all faults of smaller gain
+LEADING = 10  # number of the most likely faults that are tried together with all faults of smaller gain
 
 Named = tuple[Peak, Hypothesis]
-Names = list[Named]  # the names of one cause, which the log does not distinguish
+Names = list[Named]  # the names of one cause that the log does not distinguish
 
 
 class Cause(NamedTuple):
-    """A hypothesis with the number that gains most.
+    """A hypothesis, with the value at which its gain is largest.
 
     Attributes:
         hypothesis: the assumed fault.
         value: its size.
-        ends: the ends of the 95 % interval of that size.
+        ends: the ends of the 95 % interval of the size.
         gain: the gain in log-likelihood after all causes before it.
-        others: causes that explain the log equally well, or nearly so, and are not distinguished.
+        others: causes that explain the log equally well, or nearly so.
         of_halves: the gain over each half of the measurements, with all other causes corrected.
     """
 
@@ -70,12 +71,12 @@ class Cause(NamedTuple):
 
     @property
     def has_ends(self) -> bool:
-        """Test whether the interval of the number is bounded on both sides, as far as a fit shows."""
+        """Test whether the interval of the value has two finite ends, as far as a fit shows."""
         return not np.isinf(self.ends).any()
 
     @property
     def statement(self) -> str:
-        """Return the fault and its size; without an interval if the fit did not converge."""
+        """Describe the fault and its size, without an interval if the fit did not converge."""
         words = self.hypothesis.words(self.value, *self.ends)
         if not np.isnan(self.ends).any():
             return words
@@ -84,7 +85,7 @@ class Cause(NamedTuple):
 
     @property
     def numbers(self) -> list[Interval]:
-        """Return the numbers as reported, by component; factors rather than their logarithms."""
+        """Return the values as reported, by component; factors instead of their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Interval(self.value, low, high, name=of.part).rising(of.reported)]
@@ -94,7 +95,7 @@ class Cause(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the fault, its size, the alternatives and the gain."""
+        """Describe the fault, its size, the alternatives and the gain."""
         or_else = "".join(
             f"; this log does not determine it, equally likely: {each.statement}"
             if each.hypothesis is self.hypothesis
@@ -116,14 +117,14 @@ class Tried(NamedTuple):
 
     @property
     def row(self) -> tuple[str, str, str, str, float]:
-        """Return its kind, topic, part, the number or numbers with the largest gain, and that gain."""
+        """Return its kind, topic, part, the values with the largest gain, and that gain."""
         of, at = self.hypothesis, self.at.value
         values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
 
 
 def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
-    """Tabulate hypotheses in descending order of gain minus the cost of their numbers."""
+    """Tabulate hypotheses in descending order of gain minus the cost of their values."""
     ranked = sorted(tried, key=lambda each: -each.at.score(each.hypothesis))
     names = ("kind", "topic", "part", "value", "gain")
     return pd.DataFrame([each.row for each in ranked], columns=names)
@@ -139,11 +140,11 @@ def least_gain(count: int, size: int = 1) -> float:
 
 
 class Found(NamedTuple):
-    """A cause during the search.
+    """A cause, as represented during the search.
 
     Attributes:
-        names: faults that the log does not distinguish, with their numbers; the first one is corrected.
-        over: the trial from which the gains of the names count, while the cause is the only one.
+        names: faults that the log does not distinguish, with their values; the first one is corrected.
+        over: the trial relative to which gains are computed, while the cause is the only one.
         contenders: faults that gained nearly as much before other causes were corrected.
     """
 
@@ -159,12 +160,12 @@ class Found(NamedTuple):
 
 
 class Look(NamedTuple):
-    """The gains of the faults that are tried in addition to the causes found.
+    """The gains of faults that are tried in addition to the causes already found.
 
     Attributes:
         found: the causes.
         now: the log with these causes corrected.
-        ranked: every fault that may follow, with its largest gain.
+        ranked: every fault that may be added, with its largest gain.
     """
 
     found: Sequence[Found]
@@ -173,7 +174,7 @@ class Look(NamedTuple):
 
     @property
     def physical(self) -> Names:
-        """Return the faults of what is measured."""
+        """Return the faults of measured quantities."""
         return [pair for pair in self.ranked if _is_physical(pair[1])]
 
 
@@ -182,10 +183,10 @@ def find_causes(
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
     """Find at most `most` causes, the gain of each hypothesis, and a cause in doubt.
 
-    Each cause has the largest gain after all causes before it are corrected, where gain is
-    log-likelihood minus the cost of the numbers. Several causes are fitted together. The gains of
-    hypotheses are those on the unaltered log. A cause is in doubt if it gains most after all causes, or
-    more than the last one, but the parts of the log disagree about its number.
+    Each cause has the largest gain after all causes before it are corrected, where the gain is the
+    log-likelihood minus the cost of the values. Several causes are fitted together. The gains of
+    hypotheses are those in the unaltered log. A cause is in doubt if it would be the next one, or gains
+    more than the last one, but the parts of the log disagree about its value.
     """
     search = _Search(likelihood, base, most, len(tried))
     peaks = search.peaks(base, tried)
@@ -198,10 +199,10 @@ def find_causes(
 
 @dataclass(frozen=True)
 class _Search:
-    """A search that finds causes one after the other and fits them together.
+    """A search that finds causes one by one and fits them together.
 
     Attributes:
-        likelihood: computes the log-likelihoods of trials.
+        likelihood: function that computes the log-likelihoods of trials.
         base: the unaltered log, and the settings.
         most: the largest number of causes.
         count: the number of hypotheses.
@@ -213,7 +214,7 @@ class _Search:
     count: int
 
     def peaks(self, now: Trial, candidates: Sequence[Hypothesis], least: float = 0.0) -> list[Peak]:
-        """Find the largest gain of each candidate, roughly if all gain less than `least`."""
+        """Find the largest gain of each candidate, only roughly if all gains are below `least`."""
         return _peaks(gains_over(self.likelihood, now), candidates, self.count, least)
 
     def without(self, found: Sequence[Found]) -> Trial:
@@ -228,14 +229,14 @@ class _Search:
         *,
         target: float = -np.inf,
     ) -> tuple[list[Found], list[Named]]:
-        """Add causes to those found while another is certain, and return what is in doubt after them.
+        """Add significant causes to those found, and return the cause in doubt after them.
 
-        `peaks` are the gains of the hypotheses over the causes found. With a `target`, the search ends
-        if the allowed number of causes cannot reach that log-likelihood. Without one, it also searches
-        for causes that gain enough only after a new fit of the others.
+        `peaks` contains the gains of the hypotheses in addition to the causes found. With a `target`,
+        the search ends if the allowed number of causes cannot reach that log-likelihood. Without a
+        target, it also searches for causes whose gain is significant only after a new fit of the others.
         """
         found, doubtful, tried = list(found), list[Named](), list(tried)
-        for _ in range(2 * self.most):  # a cause may be removed again
+        for _ in range(2 * self.most):  # because a cause may be removed again
             look = self._look(tried, peaks, found, target)
             if look is None:
                 break
@@ -265,7 +266,7 @@ class _Search:
         found: Sequence[Found],
         target: float,
     ) -> Look | None:
-        """Compute the gains of hypotheses over the causes found; None if no cause can follow."""
+        """Compute the gains of hypotheses in addition to the causes found; None if none can follow."""
         named = {id(of) for each in found for _, of in each.names}
         candidates = [each for each in tried if id(each) not in named]
         if not candidates or len(found) >= self.most:
@@ -277,22 +278,22 @@ class _Search:
         return look if self._reaches(look, lacking) else None
 
     def _reaches(self, look: Look, gain: float) -> bool:
-        """Test whether the allowed number of causes could gain this much, judging by single gains.
+        """Estimate from single gains whether the allowed number of causes could gain this much.
 
-        The causes found count among them: they gain more if they are fitted again with others.
+        The causes found are included, because they gain more if they are fitted again with others.
         """
         best = max((at.score(of) for at, of in look.physical), default=0.0)
         return best * self.most >= gain
 
     def _is_gross(self, look: Look, noises: Sequence[Named]) -> bool:
-        """Test whether two gross faults may look like noise or outliers: pairs are tried then."""
+        """Test whether two gross faults may look like noise or outliers, so that pairs must be tried."""
         if any(of.kind in NOISES and at.value > GROSS for at, of in noises):
             return True
         outliers = max((at.gain for at, of in noises if of.kind == "outliers"), default=np.inf)
         return self._reaches(look, outliers)
 
     def _beside_gross(self, look: Look, alike: Names, noises: Names) -> tuple[Look, Names, Names]:
-        """Correct one of two gross faults that gain more than a noise, and find the other."""
+        """Correct one of two gross faults that together gain more than a noise, and find the other."""
         gross = _companion(self.likelihood, look.now, look.ranked)
         if gross is None:
             return look, alike, noises
@@ -303,7 +304,7 @@ class _Search:
     def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
         """Remove a noise if the other causes, replaced by faults of their kinds, explain as much.
 
-        For example, positions that are too large and look equally imprecise may be speeds that are too
+        For example, positions that are scaled and look imprecise may be explained by speeds that are too
         small.
         """
         for noise in found:
@@ -316,7 +317,7 @@ class _Search:
 
     @staticmethod
     def _widened(found: Found, tried: Sequence[Hypothesis]) -> Found:
-        """Add all faults of a cause's kind to its contenders."""
+        """Add all faults of the same kind to the contenders of each cause."""
         kind = found.supposed.of.kind
         alike = [of for of in tried if of.kind == kind and _is_physical(of)]
         return found._replace(contenders=[*found.contenders, *alike])
@@ -340,7 +341,7 @@ class _Search:
     def _without_noise(self, look: Look, noises: Sequence[Named]) -> list[Found]:
         """Find causes that explain as much as a noise or outliers; an empty list if there are none.
 
-        What a model leaves out looks like noise stated too small, and large parts of it look like
+        Errors of a model look like noise that is stated too small, and large errors look like
         outliers.
         """
         if not noises:
@@ -358,7 +359,7 @@ class _Search:
         return self._together([each._replace(contenders=[*each.contenders, *own]) for each in wide])
 
     def _hidden(self, look: Look) -> list[Found]:
-        """Add a cause that gains enough only if the causes found are fitted again together with it."""
+        """Add a cause whose gain is significant only after a new fit together with the causes found."""
         if not look.found:
             return []
         known = [each.names[0] for each in look.found]
@@ -394,19 +395,19 @@ class _Search:
             return self._together(rest) if len(rest) > 1 else [self._alone(rest[0])]
         for place, each in enumerate(found):
             found[place] = self._likelier(found, place, fitted.log_likelihood)
-            if found[place].supposed.of is not each.supposed.of:  # it comes after what was likelier
+            if found[place].supposed.of is not each.supposed.of:  # it is added after the likelier causes
                 return self._together([*found[:place], *found[place + 1 :], found[place]])
         return found
 
     def _needed(self, found: list[Found], fitted: Fit) -> list[Found]:
-        """Remove a cause that the others make superfluous, or whose number is not an estimate."""
+        """Remove a cause that the others make superfluous, or whose value is not an estimate."""
         if False in fitted.are_estimates:
             place = fitted.are_estimates.index(False)
             return [*found[:place], *found[place + 1 :]]
         place = int(np.argmin(fitted.losses))
         rest = [*found[:place], *found[place + 1 :]]
         enough = least_gain(self.count, fitted.faults[place].of.size)
-        if fitted.losses[place] >= 2.0 * enough:  # by a parabola
+        if fitted.losses[place] >= 2.0 * enough:  # estimated from a parabola
             return found
         of_rest = fit(self.likelihood, self.base, [each.supposed for each in rest])
         return rest if fitted.log_likelihood - of_rest.log_likelihood < enough else found
@@ -452,13 +453,13 @@ class _Search:
         return _alike(sorted(ranked, key=lambda pair: -pair[0].score(pair[1])))
 
     def _alone(self, found: Found) -> Found:
-        """Fit a cause as the only one."""
+        """Fit a cause without the other causes."""
         known = [(Peak(0.0, 0.0), of) for of in found.contenders]
         faults = _faults([*found.names, *known])
         return Found(self._nearest(self.base, faults), self.base, faults)
 
     def causes(self, found: Sequence[Found]) -> list[Cause]:
-        """Compute gains and intervals of the causes; a cause without a bounded interval is not named."""
+        """Compute gains and intervals of the causes, and omit causes without a bounded interval."""
         causes = self._estimated(found)
         ended = [each for each, cause in zip(found, causes, strict=True) if cause.has_ends]
         if len(ended) < len(found):
@@ -490,14 +491,14 @@ class _Search:
 
 
 def _faults(names: Names) -> list[Hypothesis]:
-    """List the faults among names, each once."""
+    """List the faults among names, without repetitions."""
     return list({id(of): of for _, of in names}.values())
 
 
 def _alike(ranked: Sequence[Named]) -> Names:
-    """Select the most likely name and those that the log does not distinguish; usual names come first.
+    """Select the most likely name and those that the log does not distinguish, usual names first.
 
-    A delay that is set too large comes before all others.
+    A delay setting that is too large comes before all others.
     """
     least = ranked[0][0].score(ranked[0][1]) - RIVAL
     near = [
@@ -507,18 +508,18 @@ def _alike(ranked: Sequence[Named]) -> Names:
 
 
 def _is_physical(of: Hypothesis) -> bool:
-    """Test whether it is a fault of a measured quantity, not noise or outliers."""
+    """Test whether a fault concerns a measured quantity, not noise or outliers."""
     return of.kind not in NOISES and of.kind != "outliers"
 
 
 def _likeliest(
     likelihood: Likelihood, now: Trial, pairs: Names, count: int
 ) -> tuple[Names, list[Named]]:
-    """Find the hypothesis with the largest gain beyond chance, its alternatives, and those in doubt.
+    """Find the hypothesis with the largest significant gain, its alternatives, and those in doubt.
 
-    The disagreement between parts of the log is a property of the log: if parts disagree about a larger
-    gain, the smaller gains are reduced as well. Burnham and Anderson, Model Selection and Multimodel
-    Inference, 2nd ed. 2002, section 2.5, also divide all by one factor.
+    Disagreement between parts is a property of the whole log. If the parts disagree about a larger
+    gain, the smaller gains are therefore reduced as well. Burnham and Anderson, Model Selection and
+    Multimodel Inference, 2nd ed. 2002, section 2.5, also divide all gains by one factor.
     """
     gains_of, inflation_of = gains_over(likelihood, now), inflation_over(likelihood, now)
     noise_gain_of = noise_gain_over(likelihood, now)
@@ -552,15 +553,15 @@ def _likeliest(
 
 
 def _takes_all(at: Peak, of: Hypothesis) -> bool:
-    """Test whether it explains a part of any fault: a noise stated too small, or outliers."""
+    """Test whether a fault explains a part of any other one: noise stated too small, or outliers."""
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
 def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | None:
     """Find one of two gross faults that together gain more than any noise; None if there are none.
 
-    One of two gross faults may gain less alone than it is worth. The most likely faults are therefore
-    tried with all others, and special numbers, such as factors of units, with each other.
+    One of two gross faults may gain little while the other is not corrected. The most likely faults are
+    therefore tried with all others, and special values, such as factors of units, with each other.
     """
     supposed, most = list[Supposed](), 0.0
     for at, of in ranked:
@@ -586,7 +587,7 @@ def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | 
 
 
 def _is_other_name(pair: Named, first: Named) -> bool:
-    """Test whether a delay is as large as the opposite delay of another topic in the likeliest cause.
+    """Test whether a delay equals the opposite delay of another topic in the likeliest cause.
 
     Except at the ends of the log, both are the same fault.
     """
@@ -597,20 +598,20 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 
 
 def _is_early(pair: Named) -> bool:
-    """Test for the less usual name of a fault: all others are early in place of one topic late."""
+    """Test for the unusual name of a fault, by which all other topics are early instead of one late."""
     at, of = pair
     is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
     return is_of_stamps and of.already + at.value < 0.0
 
 
 def _takes_back(pair: Named) -> bool:
-    """Test whether it reduces a delay that is set: the setting is too large."""
+    """Test whether a fault reduces a delay that is set, so that the setting is too large."""
     at, of = pair
     return of.already > 0.0 > at.value and not _is_early(pair)
 
 
 def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int, least: float) -> list[Peak]:
-    """Find the largest gain of each candidate; all are searched in parallel."""
+    """Find the largest gain of each candidate with one parallel search."""
     greatest = 0.0
 
     def noting(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
@@ -627,13 +628,13 @@ def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int, leas
 
 
 def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
-    """Test whether the gain exceeds chance and the number is large enough for a fault."""
+    """Test whether the gain is significant and the value is large enough for a fault."""
     is_small = isinstance(at.value, float) and abs(at.value) <= of.floor
     return at.gain > least_gain(count, of.size) and at.score(of) > 0.0 and not is_small
 
 
 def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
-    """Test whether the 95 % interval of the number extends beyond the range that is searched."""
+    """Test whether the 95 % interval of the value extends beyond the range that is searched."""
     if not of.has_end or at.is_special:
         return False
     [last] = gains_of([(of, float(np.copysign(of.limit, at.value)))])
@@ -641,9 +642,9 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
 
 
 def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
-    """Return the number of a delay or angle, with a rival number if chance explains the difference.
+    """Return the value of a delay or angle, and a rival value if chance explains the difference.
 
-    The likelier number comes first.
+    The likelier value comes first.
     """
     at, of = pair
     may_come_again = of.limit == np.pi or of.kind == "delay"
@@ -657,8 +658,8 @@ def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
 
 
 def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
-    """Make causes with the intervals of their numbers."""
-    asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others have no number
+    """Make causes with the intervals of their values."""
+    asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others have no value
     searches = []
     for at, _ in asking:
         # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
@@ -679,7 +680,7 @@ def _causes(gains_of: GainsOf, pairs: Sequence[Named]) -> list[Cause]:
 
 
 def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
-    """Compute the 95 % intervals of several numbers from the curvature of the gain at its maximum."""
+    """Compute the 95 % intervals of several values from the curvature of the gain at its maximum."""
     values, steps = np.array(at.value), np.array(of.tried[0])
 
     def cost(points: Floats) -> Floats:
@@ -692,7 +693,7 @@ def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Num
 
 
 def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -> list[Cause]:
-    """Add to the causes their gains over each half of the log: a real fault is in both."""
+    """Add to the causes their gains over each half of the log; a real fault is in both."""
     trials = [base] * (len(causes) + 1)
     for place, cause in enumerate(causes):
         trials = [
@@ -710,8 +711,8 @@ class Sought(NamedTuple):
     Attributes:
         causes: the causes, the most likely first.
         tried: every hypothesis, with its gain on the unaltered log.
-        in_doubt: a cause that would be most likely, except that the parts of the log disagree about it.
-        log_likelihood: of the unaltered log; NaN if its innovations have none, and nothing is tried.
+        in_doubt: a cause that would be the most likely, but about which the parts of the log disagree.
+        log_likelihood: that of the unaltered log; NaN if it is unknown, so that no hypothesis is tried.
     """
 
     causes: Sequence[Cause] = ()
@@ -726,7 +727,7 @@ def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: in
     Args:
         source: the log.
         label: the estimator's label.
-        settings: the estimator's parameters with its `kind`; the gate is open.
+        settings: the estimator's parameters with its `kind`, and an open gate.
         most: the largest number of causes.
 
     Raises BadInput if the estimator cannot be replayed.

@@ -1,4 +1,4 @@
-"""The command `fuselog diagnose`: it prints what is probably wrong, and what to try."""
+"""The command `fuselog diagnose`, which prints likely faults and what to try against them."""
 
 from collections.abc import Sequence
 from pathlib import Path

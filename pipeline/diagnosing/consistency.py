@@ -1,4 +1,4 @@
-"""Tests of whether NIS and NEES are those of a consistent filter, whatever the cause."""
+"""Tests of whether NIS and NEES are those of a consistent filter."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -17,16 +17,16 @@ from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, split_topic
 from fuselog.replay.judging.metrics.measuring import metric_key
 
-# share of messages in which truth equals what the filter used, from which both are the same data
+# share of messages in which the truth equals the filter's input, so that both are the same data
 SAME = 0.9
-SEEN = 1.5  # NIS per component up to which innovations show no error
+SEEN = 1.5  # NIS per component below which innovations show no error
 CHART_BINS = 60
-# ratio of mean to root mean square of innovations, above which half of their power is a bias
+# ratio of mean to root mean square of innovations above which half of their power is a bias
 BIASED = 0.7
 
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
-    """Yield errors that innovations do not show; causes that were found may explain them or not."""
+    """Yield errors that innovations do not show; if causes were found, these may explain the errors."""
     remedy = "estimate a bias as a state, or see fuselog observability LOG"
     if has_causes:
         remedy = "fix the causes above first, then check again"
@@ -49,7 +49,7 @@ def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Fin
 
 
 def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) -> dict[str, str]:
-    """Find truths that are the very positions that the filter used, with a sentence on each."""
+    """Find truths that are the same data as the positions that the filter used, and describe each."""
     sentences = {}
     for topic, about in source.topics.items():
         if about.schema_name != schemas.TRUTH_STATE.full_name or topic.startswith("/estimates/"):
@@ -77,10 +77,10 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
 def unnamed(
     done: Replay, innovations: Mapping[str, Stream], tried: int, no_judges: Collection[str]
 ) -> Iterator[Finding]:
-    """Yield NIS and NEES outside the range that a consistent filter has in CONSISTENT of all logs.
+    """Yield NIS and NEES outside the range of a consistent filter in CONSISTENT of all logs.
 
-    NIS covers all innovations, including those that a gate rejects; truths in `no_judges` do not count.
-    Errors are correlated over a run, so that the mean of NEES has the interval of a single step.
+    NIS includes all innovations, also those that a gate rejects. Truths in `no_judges` are ignored.
+    Errors are correlated over a run, so the mean NEES has the interval of a single step.
     """
     faults = f"none of the {tried} faults tried explains it" if tried else "no fault was tried"
     for topic, stream in innovations.items():
@@ -111,7 +111,7 @@ def unnamed(
 
 
 class _Seen(NamedTuple):
-    """A component whose innovations do not have their stated variances, and what may correct it."""
+    """A component whose innovations do not have their stated variances, and a possible correction."""
 
     name: str
     nis: float
@@ -121,20 +121,20 @@ class _Seen(NamedTuple):
 
     @property
     def times(self) -> float:
-        """Return by what factor they are larger, or smaller."""
+        """Return the factor by which the innovations are larger or smaller."""
         deviation = float(np.sqrt(self.nis))
         return 1.0 / deviation if self.is_small else deviation
 
     @property
     def is_small(self) -> bool:
-        """Test whether they are smaller."""
+        """Test whether the innovations are too small."""
         return self.nis < self.low
 
 
 def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Yield what each sensor's innovations show about an estimator that cannot be replayed.
+    """Yield findings on each sensor's innovations, for an estimator that cannot be replayed.
 
-    Autocorrelated innovations point to the motion or a delay, others to the sensor's own noise. If a
+    Autocorrelated innovations point to the motion or a delay, others to the noise of the sensor. If a
     channel states which parameter of its estimator is that noise, the parameter is named. Components
     with the same finding share one sentence.
     """
@@ -205,10 +205,10 @@ def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> 
 
 
 def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dict[str, MetricValue]:
-    """Replace likelihoods of the measurements that a gate accepted by that of all measurements.
+    """Replace the likelihood of accepted measurements by that of all measurements.
 
-    Measurements that a gate rejects cost nothing, so the likelihood of the others grows with their
-    number.
+    A likelihood of accepted measurements grows with the number of measurements that a gate rejects, so
+    it cannot be compared.
     """
     found = dict(metrics)
     for key in metrics:

@@ -1,7 +1,7 @@
-"""Diagnosis of an inconsistent estimator: innovations, errors if there is truth, and causes.
+"""Diagnosis of an inconsistent estimator from its innovations and errors, with the likely causes.
 
-A fault is named by the gain in log-likelihood without it, not by its apparent size: a bearing whose
-noise is stated too small makes the range's innovations too large as well.
+Faults are ranked by the gain in log-likelihood without them, not by their apparent size: if a bearing's
+noise is stated too small, the innovations of the range are too large as well.
 """
 
 import json
@@ -85,7 +85,7 @@ class Diagnosis:
         tried: a row per fault that was tried on the unaltered log, in descending order of gain: kind,
             topic, part, value, gain.
         least_gain: the gain that a fault needs to be named.
-        notes: what one should know about the diagnosis.
+        notes: remarks on the diagnosis.
         log_likelihood: of all measurements used in the search for causes, with an open gate; or NaN.
     """
 
@@ -108,7 +108,7 @@ class Diagnosis:
 
     @property
     def told(self) -> list[str]:
-        """Return the numbered sentences, or a sentence that nothing was found."""
+        """Return the numbered sentences, or a sentence that no fault was found."""
         if not self.sentences:
             why = (
                 f"none of {self.hypotheses} faults reaches the gain in log-likelihood needed, "
@@ -119,7 +119,7 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """Return a row per sentence or number in it: kind, topic, part, interval, gain, setting.
+        """Return a table with a row per sentence or value: kind, topic, part, interval, gain, setting.
 
         Alternatives that the log does not distinguish from a cause have its `sentence_number`.
         """
@@ -148,7 +148,7 @@ class Diagnosis:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Return a row per metric of the replay: estimator, quantity, case, value."""
+        """Return a table with a row per metric of the replay: estimator, quantity, case, value."""
         return self.replay.metrics
 
     @cached_property
@@ -205,7 +205,7 @@ class Diagnosis:
 
 
 def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outcome:
-    """Replace the tables of an outcome by these and a new summary, without empty ones."""
+    """Replace the tables of an outcome by these and a new summary, without empty tables."""
     found = {**tables, "summary": summary_table(outcome.metrics)}
     return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
 
@@ -218,24 +218,23 @@ def diagnose(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
 ) -> Diagnosis:
-    """Find out why an estimator is inconsistent, or that nothing is wrong.
+    """Find the causes of an estimator's inconsistency, if there are any.
 
-    Each possible fault of the log and of the settings is corrected in turn, with the number that gains
-    most in log-likelihood; the cause with the largest gain is named first (`sentences.ranked` has what
-    comes before causes). The gate is open meanwhile.
+    Each possible fault of the log and of the settings is corrected separately, with the value that
+    increases the log-likelihood most. The cause with the largest gain is named first, after findings
+    that `sentences.ranked` places before causes. The gate is open during the search.
 
     Args:
-        log: a path, an opened log, or a recording; or an estimates log next to the log on which the
-            estimates were made.
-        estimator: a registered name, or a label of your own with what it stands for, see `replay`; for
-            an estimates log one of its labels, by default its only one.
+        log: a path, an opened log, or a recording; or an estimates log next to its source log.
+        estimator: a registered name, or a label of your own mapped to an estimator (see `replay`). For
+            an estimates log, one of its labels; by default its only one.
         set: parameters of the estimator, and alterations of topics; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
     Returns:
         At most five sentences on what is wrong, and tables of the evidence.
 
-    Raises BadInput if there are several logs, or if the estimator does not fit the log, fails, or gives
+    Raises BadInput if there are several logs, or if the estimator does not fit the log, fails, or has
     no innovations.
 
     >>> from fuselog.pipeline.api.api import record
@@ -289,7 +288,7 @@ def diagnose(
             if each.where not in no_judges
         ),
     ]
-    if not sentences and all(each.kind == "gate" for each in findings):  # a gate names no cause
+    if not sentences and all(each.kind == "gate" for each in findings):  # a gate is not a cause
         findings += unnamed(done, innovations, len(sought.tried), no_judges)
     sentences += findings
     return Diagnosis(
@@ -328,9 +327,9 @@ def _of_recorded(
     settings: Mapping[str, Any],
     gap_limit_s: float,
 ) -> Diagnosis:
-    """Diagnose a filter that cannot be replayed from the innovations that it recorded.
+    """Diagnose a filter that cannot be replayed, from the innovations that it recorded.
 
-    Raises BadInput if there are several filters, settings for one, or no innovations.
+    Raises BadInput if there are several filters, settings for the filter, or no innovations.
     """
     label, *others = labels
     if others:
@@ -367,7 +366,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """A log that an estimator can follow, its replay, the corrections made first, and notes on them."""
+    """A log that an estimator can follow, its replay, and the corrections made before it."""
 
     source: LogSource | MemorySource
     done: Replay
@@ -378,9 +377,9 @@ class _Followed(NamedTuple):
 def _followed(
     source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], gap_limit_s: float
 ) -> _Followed:
-    """Replay a log, after corrections that the log itself suggests if it cannot be followed otherwise.
+    """Replay a log, with corrections that the log itself suggests if the estimator needs them.
 
-    Raises BadInput if it cannot be followed even then, with the reason for the uncorrected log.
+    Raises BadInput if the corrected log cannot be followed either, with the reason for the original log.
     """
 
     def replayed(source: LogSource | MemorySource) -> _Followed:
@@ -410,7 +409,7 @@ def _followed(
 def _asked(
     source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
-    """Return the log and the requested estimator; for an estimates log, the log it belongs to."""
+    """Return the log and the estimator; for an estimates log, return its source log."""
     has_estimates = labels_of(source) and not recorded_estimators(source)
     if has_estimates and isinstance(source, LogSource):
         stated = stated_estimators(source.log)

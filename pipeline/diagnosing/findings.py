@@ -1,7 +1,7 @@
-"""Unusual innovations and estimates, and findings in the log itself.
+"""Findings on unusual innovations and estimates, and on the log itself.
 
-Thresholds, listed here with their meaning, are far from what chance does to a log that follows its
-model.
+The thresholds are listed here with their meaning. They are far from values that chance causes in a log
+that follows its model.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -22,16 +22,17 @@ from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
-FIRST = ("lost messages", "gap", "stamps")  # findings that precede causes: they need no filter
+# kinds of findings that precede causes, because they need no filter
+FIRST = ("lost messages", "gap", "stamps")
 TAIL = 3.0  # standard deviations
 LOCKED_OUT = 20  # measurements in a row that a gate rejects
-REJECTED = 0.05  # share of measurements that a gate rejects although they are no outliers
+REJECTED = 0.05  # share of measurements that a gate rejects although they are not outliers
 FEWEST = 20
 FLOOR = 0.1  # share of estimates with the smallest variance
 FLOOR_STEP = 1e-4  # relative step from the smallest variance to the next
 
 
-# Findings that a factor of a topic corrects.
+# Kinds of findings that a factor of a topic corrects.
 FACTORS: tuple[Kind, ...] = ("unit", "scale", "sign", "gravity")
 
 
@@ -40,7 +41,7 @@ def of_log(
     streamed: Collection[str],
     corrected: Collection[tuple[Kind, str]] = (),
 ) -> list[Finding]:
-    """List the log's findings on an estimator's topics, except those that its parameters correct."""
+    """List findings in the log on an estimator's topics, except those that its parameters correct."""
     return [
         each
         for each in lint_source(source)
@@ -49,12 +50,12 @@ def of_log(
 
 
 def is_told(found: Finding) -> bool:
-    """Test whether a finding is a sentence of a diagnosis; other hints are notes."""
+    """Test whether a finding is a sentence of a diagnosis; hints are notes instead."""
     return found.severity != "hint" or found.kind in FIRST
 
 
 def corrected_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
-    """List what the estimator's parameters already correct: the delay or the factor of a topic."""
+    """List what the estimator's parameters already correct, such as the delay or factor of a topic."""
     found = list[tuple[Kind, str]]()
     for each in bound:
         if not isinstance(each, Recursive) or each.reading is None or each.parameters is None:
@@ -74,7 +75,7 @@ def corrected_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
-    """Compute a row per measured component.
+    """Compute a table with a row per measured component.
 
     The columns describe the normalised innovations: their number, mean with its 95 % interval, mean
     square, the share beyond 3 standard deviations (0.27 % of a Gaussian), excess kurtosis, correlation
@@ -122,8 +123,8 @@ def of_innovations(
 ) -> Iterator[Finding]:
     """Yield findings on rejected measurements and on divergence of the filter.
 
-    `gate` is its probability if the gate is fuselog's own. Outliers in stretches are rightly rejected
-    for long.
+    `gate` is its probability if the gate is fuselog's own. If outliers come in stretches, the gate
+    rightly rejects measurements for a long time.
     """
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
@@ -190,7 +191,7 @@ def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
 
 
 def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Yield variances that stop at a floor."""
+    """Yield variances that have a lower limit."""
     for topic, stream in estimates.items():
         if len(stream) < FEWEST or not stream.components:
             continue

@@ -1,7 +1,7 @@
-"""A joint fit of the numbers of several faults, with the search that `tune` and `calibrate` use.
+"""A joint fit of the sizes of several faults, with the search that `tune` and `calibrate` use.
 
-Each fault hides a part of the others: numbers found one after the other, and their intervals, are those
-of a log in which the other faults are still present.
+Faults hide parts of each other: if their sizes are estimated one after the other, the sizes and
+intervals are those of a log in which the other faults are still present.
 """
 
 from collections.abc import Sequence
@@ -28,14 +28,14 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
-# relative to a number: offsets to detect a jump, and to begin a search away from it
+# relative to a value: offsets to detect a jump, and to begin a search away from it
 TINY, OFF = 1e-6, 2e-3
-NEAR = 1e-3  # relative to a number or its limit: offset for tests of no effect and of limits
-TOLERANCE = 1e-7  # of the log-likelihood: far less than anything significant
+NEAR = 1e-3  # relative to a value or its limit: offset for tests of no effect and of limits
+TOLERANCE = 1e-7  # log-likelihood: far less than anything significant
 
 
 class Supposed(NamedTuple):
-    """A fault with its number."""
+    """A fault with its assumed value."""
 
     of: Hypothesis
     value: Number
@@ -46,18 +46,18 @@ class Supposed(NamedTuple):
 
     @property
     def is_special(self) -> bool:
-        """Test whether the number is one that is tried exactly."""
+        """Test whether the value is one that is tried exactly."""
         return self.value in self.of.specials
 
     @property
     def numbers(self) -> list[float]:
-        """Return the numbers to search for; a fault without a number has none."""
+        """Return the values to search for; a fault without a value has none."""
         if not self.of.tried:
             return []
         return list(self.value) if self.of.size > 1 else [self.value]
 
     def number(self, numbers: Sequence[float]) -> Number:
-        """Convert numbers to the fault's form; returns its value if it has no numbers to search for."""
+        """Convert values to the fault's form, or return its value if there is nothing to search for."""
         if not self.of.tried:
             return self.value
         return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
@@ -69,16 +69,16 @@ def corrected(base: Trial, faults: Sequence[Supposed]) -> Trial:
 
 
 class Fit(NamedTuple):
-    """The numbers with which faults together explain a log best.
+    """The values with which several faults together explain a log best.
 
     Attributes:
-        faults: the faults with these numbers.
-        log_likelihood: of the log without the faults.
+        faults: the faults with these values.
+        log_likelihood: that of the log without the faults.
         losses: loss of log-likelihood without each fault, with all others refitted, by the curvature;
-            infinite for a fault without a number.
-        are_estimates: whether the numbers of a fault are estimates; they are not if the search ended at
+            infinite for a fault without a value.
+        are_estimates: whether the values of a fault are estimates; they are not if the search ended at
             their limit, or if they have no effect.
-        ends: ends of the 95 % profile-likelihood intervals of each fault's numbers; NaN if the search
+        ends: ends of the 95 % profile-likelihood intervals of each fault's values; NaN if the search
             did not converge.
     """
 
@@ -92,12 +92,12 @@ class Fit(NamedTuple):
 def fit(
     likelihood: Likelihood, base: Trial, faults: Sequence[Supposed], *, has_ends: bool = False
 ) -> Fit:
-    """Search for the numbers of faults together, starting from those that they have.
+    """Search for the values of several faults together, starting from their present values.
 
     Args:
-        likelihood: computes the log-likelihoods of trials.
+        likelihood: function that computes the log-likelihoods of trials.
         base: the unaltered log, and the settings.
-        faults: faults with numbers to begin from.
+        faults: faults with start values.
         has_ends: whether the ends of intervals are computed.
     """
     together = _Together(likelihood, base, faults)
@@ -109,7 +109,7 @@ def fit(
         point, has_converged = least(
             together.cost, coordinates, begin, is_smooth=True, tolerance=TOLERANCE
         )
-    except BadInput:  # one of the numbers has no effect
+    except BadInput:  # one of the values has no effect
         [found] = likelihood([corrected(base, faults)])
         is_free = ~(together.is_flat(start) | together.at_limits(start))
         are_estimates = [bool(is_free[own].all()) for own in together.places]
@@ -136,8 +136,8 @@ def fit(
 def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
     """Estimate, from the curvature, the gain of the last of several faults if all are fitted again.
 
-    It is the fault's gain over the others as they are, plus WIDE times the gain of one step of a search
-    from there, a generous bound. It is infinite if the log-likelihood does not bend downwards.
+    It is the fault's gain in addition to the others, plus WIDE times the gain of the next step of a
+    search, a generous bound. It is infinite if the log-likelihood is not concave.
     """
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
@@ -152,14 +152,14 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
 
 
 def _errors(at: Peak, of: Hypothesis) -> Floats:
-    """Approximate the standard errors of the numbers (m,) of a fault at its largest gain."""
+    """Approximate the standard errors of the values (m,) of a fault at its largest gain."""
     if not of.tried or of.size > 1:
         return np.array(of.tried[0] if of.tried else (), float)
     return np.array([abs(at.value) / (2.0 * max(at.gain, 1.0)) ** 0.5])
 
 
 class _Together:
-    """The numbers of all faults as one vector (k,)."""
+    """The values of all faults as one vector (k,)."""
 
     def __init__(self, likelihood: Likelihood, base: Trial, faults: Sequence[Supposed]) -> None:
         self.likelihood, self.base, self.faults = likelihood, base, faults
@@ -174,14 +174,14 @@ class _Together:
         ]
 
     def values(self, numbers: Floats) -> list[Number]:
-        """Return the faults' values at numbers (k,)."""
+        """Convert the vector (k,) to the values of the faults."""
         return [
             each.number(numbers[own].tolist())
             for each, own in zip(self.faults, self.places, strict=True)
         ]
 
     def cost(self, points: Floats) -> Floats:
-        """Compute minus the log-likelihoods (n,) of the log without faults of numbers (n, k)."""
+        """Compute minus the log-likelihoods (n,) of the log without faults of values (n, k)."""
         of_points = [
             [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
             for point in points
@@ -189,13 +189,13 @@ class _Together:
         return -np.array(self.likelihood([corrected(self.base, faults) for faults in of_points]))
 
     def is_flat(self, point: Floats) -> NDArray[np.bool_]:
-        """Test which numbers (k,) have no effect near a point (k,)."""
+        """Test which values (k,) have no effect near a point (k,)."""
         apart = np.diag(np.maximum(np.abs(point), 1.0) * NEAR)
         here, *costs = self.cost(np.concatenate([point[None], point + apart, point - apart]))
         return np.all(np.reshape(costs, (2, -1)) == here, axis=0)
 
     def at_limits(self, point: Floats) -> NDArray[np.bool_]:
-        """Test which numbers (k,) of a point (k,) are at the limit of the search."""
+        """Test which values (k,) of a point (k,) are at the limit of the search."""
         limits = np.array([each.high for each in self.free])
         return np.abs(point) >= (1.0 - NEAR) * limits
 
@@ -216,7 +216,7 @@ class _Together:
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
-    """Compute the loss without numbers (m,) with a covariance (m, m); infinite without a number."""
+    """Compute the loss without values (m,) with a covariance (m, m); infinite without a value."""
     return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
 
 

@@ -17,15 +17,13 @@ from fuselog.recorders.parameters import merge, parse_settings
 from fuselog.replay.judging.verdicts import Consistency
 
 MENDED = "mended"
-STILL_WRONG = (
-    1.5  # times the expected NEES or NIS: above this, the most likely cause is not the only one
-)
+STILL_WRONG = 1.5  # there are other causes if NEES or NIS is above its expectation by this factor
 
 
 def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
     """Diagnose each inconsistent estimator of a result over its first run.
 
-    Estimators without a log, without innovations or without a cause are left out.
+    Estimators without a log, innovations or a cause are omitted.
     """
     logs = _logs(folder, result)
     tables = {"runs": read_table(folder / RUNS)} if (folder / RUNS).is_file() else {}
@@ -40,7 +38,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
         gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))
         try:
             sentences = diagnose(logs[0], {label: own}, gap_limit_s=gap_limit_s).sentences
-        except BadInput:  # nothing is known about an estimator without innovations
+        except BadInput:  # an estimator without innovations cannot be diagnosed
             continue
         if sentences:
             mended = _mended(logs, label, own, sentences[0], found.main)
@@ -49,7 +47,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
 
 
 def _logs(folder: Path, result: Result) -> list[Path]:
-    """List the logs of the runs that are kept, or that were replayed."""
+    """List the logs of the runs that are kept, or of the runs that were replayed."""
     kept = sorted(folder.glob("logs/run-*.mcap"))
     stated = result.settings.get("logs")
     files = stated.get("files", []) if isinstance(stated, Mapping) else []

@@ -1,12 +1,12 @@
-"""The log-likelihood of replays, to find the gain of other settings or of a log without a fault.
+"""The log-likelihood of replays, from which the gains of corrected settings and logs are computed.
 
-All trials have the same measurements, and begin by the same rule. Measurements that a trial does not
-score, such as a fix that a delay moves beyond the odometry's span, have the likelihood of a broad model:
-the distance between successive messages is what is usual for their topic.
+All trials have the same measurements, and start by the same rule. Some measurements are not scored in a
+trial, for example a fix that a delay moves beyond the odometry's span. They have the likelihood of a
+broad model, in which successive messages are as far apart as is usual for their topic.
 
-A measurement that the gate rejects is an outlier: it is uniform in the volume that the innovations span,
-and occurs with the observed share. Without a gate there are no outliers, and the log-likelihood is that
-of the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
+A measurement that the gate rejects is an outlier, uniform in the volume that the innovations span, with
+the observed share of outliers. Without a gate there are no outliers, and the log-likelihood is that of
+the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
 2001, section 5.4; Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012, chapter
 7.
 """
@@ -38,17 +38,17 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
-MOST_MESSAGES = 300_000  # messages of the runs that are replayed together
+MOST_MESSAGES = 300_000  # largest number of messages of the runs that are replayed together
 EVER_NS = 2**62
 ROOM_NS = 86_400 * 10**9  # room for earlier stamps
-LEAST_SCORED = 0.5  # share of the measurements: a trial that scores fewer is not comparable
+LEAST_SCORED = 0.5  # share of the measurements; a trial that scores fewer cannot be compared
 
 
 class Trial(NamedTuple):
-    """A possible run with possible settings of the estimator.
+    """A run and settings of the estimator that are assumed to be possible.
 
-    `stretched` is, by topic, the logarithm of the volume of measurements relative to the log's: other
-    units change the density of the numbers.
+    `stretched` is, by topic, the logarithm of the volume of measurements relative to the log's, because
+    other units change the density of the numbers.
     """
 
     source: MemorySource
@@ -62,9 +62,9 @@ class Scored(NamedTuple):
     Attributes:
         source: its messages.
         begin_ns: the stamp at which the filter begins if there is no prior.
-        left: by estimate, the log-likelihood of all other messages under the broad model.
-        beyond: by estimate, the number of these messages.
-        stretch: by estimate, the correction for units that differ from the log's.
+        left: log-likelihood of all other messages under the broad model, by estimate.
+        beyond: number of these messages, by estimate.
+        stretch: correction for units that differ from the log's, by estimate.
     """
 
     source: MemorySource
@@ -81,10 +81,10 @@ class _Known:
         self._found: dict[Hashable, tuple[object, object]] = {}
 
     def once(self, streams: Sequence[Stream], key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return the result of `find` for these very streams, cached under a key."""
+        """Return the result of `find` for these stream objects, cached under a key."""
         entry = (*map(id, streams), key)
         if entry not in self._found:
-            self._found[entry] = find(), streams  # keeps the streams alive, so that their ids stay valid
+            self._found[entry] = find(), streams  # the streams stay alive, so their ids stay valid
         return cast(Found, self._found[entry][0])
 
 
@@ -92,14 +92,14 @@ class _Known:
 class Likelihood:
     """The log-likelihood of trials that have the measurements of one run.
 
-    Trials whose estimators differ only in numbers are replayed together, as the runs of an ensemble.
+    Trials whose estimators differ only in numbers are replayed together, like the runs of an ensemble.
 
     Attributes:
         label: the estimator's label.
-        volumes: by topic, the ranges (m,) of innovations by component, in which outliers are uniform.
+        volumes: by topic, the ranges (m,) of the innovations' components, in which outliers are uniform.
         count: by estimate, the number of innovations, including those of the broad model.
-        starts: the common start of all trials, if neither the log nor broad starts give one.
-        readings: by estimate, what is read, if known.
+        starts: the common start of all trials, if the log contains none.
+        readings: by estimate, functions that read the measured numbers, if known.
         broad: by topic, the mean log-likelihood of a message under the broad model.
         later_ns: shift of all stamps, so that no alteration moves them to before 1970.
     """
@@ -116,8 +116,8 @@ class Likelihood:
     def begin(self, trial: Trial) -> dict[str, Stream]:
         """Set the trial with which others are compared, and return its innovations by topic.
 
-        They are those of the most likely part of broad starts if the log states no start. Raises
-        BadInput if the estimator cannot begin.
+        If the log has no initial state, they are those of the most likely broad start. Raises BadInput
+        if the estimator cannot begin.
         """
         bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
@@ -160,7 +160,7 @@ class Likelihood:
         bound: dict[int, list[Bound]] = {}
         for place, trial in enumerate(trials):
             stated, key = _stated_by(trial), _key(trial)
-            with suppress(BadInput):  # these settings fit no run
+            with suppress(BadInput):  # no run fits these settings
                 bound[place] = self._bound_to(trial, (key, stated))
                 together.setdefault((_alike(bound[place]) or key, stated), []).append(place)
         found = np.full((len(trials), count), -np.inf)
@@ -178,7 +178,7 @@ class Likelihood:
         return disturbed(trial.source, self._bound_to(trial))
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
-        """Divide trials into portions that fit in memory."""
+        """Divide trials into groups that fit in memory."""
         messages = sum(map(len, trials[places[0]].source.streams.values())) * part_count(self.starts)
         size = max(1, MOST_MESSAGES // max(messages, 1))
         return (places[first : first + size] for first in range(0, len(places), size))
@@ -190,7 +190,7 @@ class Likelihood:
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
-        """Select the scored messages of a trial: within the span of its controls, after its prior.
+        """Select the messages that are scored: within the span of the controls, and after the prior.
 
         `known` caches results on streams that several trials share.
         """
@@ -217,14 +217,14 @@ class Likelihood:
             topic: known.once([stream], self.later_ns, partial(_later, stream, self.later_ns))
             for topic, stream in streams.items()
         }
-        # raw: otherwise, a trial would gain by leaving out values that its alteration makes impossible
+        # raw messages: otherwise, a trial would gain if its alteration makes values impossible
         source = replace(trial.source, streams=later, is_raw=True)
         return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
         self, bounds: Sequence[Sequence[Bound]], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
-        """Replay trials of similar estimators: innovations by part and topic; none on failure."""
+        """Replay trials of similar estimators; return innovations by part and topic, none on failure."""
         count = part_count(self.starts)
         bound = [_together(each, count) for each in zip(*bounds, strict=True)]
         sources = [each.source for each in scored for _ in range(count)]
@@ -232,7 +232,7 @@ class Likelihood:
         try:
             begun = [begun_broadly(begun_at(each, self.starts), begins_ns, count) for each in bound]
             outputs = collect(replay(Ensemble(sources), begun, is_part=True))
-        except BadInput:  # these settings fit no run
+        except BadInput:  # no run fits these settings
             outputs = {}
         if not outputs and any(each is not bounds[0] for each in bounds):
             alone = zip(bounds, scored, strict=True)
@@ -249,7 +249,7 @@ class Likelihood:
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
-        """Compute log-likelihoods of equal shares of the measurements, each given those before."""
+        """Compute log-likelihoods of equal shares of the measurements, each given those before it."""
         until = []
         for share in np.arange(1, count + 1) / count:
             found = [self._of_start(scored, part, share) for part in parts]
@@ -298,16 +298,16 @@ def _topic(name: str) -> str:
 
 
 def _name(topic: str) -> str:
-    """Return what the innovations of a topic belong to; those of a program may belong to several."""
+    """Return the name to which the innovations of a topic belong; a program may have several."""
     return topic.removeprefix("/estimates/").removesuffix("/innovation")
 
 
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
-    """Find the span in which a filter can score measurements, and the step of its controls.
+    """Find the span in which a filter can score measurements, and the time step of its controls.
 
-    Measurements up to a step before it are scored at its begin, and those after it while the last
-    control holds and for the same time again: messages that a small delay moves across an end stay
-    comparable.
+    Measurements up to a step before the span are scored at its begin. Those after it are scored for as
+    long as the last control applies, and for the same time again. Thus messages that a small delay moves
+    across an end stay comparable.
     """
     begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
     for topic in controls:
@@ -338,7 +338,7 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
     """Limit the broad likelihood of topics that a filter predicts better than it states.
 
-    For a body at rest, the broad model is more precise than a conservative filter; without the limit, a
+    For a body at rest, the broad model is more precise than a conservative filter. Without the limit, a
     delay would gain by moving messages out of the scored span.
     """
     found = {}
@@ -353,9 +353,9 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Test whether rows are in the first share of their sensor's rows, by what they measure.
+    """Test whether rows are in the first share of their sensor's rows, by measured quantity.
 
-    A share of all rows would have other measurements if a delay changes their order.
+    A share of all rows would contain other measurements if a delay changes their order.
     """
     known = np.isfinite(innovations["innovation"])
     sensor = known @ 2.0 ** np.arange(known.shape[1])
@@ -367,7 +367,7 @@ def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
 
 
 def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
-    """Return the messages that can be scored in a span, see `_span`, with none before its begin."""
+    """Return the messages that can be scored in a span (see `_span`), moved to it if they are before."""
     (begin_ns, end_ns, step_ns), stamps_ns = span_ns, stream.publish_time_ns
     is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
     if is_in.all() and stamps_ns.min() >= begin_ns:
@@ -381,12 +381,12 @@ def _later(stream: Stream, by_ns: int) -> Stream:
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:
-    """Sum the log-likelihoods that the innovations of a part state."""
+    """Sum the log-likelihoods that the innovations of a part contain."""
     return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
 def _stated_by(trial: Trial) -> Hashable:
-    """Return what channels state, which has to be equal for trials that are replayed together."""
+    """Return the statements of channels, which must be equal for trials that are replayed together."""
     return tuple((topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items())
 
 
@@ -395,13 +395,13 @@ def _key(trial: Trial) -> str:
 
 
 def _alike(bound: Sequence[Bound]) -> Hashable:
-    """Return what has to be equal for estimators to be replayed together; None if nothing suffices."""
+    """Return a key that is equal for estimators that can be replayed together; None if none can."""
     keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
     return tuple(keys) if len(keys) == len(bound) else None
 
 
 def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator for runs that repeat `count` times and each have their own numbers."""
+    """Make one estimator for runs that repeat `count` times, each with its own values."""
     first = bounds[0]
     alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
     if all(each is first for each in bounds):
@@ -413,7 +413,7 @@ def _extents(stream: Stream) -> Floats:
     """Compute the ranges (m,) of innovations by component; that of an angle is a full turn."""
     kinds = stream.metadata["kinds"].split(",")
     known = np.where(np.isfinite(stream["innovation"]), stream["innovation"], np.nan)
-    highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # result for a component without numbers
+    highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # result for a component without values
     extents = highest - np.fmin.reduce(known, axis=0, initial=np.inf)
     extents = np.where(np.array(kinds) == "angle", 2.0 * np.pi, extents)
     return np.where(extents > 0.0, extents, 1.0)

@@ -1,4 +1,4 @@
-"""The data that is diagnosed: the first part of a long log, or what an autopilot recorded."""
+"""The data to diagnose: the first part of a long log, or the estimates that an autopilot recorded."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,13 +20,13 @@ from fuselog.replay.engine.streams.blocks import Findings
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.metrics.measuring import find_metrics
 
-MOST_MESSAGES = 40_000  # messages of a log, from its first, in which causes are searched for
+MOST_MESSAGES = 40_000  # number of messages from the start of a log in which causes are searched for
 
 
 class Outputs(Mapping[str, Stream]):
-    """A mapping from topics to the outputs of a replay that have a given schema.
+    """A mapping from topics to those outputs of a replay that have a given schema.
 
-    Only the last topic is cached, because outputs of a long log take much memory.
+    Only the last topic is cached, because the outputs of a long log take much memory.
     """
 
     def __init__(self, done: Replay, schema: Schema) -> None:
@@ -51,7 +51,7 @@ class Outputs(Mapping[str, Stream]):
 
 
 def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str, Any]) -> BadInput:
-    """Return the error for an estimator that gives no innovations on a log of this name."""
+    """Return the error for an estimator that has no innovations on a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
     remedy = for_likelihood(settings) or "use a filter of the same model, such as -e ekf"
@@ -61,7 +61,7 @@ def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str,
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
-    """Return an estimator's recorded estimates as if a replay had made them."""
+    """Return an estimator's recorded estimates in the form of a replay's."""
     estimates = Renamed(source, label, label)
     judge = judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)
     return Replay([source], [estimates], {label: {}}, Pass(judge, {label: {}}), gap_limit_s)
@@ -78,7 +78,7 @@ class Portion(NamedTuple):
 def first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> Portion:
-    """Read what the estimator needs from a log; only the first MOST_MESSAGES of a long one."""
+    """Read the topics that the estimator uses, at most the first MOST_MESSAGES of a log."""
     whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
@@ -91,7 +91,7 @@ def first_part(
             break
     for topic, found in parts.items():
         streams[topic] = concatenate(found) if found else source.empty(topic)
-    for each in bound:  # a setting may name the truth; its errors are not needed here
+    for each in bound:  # a setting may name the truth, whose errors are not needed here
         if each.truth in source.topics:
             streams.setdefault(each.truth, source.empty(each.truth))
     end_ns, note = None, ""
@@ -117,7 +117,7 @@ def on_the_rest(
     advised: Mapping[str, Any],
     end_ns: int,
 ) -> str:
-    """Compute the gain of following advice after a part of the log, as the end of a sentence.
+    """Compute the gain of advice over the rest of the log, and return the end of a sentence.
 
     Args:
         source: the whole log.

@@ -1,7 +1,7 @@
-"""Search for the numbers at which faults gain most, over all faults in parallel.
+"""Search for the values at which faults gain most, over all faults in parallel.
 
-A search is a generator: it yields values, receives their gains, and returns its `Peak`. One replay can
-thus compute the next values of all faults.
+A search is a generator that yields values, receives their gains, and returns its `Peak`. Thus one replay
+can compute the next values of all faults.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,21 +12,21 @@ import numpy as np
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.optimise import Search
 
-Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
-ROUNDS = 14  # of a refinement, at most
+Gains = Callable[[Sequence[Number]], Sequence[float]]  # most evaluations of a search for one value
+ROUNDS = 14  # most evaluations of a refinement
 NEAR = 1e-5  # accuracy of a peak in log-likelihood
-CLEAR = 0.05  # the same for a peak of several numbers
-# accuracy relative to the distance from the largest peak: a distant peak can be less accurate
+CLEAR = 0.05  # the same for a peak of several values
+# accuracy relative to the distance from the largest peak; a distant peak can be less accurate
 FAR = 0.02
-GRID = 49  # numbers over the whole range, among which another maximum is searched for
+GRID = 49  # values over the whole range, among which another maximum is searched for
 WIDE = 4.0  # factor on the gain that a parabola predicts, a generous bound
-NUMBER_COST = 3.0  # cost in log-likelihood of each number that is found
+NUMBER_COST = 3.0  # cost in log-likelihood of each estimated value
 
 
 class Peak(NamedTuple):
     """The value at which the gain of a fault is largest, and that gain.
 
-    `is_special` tells that the value is one of the fault's special ones, which are not searched.
+    `is_special` states whether the value is one of the fault's special values.
     """
 
     value: Number
@@ -34,7 +34,7 @@ class Peak(NamedTuple):
     is_special: bool = False
 
     def score(self, of: Hypothesis) -> float:
-        """Compute the gain minus the cost of each number that is found."""
+        """Compute the gain minus the cost of each estimated value."""
         is_free = of.tried and not self.is_special
         return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
 
@@ -45,10 +45,10 @@ def peak(
     """Search for the largest gain of a fault.
 
     Args:
-        of: the fault; its gain is zero at the number zero.
-        floor: a gain below this is not worth a search.
-        greatest: returns the largest known gain of any fault. If there is none yet, and no gain nearby
-            or at a special value, distant values are not searched.
+        of: the fault, whose gain is zero at the value zero.
+        floor: a gain below which a search is not worthwhile.
+        greatest: function that returns the largest known gain of any fault. Distant values are not
+            searched if no gain is known yet, or found nearby or at a special value.
     """
     if of.size > 1:
         return (yield from _of_several(of, floor, greatest))
@@ -61,7 +61,7 @@ def peak(
         return best
     known[0.0] = 0.0
     is_flat = max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor
-    if is_flat and greatest() < floor:  # and nothing else is wrong
+    if is_flat and greatest() < floor:  # and there is no other fault
         return Peak(0.0, 0.0)
     known.update(zip(far, (yield far), strict=True))
     if max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor:
@@ -136,7 +136,7 @@ def _next(known: Mapping[float, float], limit: float) -> list[float]:
 
 
 def _is_lopsided(low: float, best: float, high: float) -> bool:
-    """Test whether a bracket is too uneven for a parabola."""
+    """Test whether a bracket is too asymmetric for a parabola."""
     return max(best - low, high - best) > 8.0 * min(best - low, high - best)
 
 
@@ -146,7 +146,7 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
         return np.inf
     low, high = sorted(sides)
     gains = np.array([known[low], known[high]])
-    if not gains.any():  # the number has no effect
+    if not gains.any():  # the value has no effect
         return 0.0
     if not np.isfinite(gains).all():
         return np.inf
@@ -155,10 +155,10 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
 
 
 def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search[Number, Peak]:
-    """Search for several numbers with repeated paraboloids around the best values.
+    """Search for several values with repeated paraboloids around the best values.
 
-    The gain of a diverging filter is rough and has no paraboloid: then the best evaluated point is
-    taken, and the steps around it get smaller.
+    The gain of a diverging filter is rough and has no paraboloid. In this case, the best evaluated point
+    is used, and the steps around it are reduced.
     """
     size, steps = of.size, np.array(of.tried[0])
     at, gain = np.zeros(size), 0.0
@@ -183,7 +183,7 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
         best = int(np.argmax(gains))
         if found < gain + gains[best]:
             found, move, is_rough = gain + gains[best], np.subtract(asked[best], at), True
-        if found <= gain and is_rough:  # no parabola of this width
+        if found <= gain and is_rough:  # there is no parabola of this width
             steps, is_rough = 0.2 * steps, False
             continue
         if found <= gain:
@@ -200,9 +200,9 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
 
 
 def rival(of: Hypothesis, at: Peak, least: float) -> Search[Number, Peak | None]:
-    """Search for another number of a fault that gains at least `least`; None if there is none.
+    """Search for another value of a fault that gains at least `least`; None if there is none.
 
-    It is another local maximum, such as that of a delay on laps of equal length.
+    It is another local maximum, for example of a delay on laps of equal length.
     """
     values = np.linspace(-of.limit, of.limit, GRID).tolist()
     known = dict(zip(values, (yield values), strict=True)) | {at.value: at.gain}

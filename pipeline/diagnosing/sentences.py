@@ -1,4 +1,4 @@
-"""The sentences of a diagnosis in their order: causes, and findings in the log itself."""
+"""The sentences of a diagnosis in order, on causes and on findings in the log itself."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from fuselog.recorders.log.impossible import Rejections
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.judging.errors.evaluation import split_topic
 
-# Kinds that explain the numbers themselves, in contrast to noise or biases that would have to be large.
+# Kinds of faults of the values themselves; noise or biases would have to be large to explain them.
 OF_FORM = (
     *("factor or sign", "exchanged axes", "convention", "parameter", "delay", "clock drift"),
     *("outliers", "exchanged numbers", "start"),
@@ -28,24 +28,24 @@ MOST_SENTENCES = 5
 Rest = Callable[[Mapping[str, Any]], str]  # the gain of settings over the rest of a long log
 
 
-# Kinds of log findings that a cause of another kind covers.
+# Kinds of findings in the log that a cause of another kind explains.
 ALIKE: Mapping[Kind, Kind] = {"mounting": "bias or turned frame", "covariance": "measurement noise"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CauseFinding(Finding):
-    """A finding by likelihood: it concerns the topic or parameter of its `cause`."""
+    """A finding from likelihoods, about the topic or parameter of its `cause`."""
 
     cause: Cause
 
     @property
     def fix(self) -> str:
-        """Return what to try."""
+        """Return the advice."""
         return self.otherwise
 
 
 def cause_of(found: Finding) -> Cause | None:
-    """Return the cause of a finding by likelihood; None for other findings."""
+    """Return the cause of a finding from likelihoods; None for other findings."""
     return found.cause if isinstance(found, CauseFinding) else None
 
 
@@ -59,7 +59,7 @@ def names_of(found: Finding) -> list[tuple[Kind, str]]:
 def ranked(
     causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
 ) -> list[Finding]:
-    """Order findings: stamps, causes, and what else is found without a filter.
+    """Order findings: stamps, causes, and other findings that need no filter.
 
     A finding with a setting that corrects it comes before causes that are only its consequence, such as
     noise. Findings that a cause names or advises are not repeated.
@@ -88,7 +88,7 @@ def ranked(
 
 
 def _is_advised(setting: str, advised: Collection[str]) -> bool:
-    """Test whether a setting, or that of the whole vector to which it belongs, is advised."""
+    """Test whether a setting, or that of the vector to which it belongs, is advised."""
     stem = setting.partition("=")[0].removesuffix("_scale")
     return any(stem.startswith(each.removesuffix("_scale")) for each in advised)
 
@@ -98,7 +98,7 @@ def marks_of(
 ) -> dict[str, Stream]:
     """Write sentences as messages by topic for a timeline, at the stamps where they begin.
 
-    `outputs` are the topics of what was estimated, `first_ns` is the first stamp of the log.
+    `outputs` are the topics of the estimates, `first_ns` is the first stamp of the log.
     """
     cases = list(dict.fromkeys(split_topic(topic)[1] for topic in outputs))
     found: dict[str, list[Finding]] = {}
@@ -116,7 +116,7 @@ def marks_of(
 
 
 def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
-    """List findings in the log that no sentence has: hints, and those that a cause names differently."""
+    """List findings that are not sentences: hints, and those that a cause describes differently."""
     return [
         f"hint: {each.sentence}" if each.severity == "hint" else f"the log itself shows: {each.evidence}"
         for each in of_log
@@ -125,7 +125,7 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 
 
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
-    """List what one should know about a diagnosis: what is in doubt, not judged, or left out."""
+    """List remarks on a diagnosis: findings in doubt, untested parts, and omissions."""
     notes = [
         "in doubt, like everything with a smaller gain, because the parts of the log disagree about the "
         f"number by more than chance: {each.words}"
@@ -151,9 +151,9 @@ def _finding(
     before: Sequence[Finding],
     rest: Rest | None,
 ) -> CauseFinding:
-    """Describe a cause, what to try against it, and its effect on the rest of a long log.
+    """Describe a cause, what to try, and the effect of trying it on the rest of a long log.
 
-    `before` are findings on stamps, of which a cause may be a consequence.
+    `before` contains findings on stamps, of which a cause may be a consequence.
     """
     of, words = cause.hypothesis, cause.words
     remedy = of.remedy(cause.value)

@@ -1,8 +1,8 @@
-"""A study of diagnosing: faults are planted in logs and settings; it counts how often they are named.
+"""A study of diagnosing, which plants faults in logs and settings and counts how often they are named.
 
-Faults that cannot be distinguished count as one kind: a bearing's bias and its sensor's rotated frame. A
-rotation or a drift is only visible between two frames or clocks, so that either may be named. The gain
-in log-likelihood from removing a fault shows whether it is visible at all. Some are not: for example, a
+Faults that cannot be distinguished count as one kind, such as a bearing's bias and its sensor's rotated
+frame. A rotation or a drift is only visible between two frames or clocks, so either may be named. The
+gain in log-likelihood from removing a fault shows whether it is visible at all. Some are not, such as a
 delay of the only sensor of a vehicle without controls.
 """
 
@@ -28,9 +28,9 @@ from fuselog.recorders.parameters import Parameters, merge
 from fuselog.recorders.recording import record_run
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
-WORTH = 10.0  # gain in log-likelihood: a fault that gains less when removed is not counted
+WORTH = 10.0  # a fault is not counted if its removal increases the log-likelihood by less than this
 FIRST = 0.8  # share of the counted faults that should be named first
-SIZED = ("R", "Q", "delay")  # faults whose size has to be in its interval
+SIZED = ("R", "Q", "delay")  # kinds of faults whose size should be in its interval
 DEGREE = np.pi / 180.0
 QUANTITIES = (
     "worth",
@@ -62,11 +62,11 @@ class Options(Parameters):
 
 
 class Fault(NamedTuple):
-    """A fault, and what a diagnosis should report.
+    """A fault, and the expected diagnosis.
 
     Attributes:
-        kind, topic: what is named; any topic if `topic` is empty.
-        value: its number, which the 95 % interval should cover; None for a fault without a number.
+        kind, topic: the kind and topic to be named; any topic if `topic` is empty.
+        value: its size, which the 95 % interval should cover; None for a fault without a size.
         record: parameters of the recorder that cause it.
         settings: settings of the estimator that cause it.
         alteration: an alteration of `altered` (by default `topic`) by `by` (by default `value`).
@@ -234,7 +234,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
-    """Return the scenario and the fault of each name; all of them without names."""
+    """Return the scenario and the fault of each name; all of them if no names are given."""
     known = {
         f"{name}-{fault}": (name, fault)
         for name, scenario in SCENARIOS.items()
@@ -255,7 +255,7 @@ def battery_seeds(options: Options, runs: int) -> range:
 def _recorded(
     scenario: Scenario, fault: Fault, seed: int, run: int
 ) -> tuple[MemorySource, MemorySource]:
-    """Record a run without a fault, and the same run with it."""
+    """Record a run without a fault, and the same run with the fault."""
     parameters = merge(scenario.parameters, fault.record)
     source = memory_source(*record_run(scenario.recorder, scenario.parameters, seed, run))
     faulty = memory_source(*record_run(scenario.recorder, parameters, seed, run))
@@ -277,7 +277,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
 
 
 def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
-    """Summarise what the diagnosis reported, and whether it is right."""
+    """Summarise the reported causes, and test whether the planted fault is among them."""
     is_right = [
         any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in names_of(each))
         for each in found.sentences
@@ -300,7 +300,7 @@ def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Count the runs in which the fault matters, and how often it is named and its value covered."""
+    """Count the runs in which the fault matters, and how often it is named and its size covered."""
     counted = rows[rows["worth"] >= WORTH]
     return pd.Series(
         {

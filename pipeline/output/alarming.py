@@ -1,8 +1,8 @@
-"""Warnings about a replay's numbers, the worst first: one sentence each, and what to do.
+"""Warnings about the numbers of a replay, the worst first, each with advice.
 
 For a filter with correct covariances, NIS, NEES and the share of rejected measurements are within their
-limits in 999 of 1,000 logs. A value outside gives a warning, and so does a constant error. The
-class `fuselog.replay.judging.verdicts.Squares` interprets the values for the filter.
+limits in 999 of 1,000 logs. A value outside its limits causes a warning, and so does a constant error.
+The class `fuselog.replay.judging.verdicts.Squares` explains what the values mean for the filter.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +55,7 @@ class _Range(NamedTuple):
 
     @property
     def fact(self) -> str:
-        """Return the value and its limits as a phrase."""
+        """Format the value and its limits as a phrase."""
         limits = f"where a consistent filter is between {self.low:.3g} and {self.high:.3g}"
         return f"is {self.of.found.value:.3g}{' per component' * (self.of.name == NIS)}, {limits}"
 
@@ -98,7 +98,7 @@ def alarms_of(
 
 
 def _of_components(judge: Judge) -> Iterator[Finding]:
-    """Find components about which no measurement informs an estimator."""
+    """Find components of the state on which an estimator's measurements have no influence."""
     for (estimator, case), names in judge.uninformed.items():
         them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
         words = (
@@ -137,7 +137,7 @@ def _of_innovations(
         facts, excess = [], 1.0
         gated = sums.messages - sums.accepted
         expected = (1.0 - gate) * sums.messages
-        # a count of rare events is Poisson distributed; its tail is a chi-square tail
+        # a count of rare events is Poisson distributed, with the tail of a chi-square distribution
         if gated and chi2.sf(2.0 * expected, 2 * gated) > CONSISTENT:
             share = gated / sums.messages
             excess = max(1.0, gated / max(expected, RARE * sums.messages))
@@ -208,7 +208,7 @@ def dominating_run(nees: "pd.Series[float]") -> str:
 
 
 def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
-    """Describe a constant error, in the axes of the body or of the plane."""
+    """Describe a constant error, in the axes of the body or of the local tangent plane."""
     offset = ", ".join(f"{each:.3g}" for each in constant.offset_m)
     name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
     words = f"{name}: {_percent(constant.share)} of the squared error is constant, "
@@ -227,7 +227,7 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
 
 
 def _of_costs(judge: Judge) -> Iterator[Finding]:
-    """Find trajectory searches that ended at a higher cost than their residuals explain."""
+    """Find trajectory searches whose final cost is higher than measurement noise explains."""
     metrics = judge.metrics
     for topic, innovations in judge.innovations.items():
         sums = innovations.total
@@ -238,7 +238,8 @@ def _of_costs(judge: Judge) -> Iterator[Finding]:
             continue
         _, high = chi_square_interval(numbers, 1, CONSISTENT)
         high *= 0.5 / judge.runs
-        if cost > high * max(1.0, sums.squared / sums.degrees):  # understated noise raises both
+        # noise parameters that are too small raise both the cost and the NIS
+        if cost > high * max(1.0, sums.squared / sums.degrees):
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
                 f"{numbers / judge.runs:.4g} measured numbers explain at most {high:.4g}: probably a "
@@ -274,7 +275,7 @@ def _of_digits(judge: Judge) -> Iterator[Finding]:
 
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
-    """Find measurements that were not used for a reason; a tracker's unassociated ones have none."""
+    """Find measurements that were not used for a stated reason, such as a rejection by a gate."""
     measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
         is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
@@ -286,7 +287,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find estimators with different gates, if one rejected a measurement; they are not comparable."""
+    """Find estimators that are not comparable because their gates differ and rejected measurements."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

@@ -1,7 +1,7 @@
-"""Types in which results store doubts about their numbers: warnings, causes, stress verdicts.
+"""Types of the warnings, causes and stress verdicts that results store with their numbers.
 
-`fuselog.pipeline.output.alarming` finds warnings, `fuselog run --diagnose` causes, and `--stress` its
-verdicts.
+`fuselog.pipeline.output.alarming` finds the warnings, `fuselog run --diagnose` the causes, and
+`--stress` the verdicts.
 """
 
 from collections.abc import Mapping
@@ -41,9 +41,9 @@ class Cause:
 
     Attributes:
         estimator: the estimator's label.
-        words: the sentence.
+        words: description of the cause in one sentence.
         short: the same in a few words, for the report's first sentence.
-        setting: the `--set` value that corrects it; empty if none does.
+        setting: the `--set` value that corrects the cause; empty if no setting does.
         mended: the outcome of the same runs with that setting; empty if they were not replayed.
     """
 
@@ -64,7 +64,7 @@ class Stressing:
 
     Attributes:
         estimator: the estimator's label.
-        verdict: the worst verdict that more than one in a hundred runs have.
+        verdict: the worst verdict that more than 1 % of the runs have.
         words: the verdict with its numbers, then an explanation.
         moved: the largest change of a metric's mean over the runs, by `quantity.case`, and by
             `quantity` over all cases.

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# More points of a line than this are not visible.
+# Largest number of points in a line; more are not visible.
 MOST_POINTS = 1000
 LINE_LETTERS = 100  # characters in a line of a picture's title
-# Contrast with white and black is at least 3:1 (WCAG 2.2, 1.4.11); the colours differ clearly.
+# Colours that differ clearly, with a contrast of at least 3:1 to white and black (WCAG 2.2, 1.4.11).
 COLOURS = (
     *("#2f7fd1", "#d2640a", "#2a9147", "#d8433b", "#9461d6"),
     *("#138f97", "#d0459a", "#9c6b3f", "#878a12", "#5f78a8"),
@@ -41,7 +41,7 @@ def _on_an_axis(value: Any) -> Any:
 Number = Annotated[float | None, BeforeValidator(_on_an_axis)]
 Numbers = list[Number]
 Places = list[Number] | list[str]
-# Triangles mark landmarks, an area is a closed polygon, "outside" is drawn in red.
+# Triangles mark landmarks, an area is a closed polygon, and "outside" is drawn in red.
 Style = Literal["line", "dashed", "markers", "dots", "line+markers", "triangles", "area", "outside"]
 
 
@@ -67,7 +67,7 @@ class Axis(Parameters):
 
 
 class Drawn(Parameters):
-    """Something drawn over x, which holds numbers or names.
+    """Something that is drawn over x, an array of numbers or names.
 
     Everything with the same label has the same colour in all panels, and is hidden together. A
     reference, such as the truth, is drawn for comparison with the others.
@@ -127,7 +127,7 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Panels in rows, with a common legend unless their titles identify the curves.
+    """Panels in rows, with a common legend unless the panel titles identify the curves.
 
     Attributes:
         panels: row by row.
@@ -160,7 +160,7 @@ def _has_own_colour(drawn: Drawn) -> bool:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> slice:
-    """Return a slice that keeps every k-th of `count` points, so that at most `most` remain."""
+    """Return a slice that selects every k-th of `count` points, at most `most` of them."""
     return slice(None, None, max(1, -(-count // most)))
 
 
@@ -314,7 +314,7 @@ def draw(chart: Chart) -> "Figure":
 
 
 def _height_in(panel: Panel) -> float:
-    """Choose the height of a panel; a plane with limits follows their ratio."""
+    """Choose the height of a panel, from the ratio of the limits if its axes have the same scale."""
     if panel.plane and panel.x.limits and panel.y.limits:
         wide, high = panel.x.limits[1] - panel.x.limits[0], panel.y.limits[1] - panel.y.limits[0]
         return min(4.5, 7.0 * high / wide + 0.9)

@@ -1,7 +1,7 @@
 """Verdicts on claims, which are statements of papers.
 
-A claim is data, next to an experiment's settings in data/experiments: a sentence, what the paper says,
-and a comparison of metrics that decides it; see `fuselog.pipeline.output.expressions`.
+Claims are stored next to an experiment's settings in data/experiments. A claim consists of a sentence,
+the paper's result, and a comparison of metrics that decides it (`fuselog.pipeline.output.expressions`).
 """
 
 import re
@@ -34,7 +34,7 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import Claimed
 
-# Recording name of a claim about all recordings.
+# Name of the recording in a claim about all recordings.
 ANY = "any"
 TOO_FEW = f"too few runs for a 95 % interval, which needs {FEWEST_RUNS}"
 
@@ -83,7 +83,7 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 
 
 def known(claim: Claim) -> Claim:
-    """Return the claim; if one of our numbers is missing, with the verdict not reproducible."""
+    """Return the claim, with the verdict "not reproducible" if one of our numbers is missing."""
     has_none = claim.verdict in (Claimed.NOT_REPRODUCIBLE, Claimed.NO_VERDICT) or claim.why == TOO_FEW
     if has_none or not re.search(rf"\bnan\b|(?<!\w){MISSING}(?!\w)", claim.ours):
         return claim
@@ -114,10 +114,10 @@ class StatedClaim(Parameters):
         given: numbers or expressions, by the names that texts and comparison use.
         optional: whether the claim is left out, instead of not reproducible, if the result lacks one
             of its metrics.
-        least_runs: with fewer runs the claim is inconclusive, unless each number that decides it has
-            an interval; by default the number of runs in the experiment's file, if it makes runs.
-        recording: the experiment's recording that the claim is about, by default the first; `any`
-            stands for all data. For other data the claim has numbers, but no verdict.
+        least_runs: the number of runs below which the claim is inconclusive, unless each number that
+            decides it has an interval. The default is the number of runs in the experiment's file.
+        recording: the experiment's recording to which the claim refers, by default the first; `any`
+            means all data. For other data, the claim has numbers but no verdict.
     """
 
     sentence: str
@@ -148,12 +148,12 @@ class StatedClaim(Parameters):
 
     @property
     def recordings(self) -> set[str]:
-        """Return the claim's recordings: `*` if only a result can tell, "" for the first."""
+        """Return the claim's recordings: "" is the first, `*` means that they depend on the result."""
         return {_named(self, meant).recording for meant in _combinations(self.each)}
 
     @property
     def names(self) -> set[str]:
-        """Return the names that the claim uses but does not define; raises BadInput for bad ones."""
+        """Return the names that the claim uses but does not define; raise BadInput for invalid names."""
         found: set[str] = set()
         for meant in _combinations(self.each):
             claim = _named(self, meant)
@@ -168,7 +168,7 @@ class StatedClaim(Parameters):
 
 
 def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
-    """Read an expression; raises BadInput that names the claim if it cannot be read."""
+    """Parse an expression; if it is invalid, raise BadInput with the claim's name."""
     try:
         return read(*arguments)
     except BadInput as error:
@@ -176,7 +176,7 @@ def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
 
 
 def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: str) -> None:
-    """Raise BadInput that names `where` and the claim, if a claim uses an unknown number."""
+    """Raise BadInput with `where` and the claim if a claim uses an unknown number."""
     for claim in stated:
         for name in sorted(claim.names.difference(names)):
             raise BadInput(
@@ -185,7 +185,7 @@ def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: 
 
 
 def require_recordings(stated: Sequence[StatedClaim], recordings: Collection[str], where: str) -> None:
-    """Raise BadInput that names `where` and the claim, if a claim is about an unknown recording."""
+    """Raise BadInput with `where` and the claim if a claim is about an unknown recording."""
     if ANY in recordings:
         raise BadInput(f"{where}: '{ANY}' stands for all recordings; give recordings.{ANY} another name")
     known = {"", "*", ANY, *recordings}
@@ -205,8 +205,8 @@ def decide(
 ) -> list[Claim]:
     """Decide claims from a result's metrics, their 95 % intervals, and numbers by name.
 
-    `recordings` states for each recording whether the result is from it: claims about others get no
-    verdict. Raises BadInput if an expression of a claim cannot be evaluated.
+    `recordings` states for each recording whether the result comes from it. Claims about other
+    recordings get no verdict. Raises BadInput if an expression of a claim cannot be evaluated.
     """
     values = Values(metrics, intervals, {name: exactly(value) for name, value in names.items()})
     found = []
@@ -220,7 +220,7 @@ def decide(
 
 
 def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
-    """Return the claim, without its verdict if it is about another recording; "" is the first one."""
+    """Return the claim, or remove its verdict if it is about another recording; "" is the first."""
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
@@ -246,7 +246,7 @@ def _combinations(
 
 
 def _found(pattern: str, metrics: Mapping[str, Any]) -> list[str]:
-    """List what the `*` of a metric such as `nees[ekf, *]` matches, without duplicates."""
+    """List the names that the `*` of a metric such as `nees[ekf, *]` matches, without duplicates."""
     quantity, _, of = pattern.removesuffix("]").partition("[")
     return list(dict.fromkeys(keys_of(quantity, of, metrics).values()))
 
@@ -269,7 +269,7 @@ _TEXTS = (
 
 
 def _decided(claim: StatedClaim, values: Values) -> Claim | None:
-    """Decide a claim; return None if it is left out."""
+    """Decide a claim; return None if the claim is omitted."""
     try:
         return _reading(claim.sentence, _verdict, claim, values)
     except NoMetric as error:
@@ -282,7 +282,7 @@ def _decided(claim: StatedClaim, values: Values) -> Claim | None:
 
 
 def _as_far_as_known(text: str, values: Values) -> str:
-    """Put numbers into the text, or return it unchanged if one of them is missing."""
+    """Insert numbers into the text, or return the text unchanged if one of them is missing."""
     try:
         return formatted(text, values)
     except (BadInput, NoMetric):
@@ -290,7 +290,7 @@ def _as_far_as_known(text: str, values: Values) -> str:
 
 
 def _few_runs(claim: StatedClaim, values: Values) -> str:
-    """Explain that a claim needs more runs to be decided without an interval; empty if it does not."""
+    """Return the reason why a claim needs more runs, or an empty text if it has enough."""
     runs, least = values.names.get("runs"), claim.least_runs
     if not isinstance(runs, Interval) or least is None or runs.value >= least:
         return ""
@@ -301,7 +301,7 @@ def _few_runs(claim: StatedClaim, values: Values) -> str:
 
 
 def _stated(claim: StatedClaim) -> dict[str, str]:
-    """Return the claim's expressions by the names that it gives them."""
+    """Return the expressions that the claim defines, by name."""
     stated = {name: of for name, of in claim.given.items() if isinstance(of, str)}
     return stated | ({"value": claim.value} if claim.value else {})
 

@@ -33,7 +33,7 @@ from fuselog.replay.judging.errors.truths import Doubt
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_TOPICS = 3  # topics named in one sentence
+MOST_TOPICS = 3  # largest number of topics that a sentence names
 COLUMNS = [*Row._fields]
 # Note of an estimates log on the span and clock of its replay; absent for a whole log by publish time.
 REPLAYED = "replayed"
@@ -44,7 +44,7 @@ def untaken(
 ) -> list[Row]:
     """List the topics that an estimator does not use at all, in the replayed spans of all logs.
 
-    Truths and maps do not count, nor do controls, unless a setting would make the estimator use
+    Truths and maps are not listed. Controls are listed only if a setting would make the estimator use
     them.
     """
     taken: dict[str, set[str]] = {label: set() for label in labels}
@@ -98,8 +98,8 @@ def recounted(
 ) -> list[Row]:
     """Compute the coverage table from estimates logs and their source logs, as the replay did.
 
-    `stated` holds the estimators' settings by label, `doubts` the doubts about truths. If an
-    estimator cannot be bound to the logs, its row says so.
+    `stated` contains the estimators' settings by label, `doubts` the doubts about truths. If an
+    estimator cannot be bound to the logs, its row states this.
     """
     rows: list[Row] = []
     bound: list[Bound] = []
@@ -132,7 +132,7 @@ def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock
 
 
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
-    """Return the note REPLAYED for a source's estimates; empty for a whole log by publish time."""
+    """Return the note REPLAYED for a source's estimates; empty for a whole log in publish order."""
     ends = source.start_ns, getattr(source, "end_ns", None)
     text = json.dumps([*ends, order])
     return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
@@ -152,7 +152,7 @@ def _noted(note: str) -> tuple[int | None, int | None, Clock]:
 def _recounted(
     estimates: LogSource, source: LogSource, order: Clock, bound: Sequence[Bound]
 ) -> dict[str, Usage]:
-    """Count the messages of one run by bound estimator, and their use up to the last output."""
+    """Count the messages of one run for each estimator, and how many were used up to the last output."""
     usages = {each.name: Usage(each.name) for each in bound}
     maps = {
         topic: gather([source.read([topic])[topic]])
@@ -210,9 +210,9 @@ def rows_of(
     doubts: Mapping[str, Doubt],
     left_out: Rejections,
 ) -> list[Row]:
-    """Collect all rows by estimator and topic: counted messages, other topics, and doubtful truths.
+    """Collect the rows of counted messages, other topics and doubtful truths, by estimator and topic.
 
-    Messages that were left out because they are impossible are included in the counts.
+    Messages that were dropped because their values are impossible are included in the counts.
     """
     rows = [_whole(row, left_out) for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
@@ -233,7 +233,7 @@ def rows_of(
 
 
 def _whole(row: Row, left_out: Rejections) -> Row:
-    """Add the messages to a row that were left out before an estimator received them."""
+    """Add messages that were dropped before an estimator received them to the row."""
     if row.topic not in left_out:
         return row
     why = "; ".join(filter(None, (row.why, left_out.sentence(row.topic))))
@@ -273,7 +273,7 @@ def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:
-    """Report what was not used, with one sentence for all topics that an estimator does not use.
+    """Describe the messages that were not used, with one sentence per estimator for all unused topics.
 
     An estimator that uses no measurements at all does so by design and is not reported.
     """

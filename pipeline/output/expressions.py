@@ -1,4 +1,4 @@
-"""Evaluation of expressions over a result's metrics, which decide claims and give their numbers.
+"""Evaluation of expressions over a result's metrics, which decide claims.
 
     nees[ekf, robot1]          the metric `ekf.nees.robot1`
     nees[ekf]                  the metric `ekf.nees`
@@ -70,7 +70,7 @@ def evaluate(expression: str, values: Values) -> Value:
 
 
 def truth(expression: str, values: Values) -> Truth:
-    """Test whether an expression holds, in all entries if it is a list; raises as `evaluate` does."""
+    """Test whether an expression holds, for all entries if it is a list; raise as `evaluate` does."""
     found = evaluate(expression, values)
     if isinstance(found, Interval):
         raise BadInput(f"'{expression}' is a number, not a comparison; compare it with a limit")
@@ -98,7 +98,7 @@ def formatted(template: str, values: Values) -> str:
 
 
 def expressions_in(template: str) -> list[str]:
-    """Return the expressions of a template; raises BadInput if its braces do not match."""
+    """Return the expressions of a template; raise BadInput if its braces do not match."""
     try:
         return [each for _, each, _, _ in Formatter().parse(template) if each is not None]
     except ValueError as error:
@@ -119,7 +119,7 @@ def in_words(value: Value, form: str, *, named: bool = False) -> str:
 
 @cache
 def parse(expression: str) -> ast.expr:
-    """Parse an expression; raises BadInput if it contains syntax that expressions do not allow."""
+    """Parse an expression; raise BadInput if it contains syntax that expressions do not allow."""
     quoted = re.sub(r"(\w)\[(?!-?\d+\])([^\[\]]*)\]", lambda each: f"{each[1]}[{each[2]!r}]", expression)
     try:
         tree = ast.parse(quoted.strip(), mode="eval").body
@@ -141,7 +141,7 @@ def parse(expression: str) -> ast.expr:
 
 @cache
 def names_in(expression: str) -> frozenset[str]:
-    """Return the names of numbers in an expression; raises BadInput if it is invalid."""
+    """Return the names of numbers in an expression; raise BadInput if it is invalid."""
     tree = parse(expression)
     nodes = list(ast.walk(tree))
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
@@ -157,10 +157,10 @@ def names_in(expression: str) -> frozenset[str]:
 
 
 def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:
-    """Test whether a comparison needs many runs, because chance may carry it across its limit.
+    """Test whether chance could change the result of a comparison, so that it needs many runs.
 
-    This is so if it reads a metric without an interval, uses only one end of an interval, or asks
-    what an interval contains, which gets wider with fewer runs.
+    This is the case if the comparison reads a metric without an interval, uses only one end of an
+    interval, or tests what an interval contains, because fewer runs make the interval wider.
 
     Args:
         expression: the comparison.
@@ -287,9 +287,9 @@ def metric(quantity: str, of: str, values: Values) -> Value:
 
 
 def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
-    """Find the metrics of `estimator, case`: their keys, and what `*` and `|` match in each.
+    """Find the keys of the metrics of `estimator, case`, and the names that `*` and `|` match in each.
 
-    Raises `NoMetric` if a metric that is named without `*` is missing.
+    Raises `NoMetric` if a metric is missing that the expression names without `*`.
     """
     estimator, _, case = (part.strip() for part in of.partition(","))
     found = {}

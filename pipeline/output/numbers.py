@@ -1,4 +1,4 @@
-"""Arithmetic with intervals, as expressions need it.
+"""Arithmetic with numbers that have intervals, for the evaluation of expressions.
 
 A comparison that an interval leaves open is neither true nor false. Operations and comparisons on lists
 apply to each entry.
@@ -14,7 +14,7 @@ from typing import Any, Literal
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.judging.intervals import Interval
 
-# True, false, None if an interval leaves it open, or "missing" if a number is NaN.
+# True, false, None if the interval does not decide it, or "missing" if a number is NaN.
 Truth = bool | Literal["missing"] | None
 Value = Interval | Truth | list[Any]
 
@@ -38,7 +38,7 @@ def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
 
 
 def combined(operation: Callable[[float, float], float]) -> Callable[[Interval, Interval], Interval]:
-    """Extend an operation to intervals; the ends of its result come from the ends of its arguments."""
+    """Extend an operation to intervals, whose ends are computed from the ends of the arguments."""
 
     def of(one: float, other: float) -> float:
         try:
@@ -55,7 +55,7 @@ def combined(operation: Callable[[float, float], float]) -> Callable[[Interval, 
 
 
 def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Interval, Interval], Truth]:
-    """Make a comparison that is "missing" if one of its numbers is."""
+    """Make a comparison that returns "missing" if one of its numbers is missing."""
 
     def found(one: Interval, other: Interval) -> Truth:
         if not (isinstance(one, Interval) and isinstance(other, Interval)):
@@ -66,7 +66,7 @@ def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Inter
 
 
 def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Interval], Truth]:
-    """Make a test whether one number is below, or above, another with all of both intervals."""
+    """Make a test whether one number and its interval are entirely below, or above, another's."""
 
     def compare(one: Interval, other: Interval) -> Truth:
         if one.low == one.high and other.low == other.high:
@@ -95,14 +95,14 @@ def _equal(one: Interval, other: Interval) -> Truth:
 
 
 def negated(of: Truth) -> Truth:
-    """Negate a truth value; open and missing stay as they are."""
+    """Negate a truth value; undecided and missing values stay as they are."""
     return not of if isinstance(of, bool) else of
 
 
 def all_hold(truths: Sequence[Any]) -> Truth:
     """Test whether all truth values, nested lists included, are true.
 
-    The result is missing if one is missing, else false if one is false, else open if one is open.
+    The result is missing if one value is missing, else false if one is false, else undecided if one is.
     """
     known = flat(truths)
     if "missing" in known:
@@ -111,7 +111,7 @@ def all_hold(truths: Sequence[Any]) -> Truth:
 
 
 def any_holds(truths: Sequence[Any]) -> Truth:
-    """Test whether one truth value, nested lists included, is true; open or missing as in `all_hold`."""
+    """Test whether any truth value, nested lists included, is true; undecided as in `all_hold`."""
     return negated(all_hold([negated(each) for each in flat(truths)]))
 
 
@@ -121,7 +121,7 @@ def flat(values: Sequence[Any]) -> list[Any]:
 
 
 def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Interval]:
-    """Make a function of numbers or lists, such as the minimum, that is applied to values and ends."""
+    """Make a function of numbers or lists, such as the minimum, that also handles intervals."""
 
     def found(*arguments: Value) -> Interval:
         numbers = flat(arguments)
@@ -187,7 +187,7 @@ def _chi_square(share: Interval, size: Interval) -> Interval:
 
 
 def _count(values: list[Any]) -> Interval:
-    """Count the comparisons that are true; if one is missing, the count has no interval."""
+    """Count the true comparisons; if a comparison is missing, the count has no interval."""
     known = flat(values)
     count = float(sum(each is True for each in known))
     return Interval(count) if "missing" in known else exactly(count)

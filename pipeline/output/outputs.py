@@ -1,8 +1,7 @@
-"""Protection of existing files: no command changes or deletes a file that fuselog did not write for it.
+"""Protection of existing files: commands change or delete only files that fuselog wrote for them.
 
-An existing file is replaced only if the same command wrote it, which its content must show. An output is
-never an input, another output or a symbolic link, whatever names are given: what counts is the actual
-path that will be written.
+An existing file is replaced only if its content shows that the same command wrote it. An output is
+never an input, another output or a symbolic link; paths are compared after they are resolved.
 """
 
 import json
@@ -20,7 +19,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.recorders.parsing import parse_json
 
-MOST_SETTINGS = 3  # settings named in one sentence
+MOST_SETTINGS = 3  # largest number of settings that a sentence names
 # Notes of a log's run on how it was cut, merged or relabelled, and by which command last.
 CHANGES, CHANGED_BY = "changes", "changed by"
 
@@ -58,7 +57,7 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
 
 
 def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
-    """Raise BadInput if a folder to be replaced is a link or a root, or contains an input."""
+    """Raise BadInput if a folder that would be replaced is a link or a root, or contains an input."""
     folder = settled(folder)
     if not folder.name:
         raise BadInput(f"{folder}: is the root of a file system; give a folder in it with --out")
@@ -75,7 +74,7 @@ def check_outputs(
 ) -> None:
     """Raise BadInput if a command may not write its result folder or its timeline.
 
-    This is checked before the work starts, so that no work is lost.
+    The check runs before the work starts, so no work is lost.
     """
     if timeline is not None:
         check_files([(timeline, TIMELINE)], inputs)
@@ -101,7 +100,7 @@ def _is_of_result(path: Path) -> bool:
 
 
 def _identity(path: Path) -> Hashable:
-    """Return a key that is equal for all names of the same file, even if it does not exist yet."""
+    """Return a key that is the same for all names of a file, even before the file exists."""
     try:
         state = path.stat()
     except OSError:
@@ -115,7 +114,7 @@ def run_written(path: Path) -> RunMetadata | None:
 
 
 def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
-    """Describe the settings in which a replaced log differs from the new one; empty if none do."""
+    """Describe how the settings of a replaced log differ from the new one's; empty if they do not."""
     if before is None or now is None:
         return ""
     old, new = _settings_of(before), _settings_of(now)
@@ -126,7 +125,7 @@ def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) ->
 
 
 def _settings_of(run: RunMetadata) -> dict[str, str]:
-    """Return the settings of a run, or of the estimates of one: values as JSON by name."""
+    """Return the settings of a log's run or of its estimators, as JSON by name."""
     found: dict[str, Any] = {"scenario": run.scenario, "seed": run.seed, "run": run.run}
     found |= run.parameters
     if _is_estimates(run):
@@ -140,7 +139,7 @@ def _shown(settings: Mapping[str, str], name: str) -> str:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """Return the run of a log that fuselog wrote: as recorded, or changed since if `is_changed`."""
+    """Return the run of a log that fuselog wrote, or changed afterwards if `is_changed`."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None

@@ -1,4 +1,4 @@
-"""Explanations of refuted claims: the parts of the comparison that are false, with their numbers."""
+"""Explanations of refuted claims, with the false parts of the comparison and their numbers."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ from fuselog.pipeline.output.expressions import (
 from fuselog.pipeline.output.numbers import COMPARISONS, Truth, by_entry, exactly, flat
 from fuselog.replay.judging.intervals import Interval
 
-MOST_ENTRIES = 4  # entries named in a sentence
+MOST_ENTRIES = 4  # largest number of entries that a sentence names
 _WORDS: dict[type[ast.cmpop], str] = {
     ast.Lt: "below",
     ast.LtE: "at most",
@@ -107,7 +107,7 @@ class _Reader(NamedTuple):
     def _compare(
         self, op: type[ast.cmpop], one: ast.expr, other: ast.expr, *, wanted: bool
     ) -> _Comparison:
-        """Compare two sides entry by entry; a measured side is the subject, a given one the limit."""
+        """Compare two sides entry by entry; the measured side is the subject, the other the limit."""
         if op in _MIRRORED and not self._is_measured(one) and self._is_measured(other):
             op, one, other = _MIRRORED[op], other, one
 
@@ -143,7 +143,7 @@ def _compared(op: type[ast.cmpop], number: Interval, limit: Interval) -> _Entry:
 
 
 def _only(found: _Comparison, truths: Sequence[Truth], *, wanted: bool) -> _Comparison:
-    """Exempt entries for which the enclosing condition already has the required outcome."""
+    """Ignore entries for which the enclosing condition already has the required outcome."""
     of_each = truths if len(truths) == len(found.entries) else [*truths[:1]] * len(found.entries)
     entries = [
         entry._replace(truth=found.wanted) if truth is wanted else entry

@@ -1,7 +1,7 @@
-"""The results of an experiment, and their folder: tables, figures, claims, result.json.
+"""The results of an experiment and their folder, with tables, figures, claims and result.json.
 
 A result folder is built next to its final path and moved there when it is complete. result.json lists
-its content, so that nothing else is ever replaced with it.
+its files, and a folder with other files is never replaced.
 """
 
 import hashlib
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# Longer tables are not for reading and are written only as Parquet.
+# Longer tables are written only as Parquet, because they are too long to read as text.
 CSV_ROWS = 20_000
 # Increased when result.json changes incompatibly; a file without it has format 1.
 FORMAT = 1
 # The table of runs, in a result's folder.
 RUNS = Path("tables", "runs.parquet")
-# Run times of estimators, which differ in every run: next to result.json, and without a hash in it.
+# File of the estimators' run times, which differ in every run, so result.json has no hash of it.
 TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
-# The command that made a result; the report's opening depends on it.
+# The commands that make results; the report's opening depends on them.
 Kind = Literal["run", "sweep", "compare", "tune", "diagnose", "replay", "evaluate", "noise", "ellipsoid"]
 
 
@@ -58,12 +58,12 @@ class Outcome:
         input_sha256: a hash of the input data.
         parameters: those of all estimators, including defaults.
         bounds: the 95 % range of a metric if the estimator is consistent.
-        intervals: the 95 % interval of the true metric, from the spread over runs.
+        intervals: the 95 % interval of the true metric, from the variation over runs.
         alarms: warnings about the metrics.
         causes: why an estimator is inconsistent, if it was diagnosed.
         stress: the effect of changes that should not matter, if it was tested.
         timings: the seconds and messages of each estimator.
-        kind: the command that made it.
+        kind: the command that made the result.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -81,15 +81,15 @@ class Outcome:
     kind: Kind = "run"
 
     def measure(self, key: str, number: Interval) -> None:
-        """Store the value of an Interval `number`, and its ends, as the metric `key`."""
+        """Store the value of an Interval `number` as the metric `key`, and its ends as an interval."""
         self.metrics[key], self.intervals[key] = float(number.value), (number.low, number.high)
 
 
 class Result(Parameters):
     """The content of result.json.
 
-    `files` lists the files in the folder with their SHA-256; the hash of result.json itself is that
-    of its text without this entry. Files that depend on the clock have none: timelines, whose rows
+    `files` lists the files in the folder with their SHA-256. The hash of result.json itself is that of
+    its text without this entry. Files that depend on the clock have no hash: timelines, whose rows
     Rerun numbers by time, and `TIMINGS`. `bounds` are the 95 % ranges of metrics of a consistent
     estimator, `intervals` the 95 % intervals of the true metrics; `alarms` are warnings about the
     metrics, the worst first; `causes` explain why estimators are inconsistent, if diagnosed;
@@ -156,7 +156,7 @@ def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> d
 
 
 class Measured(NamedTuple):
-    """A metric's value, or a word for it, and its 95 % range if the estimator is consistent."""
+    """A metric's value, or a word instead of it, and its 95 % range if the estimator is consistent."""
 
     value: MetricValue | str = None
     bounds: Bounds | None = None
@@ -172,7 +172,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one case, by quantity and then estimator; all estimators in the same order."""
+    """The metrics of one case, by quantity and then estimator, always in the same order."""
 
     case: str
     estimators: list[str]
@@ -180,9 +180,9 @@ class MetricTable:
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """Read a table of a result's folder; raises BadInput if it is damaged.
+    """Read a table from a result's folder; raise BadInput if it is damaged.
 
-    Arrow itself cannot open file names outside the locale's encoding.
+    Arrow itself cannot open file names that the locale's encoding does not contain.
     """
     import pandas as pd
 
@@ -198,7 +198,7 @@ def metric_tables(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> list[MetricTable]:
-    """Group metrics by case; a table of runs adds the interval of the mean NEES over them."""
+    """Group metrics by case, and add the interval of the mean NEES if there is a table of runs."""
     over_runs = {} if runs is None else _nees_over_runs(runs)
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
     cases: dict[str, dict[str, dict[str, Measured]]] = {}
@@ -216,7 +216,7 @@ def metric_tables(
 def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
     """Compute the mean of the runs' NEES with its 95 % interval, by estimator and case.
 
-    Fewer than `FEWEST_RUNS` runs have none. A study may have a table of runs without NEES.
+    There is no interval for fewer than `FEWEST_RUNS` runs. A table of runs may lack the NEES.
     """
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}
@@ -230,10 +230,10 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
-    """Open a temporary folder next to `folder`; it replaces an earlier result if all goes well.
+    """Open a temporary folder next to `folder`, which replaces an earlier result after success.
 
-    Raises BadInput if `folder` is something other than one of our results, if another process is
-    filling it, or if it cannot be written.
+    Raises BadInput if `folder` is not a result of fuselog, if another process is filling it, or if it
+    cannot be written.
     """
     return whole_folder(folder, lambda found: require_ours(found, folder))
 
@@ -368,7 +368,7 @@ def keep(
 def read_result(folder: Path) -> Result:
     """Read the result.json of a result folder.
 
-    Raises BadInput if it is missing, damaged or of another format.
+    Raises BadInput if the file is missing, damaged or in another format.
     """
     path = folder / RESULT_FILE
     try:

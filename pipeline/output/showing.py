@@ -1,4 +1,4 @@
-"""Display of objects of the Python interface: a few lines of text, and tables in a notebook."""
+"""Display of objects of the Python interface, as a few lines of text or as tables in a notebook."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
 
 
 class Showing(ABC):
-    """An object that displays what `_shown` returns: as text, and as HTML in a notebook."""
+    """A base class of objects that display what `_shown` returns, as text or as HTML in a notebook."""
 
     @property
     @abstractmethod
@@ -64,7 +64,7 @@ def shown_metrics(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> Shown:
-    """Display metrics; several cases are summarised by their medians."""
+    """Format metrics for display; if there are several cases, show their medians."""
     return Shown(title, sentences, tables_of(metrics, bounds, runs, most_cases=1))
 
 

@@ -1,4 +1,4 @@
-"""Summaries of judged replays: metrics, tables, and charts of errors, modes, particles, delays."""
+"""Summaries of judged replays, with metrics, tables and charts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,7 +22,7 @@ def summarise(
     coverage: Sequence[Row] = (),
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Outcome:
-    """Summarise a judged replay: metrics, warnings, tables, figures, and the use of the log's topics.
+    """Summarise a judged replay in metrics, warnings, tables, figures and message counts.
 
     Args:
         judge: of all runs.
@@ -75,8 +75,7 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
 def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     """Draw RMSE and NEES over time for all runs together, with the 95 % band of a consistent estimator.
 
-    Each panel shows one estimator, and the panels of a row share their axes, so that curves never
-    overlap.
+    Each panel shows one estimator, so curves never overlap. The panels of a row share their axes.
     """
     first, table = judged[0]
     named = {
@@ -136,7 +135,7 @@ def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis
 
 
 def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
-    """Write an estimator's name, and the share of steps at which it is outside its interval."""
+    """Write an estimator's name and the share of steps at which the quantity is outside its interval."""
     known = steps[[quantity, low, low.replace("_low", "_high")]].dropna()
     if known.empty:
         return label
@@ -155,7 +154,7 @@ def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
 def _outside(
     steps: pd.DataFrame, quantity: str, low: "pd.Series[float]", high: "pd.Series[float]", axis: Axis
 ) -> list[Series]:
-    """Draw a strip along the bottom where a curve is outside its band."""
+    """Draw a strip along the bottom of a panel where a curve is outside its band."""
     is_out = (steps[quantity] < low) | (steps[quantity] > high)
     if not is_out.any() or axis.limits is None:
         return []
@@ -164,14 +163,14 @@ def _outside(
 
 
 def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:
-    """Draw a chart of the rows of each case."""
+    """Apply `draw` to the rows of each case, and return the charts."""
     if table.empty:
         return {}
     return {str(case): draw(rows, str(case)) for case, rows in table.groupby("case", sort=False)}
 
 
 def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
-    """Draw the mean probability of each mode over time, over all runs, one panel per estimator."""
+    """Draw the probability of each mode over time, averaged over all runs, one panel per estimator."""
     x, y = Axis(label="time (s)"), Axis(label="mean probability", limits=(0.0, 1.0))
     panels = {name: Panel(x=x, y=y, title=name) for name in modes["estimator"].unique()}
     for (name, mode, smoothed), rows in modes.groupby(["estimator", "mode", "smoothed"], sort=False):
@@ -184,7 +183,7 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
 
 
 def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
-    """Draw the mean effective share of the particles over time, over all runs."""
+    """Draw the effective share of the particles over time, averaged over all runs."""
     x, y = Axis(label="time (s)"), Axis(label="effective share", limits=(0.0, 1.0))
     series = [
         curve(str(name), rows["elapsed_s"], rows["effective_share"])
@@ -195,9 +194,9 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
 
 
 def late_counts(late: pd.DataFrame) -> pd.DataFrame:
-    """Count out-of-sequence messages: a row per estimator, case and outcome; see `Judge.late`.
+    """Count out-of-sequence messages, with a row per estimator, case and outcome; see `Judge.late`.
 
-    Each row has their mean delay in seconds, and how many messages were reprocessed because of them.
+    Each row contains the mean delay in seconds, and how many messages were reprocessed because of them.
     """
     rows = late.assign(late_s=late["late_s"] * late["messages"])
     if "repeated" in late:

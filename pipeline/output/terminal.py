@@ -1,6 +1,6 @@
-"""Progress bars and tables on the terminal. Standard output is for results only.
+"""Progress bars and tables on the terminal; standard output is for results only.
 
-Texts may come from a log or a file name, so terminal control characters are printed as visible codes.
+Texts from logs and file names may contain control characters, which are printed as visible codes.
 """
 
 import json
@@ -38,14 +38,14 @@ from fuselog.replay.judging.verdicts import Claimed
 if TYPE_CHECKING:
     import pandas as pd
 
-# With more cases, metrics are summarised; only files list each case.
+# With more cases than this, metrics are summarised, and only files list each case.
 MOST_CASES = 6
-# Interval of progress lines if standard error is not a terminal.
+# Interval between progress lines if standard error is not a terminal.
 TOLD_EVERY_S = 60.0
 
 
 def _console(*, stderr: bool) -> Console:
-    """Make a console for plain text, wide unless a terminal limits it."""
+    """Make a console for plain text that is as wide as the terminal, or very wide without a terminal."""
     console = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = 1000
@@ -64,11 +64,11 @@ class OnceAMinute:
         self.begin()
 
     def begin(self) -> None:
-        """Start the minute; called when a command begins."""
+        """Start the first minute; commands call this when they begin."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
-        """Write a line, unless another was written, or the command began, within the last minute."""
+        """Write a line, unless the last line or the start of the command was less than a minute ago."""
         now_s = monotonic()
         if now_s - self._last_s >= TOLD_EVERY_S:
             self._last_s = now_s
@@ -81,7 +81,7 @@ once_a_minute = OnceAMinute()
 def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:
     """Yield items with a progress bar on standard error, or one line a minute if it is not a terminal.
 
-    The title is converted to text again after every item, since it may report progress.
+    The title is converted to text again after every item, because it may report progress.
     """
     if not err.is_terminal:
         for done, item in enumerate(items, start=1):
@@ -113,12 +113,12 @@ def status() -> Iterator[Callable[[str], None]]:
 
 
 def say(text: str) -> None:
-    """Print a line; the terminal wraps it, so that paths stay whole."""
+    """Print a line without line breaks, so that paths stay whole."""
     out.print(printable(text), soft_wrap=True)
 
 
 def say_next(*words: str) -> None:
-    """Print the command that one would type next."""
+    """Suggest the next command."""
     say(f"next: {shlex.join(['fuselog', *words])}")
 
 
@@ -223,11 +223,12 @@ def print_metrics(
     runs: "pd.DataFrame | None" = None,
     details: str = "--json",
 ) -> None:
-    """Print metrics as tables: one per case, a row per quantity, a column per estimator.
+    """Print metrics as tables, one per case, with a row per quantity and a column per estimator.
 
-    A value with bounds is followed by them: the 95 % range of a consistent estimator. A table of
-    runs adds the mean NEES over them, see `metric_tables`, or why there is none. Many cases are
-    summarised in one table of medians; `details` names the place with each case.
+    A value with bounds is followed by them: the 95 % range of a consistent estimator. If there is a
+    table of runs, the mean NEES over the runs is added, or the reason why it is missing (see
+    `metric_tables`). Many cases are summarised in one table of medians; `details` names the place that
+    lists each case.
     """
     for title, columns, rows in tables_of(metrics, bounds, runs):
         print_table(columns, rows, title)
@@ -243,7 +244,7 @@ def tables_of(
     runs: "pd.DataFrame | None" = None,
     most_cases: int = MOST_CASES,
 ) -> list[PrintedTable]:
-    """Make the tables of metrics, see `print_metrics`; with more cases than `most_cases`, of medians."""
+    """Make the tables of metrics, or of their medians if there are more cases than `most_cases`."""
     tables = metric_tables(metrics, bounds, runs)
     is_summarised = _number_of_cases(metrics) > most_cases
     found = []
@@ -259,7 +260,7 @@ def tables_of(
 
 
 def _over_cases(tables: Sequence[MetricTable]) -> PrintedTable:
-    """Make a table of the median, minimum and maximum over cases: a row per quantity with numbers."""
+    """Make a table of the median, minimum and maximum over cases, with a row per quantity."""
     found: dict[str, dict[str, list[float]]] = {}
     for table in tables:
         for quantity, values in table.quantities.items():
@@ -292,7 +293,7 @@ def _with_bounds(measured: Measured) -> object:
 
 
 def print_pose_errors(metrics: Mapping[str, float]) -> None:
-    """Print APE and RPE: a row each, a column per statistic; then the numbers of poses and pairs."""
+    """Print APE and RPE with a column per statistic, then the numbers of poses and pairs."""
     rows: dict[str, dict[str, float]] = {}
     counts = []
     for key, value in metrics.items():
@@ -310,9 +311,9 @@ def print_pose_errors(metrics: Mapping[str, float]) -> None:
 def print_parameters(
     parameters: Mapping[str, Mapping[str, object]], stated: Mapping[str, Mapping[str, str]] | None = None
 ) -> None:
-    """Print the parameters of estimators by label: a row each, a column per estimator.
+    """Print the parameters of estimators, with a row per parameter and a column per estimator label.
 
-    Parameters that a log's channels state come last, with the topic of the channel.
+    Parameters from a log's channels come last, with the topic of the channel.
     """
     names = dict.fromkeys(name for values in parameters.values() for name in values)
     rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
@@ -322,7 +323,7 @@ def print_parameters(
 
 
 def print_worst(alarms: Sequence[Finding]) -> None:
-    """Print the worst warning about the numbers that follow."""
+    """Print the worst warning about the numbers that are printed next."""
     for alarm in alarms[:1]:
         say(f"doubtful: {alarm.sentence}")
 
@@ -336,7 +337,7 @@ def print_others(alarms: Sequence[Finding]) -> None:
 
 
 def print_claims(claims: Sequence[Claim]) -> None:
-    """Print the claims with the paper's and our numbers, after a line on claims without verdict."""
+    """Print the claims with the paper's and our numbers, after a line on claims without a verdict."""
     elsewhere = sum(claim.verdict == Claimed.NO_VERDICT for claim in claims)
     if elsewhere:
         say(

@@ -1,4 +1,4 @@
-"""Names of quantities and formats of numbers for people: `position_rmse_m` becomes "position error"."""
+"""Names of quantities and formats of numbers for readers: `position_rmse_m` becomes "position error"."""
 
 import math
 import re
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from fuselog.recorders.units import parted, written
 
 DIGITS = 3
-MOST_APART = 30.0  # largest ratio of numbers that share their number of decimals
+MOST_APART = 30.0  # largest ratio between numbers that are written with the same number of decimals
 # Typographic characters.
 MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
 
@@ -19,10 +19,10 @@ class Quantity(NamedTuple):
 
     Attributes:
         name: the usual name.
-        meaning: what it is, in a sentence.
-        group: the group of table rows that it belongs to.
+        meaning: a sentence that explains the quantity.
+        group: the group of table rows to which it belongs.
         unit: the unit in which it is stored; empty if it has none.
-        aim: the right value, if it is the same number for all estimators.
+        aim: the ideal value, if it is the same number for all estimators.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Quantity(NamedTuple):
 ACCURACY, CONSISTENCY, COST = "Accuracy", "Consistency", "Cost and failures"
 TRACKING, OTHER = "Targets and tracks", "Other quantities"
 _RMS = "Root mean square over all steps of all runs."
-# By key; the order is that of the table.
+# By key, in the order of the table.
 QUANTITIES: dict[str, Quantity] = {
     "position_rmse_m": Quantity("position error, RMS", f"Distance to the truth. {_RMS}", ACCURACY, "m"),
     "orientation_rmse_deg": Quantity(
@@ -115,7 +115,7 @@ LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "l
 
 
 def quantity(key: str) -> Quantity:
-    """Describe a quantity of a result; an unknown one by its own name in readable form.
+    """Describe a quantity of a result; make a readable name for an unknown one.
 
     >>> quantity("turn_rmse_radps").name, quantity("turn_rmse_radps").unit
     ('turn error, RMS', 'rad/s')
@@ -158,7 +158,7 @@ def meaning_alone(text: str) -> str:
 
 
 class Scale(NamedTuple):
-    """A display unit for numbers: the factor they are multiplied by, and the unit's sign."""
+    """A unit for the display of numbers, with its sign and the factor that converts them."""
 
     factor: float = 1.0
     sign: str = ""
@@ -208,7 +208,7 @@ def _sign(unit: str) -> str:
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:
-    """Format a number for people: `digits` digits, no e, a true minus, commas in thousands.
+    """Format a number with `digits` digits, without an exponent "e", with commas in thousands.
 
     >>> [number(each) for each in (0.0266714, -7514.7, 3.0, 1e-7, 0.99999, None)]
     ['0.0267', '−7,515', '3', '1 × 10⁻⁷', '1', '–']
@@ -226,7 +226,7 @@ def number(value: float | None, digits: int = DIGITS) -> str:
 
 
 def stated(value: float) -> str:
-    """Format a number that a person set as it was set: 0.05, not 0.0500."""
+    """Format a number as a person wrote it in a setting: 0.05, not 0.0500."""
     return f"{value:.4g}".replace("-", MINUS) if 1e-4 <= abs(value) < 1e6 else number(value)
 
 
@@ -265,7 +265,7 @@ def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str
 
 
 def count(number_of: int, one: str, many: str = "") -> str:
-    """Format a number of things.
+    """Format a number of things with the singular or the plural.
 
     >>> count(1, "run"), count(1200, "run")
     ('1 run', '1,200 runs')

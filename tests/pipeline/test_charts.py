@@ -237,7 +237,7 @@ def test_a_comparison_has_the_difference_of_the_second_less_the_first() -> None:
         for at, name in ((1.0, "position_rmse_m"), (5.0, "nees"))
     )
     chart = difference_chart(rows)
-    assert chart.title == "robot1: ukf less ekf, with 95 % over the runs"
+    assert chart.title == "robot1: ukf minus ekf, with 95 % intervals over the runs"
     wanted = {
         f"difference of {name} over time (s)": {
             "ukf - ekf": [TIMES, at + TIMES],

@@ -1,4 +1,4 @@
-"""The C code of a filter, its header and its source, from the graphs of its steps.
+"""The C code of a filter, its header and its source, generated from the graphs of its steps.
 
-Begin reading in `filter`, which writes the functions; `algebra` is the update that all have in common.
+Begin with `filter`, which writes the functions; `algebra` contains the update that all filters share.
 """

@@ -1,10 +1,10 @@
 """The Kalman update in C, with the same operations as `fuselog.replay.inference.kalman.update`.
 
-`UPDATE` is the update of all filters except iterated ones, which have `ITERATE`; both call `ALGEBRA`.
+`UPDATE` is the update of all filters except iterated ones, which use `ITERATE`. Both call `ALGEBRA`.
 Square-root forms have their own update and use only `COMMON`.
 
-NAME, T and M stand for the filter's name, the size of its tangent space, and the most components of a
-sensor; REAL, and _S at the end of numbers and functions of libm, stand for the precision.
+NAME, T and M are placeholders for the filter's name, the size of its tangent space, and the largest
+number of components of a sensor. REAL and the suffix _S are placeholders for the precision.
 """
 
 CHOLESKY = """/* A = L L' in place, for the first `size` rows and columns; 0 if A is indefinite. */

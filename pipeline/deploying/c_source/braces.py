@@ -1,4 +1,4 @@
-"""Braces around the bodies of conditions and loops in C, so that templates can omit them."""
+"""Insertion of braces around the bodies of conditions and loops in C, which templates omit."""
 
 import re
 
@@ -7,14 +7,14 @@ _COMMENT = re.compile(r"\s*/\*.*\*/$")
 
 
 def braced(text: str) -> str:
-    """Put every body of an `if`, `else`, `for` and `while` in braces.
+    """Put braces around every body of an `if`, `else`, `for` and `while`.
 
     Args:
-        text: C code with bodies on lines of their own, indented more than their heads.
+        text: C code with bodies on separate lines, indented more than their heads.
     """
     found: list[str] = []
-    opened: list[int] = []  # indents of the heads whose bodies got a brace here
-    balance = head = 0  # open parentheses, and the indent of the head that they belong to
+    opened: list[int] = []  # indents of the heads whose bodies have an open brace
+    balance = head = 0  # number of open parentheses, and the indent of the head to which they belong
     for line in text.split("\n"):
         indent = len(line) - len(line.lstrip())
         if balance == 0 and line.strip() and line[0] != "#":

@@ -1,6 +1,6 @@
-"""Square-root forms in C, with the operations of `fuselog.replay.inference.kalman.square_root`.
+"""Square-root forms in C, with the same operations as `fuselog.replay.inference.kalman.square_root`.
 
-Names are those of `algebra`; ROWS and COLUMNS are the largest size of an array to be factorised.
+Placeholders are those of `algebra`; ROWS and COLUMNS are the size of the largest array to factorise.
 """
 
 FACTORISING = """\

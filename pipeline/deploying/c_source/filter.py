@@ -1,4 +1,4 @@
-"""The source of a filter in C99, written from the graphs of its steps."""
+"""The source of a filter in C99, generated from the graphs of its steps."""
 
 import math
 import re
@@ -34,7 +34,7 @@ from fuselog.replay.tracing.c_text import Precision, c_lines, helpers_of
 from fuselog.replay.tracing.functions import trace
 from fuselog.replay.tracing.graph import Graph, needed
 
-IN_SINGLE = 5e-7, 3e-11  # for ROUNDING and NOTHING_LEFT: the same multiple of rounding, and its square
+IN_SINGLE = 5e-7, 3e-11  # ROUNDING is this multiple of the rounding error, NOTHING_LEFT its square
 
 
 def source(made: CFilter) -> str:
@@ -66,7 +66,7 @@ _FUNCTION = re.compile(
 
 
 def _without_unused(text: str) -> str:
-    """Remove functions that nothing calls, and those that only these call."""
+    """Remove functions that are never called, and those that only these functions call."""
     for found in reversed([*_FUNCTION.finditer(text)]):
         if len(re.findall(rf"\b{found[1]}\(", text)) == 1:
             text = text[: found.start()] + text[found.end() :]
@@ -107,7 +107,7 @@ _COPY = """\
 """
 
 
-# a small processor computes in `float`, and tests the bits of a `double` faster than it adds them
+# a small processor tests the bits of a `double` faster than it adds; `float` it adds in hardware
 _FINITE = """\
 /* Whether numbers are finite: no exponent has all of its bits set. */
 static int is_finite(const double *numbers, int count)
@@ -161,7 +161,7 @@ def _init(made: CFilter) -> str:
         f"    filter->control[{index}] = {made.precision.number(value)};\n"
         for index, value in enumerate(control)
     )
-    if made.is_interpolated:  # the control from the prior on is unknown before its first message
+    if made.is_interpolated:  # the control between the prior and its first message is unknown
         unknown = made.precision.number(math.nan)
         driven = "".join(f"    filter->control[{index}] = {unknown};\n" for index in range(len(control)))
         driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""

@@ -1,4 +1,4 @@
-"""The header of a filter in C99: types, names of components, functions."""
+"""The header of a filter in C99, with types, names of components and functions."""
 
 from collections.abc import Iterator, Sequence
 

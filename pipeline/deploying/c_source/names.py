@@ -1,4 +1,4 @@
-"""Names, sizes and numbers of a filter in C99, and the templates that they fill in."""
+"""Names, sizes and numbers of a filter in C99, and the templates that they fill."""
 
 import re
 from dataclasses import replace
@@ -25,14 +25,14 @@ stdout tan tanh time trunc y0 y1 yn vectors cortex_m4f"""
 
 
 class CFilter(NamedTuple):
-    """A filter to be written as C.
+    """A filter that is to be written as C.
 
     Attributes:
-        name: the prefix of its names in C.
+        name: the prefix of its identifiers in C.
         filtering: the filter, bound to a log.
         steps: its steps.
         precision: the precision of its numbers.
-        origin: what it was made from, in words.
+        origin: description of what it was made from.
     """
 
     name: str
@@ -59,24 +59,24 @@ class CFilter(NamedTuple):
 
     @property
     def is_root(self) -> bool:
-        """Test whether it carries a factor of the covariance, not the covariance itself."""
+        """Test whether the filter stores a factor of the covariance, not the covariance itself."""
         return self.filtering.form is FACTORS
 
     @property
     def is_interpolated(self) -> bool:
-        """Test whether the motion gets the mean of the controls at both ends of a step."""
+        """Test whether the motion uses the mean of the controls at both ends of a step."""
         control = self.filtering.bound_model.model.control
         return control is not None and control.interpolated
 
     @property
     def has_gaps(self) -> bool:
-        """Test whether its control may be silent for so long that nothing is known meanwhile."""
+        """Test whether the control may be missing for so long that the state becomes unknown."""
         control = self.filtering.bound_model.model.control
         return control is not None and bool(control.gap)
 
     @property
     def sensors(self) -> list[tuple[str, Sensor]]:
-        """Return the sensors with their names in C; several topics of a kind have separate names."""
+        """Return the sensors with their names in C; topics of the same kind have separate names."""
         found: dict[str, Sensor] = {}
         topics: dict[str, set[str]] = {}
         for sensor, topic in self.filtering.found.sensors:
@@ -143,7 +143,7 @@ class CFilter(NamedTuple):
 
 
 def identifier(name: str) -> str:
-    """Convert a name to an identifier of C: lower case, without the slashes of topics."""
+    """Convert a name to a C identifier in lower case, without the slashes of topics."""
     text = re.sub(r"\W+", "_", name.strip("/")).lower()
     return (
         f"{text}_"
@@ -162,7 +162,7 @@ def _read(step: Step) -> set[str]:
 
 
 def filled(made: CFilter, template: str) -> str:
-    """Fill the names and sizes of a filter into a template."""
+    """Fill a template with the names and sizes of a filter."""
     text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
     text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
     return made.precision.text(text)

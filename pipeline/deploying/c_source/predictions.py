@@ -1,4 +1,4 @@
-"""The predicting functions of a filter in C: over a step, between two controls, over a gap."""
+"""The prediction functions of a filter in C: over a step, between two controls, over a gap."""
 
 import re
 
@@ -132,7 +132,7 @@ def _factorising(made: CFilter, columns: int) -> list[str]:
 
 
 def _pass_gap(made: CFilter) -> str:
-    """Write the prediction over a gap of the control, after which it continues."""
+    """Write the prediction over a gap of the control, after which the filter continues."""
     step, t = made.steps.gap, made.tangent
     assert step is not None
     names, declared = Inputs(made, "motion").names(step, "control")
@@ -145,7 +145,7 @@ def _pass_gap(made: CFilter) -> str:
 
 
 def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
-    """Write the body of a prediction, with declarations of what its lines use."""
+    """Write the body of a prediction, with declarations of the variables that its lines use."""
     text = "\n".join([*declared, *lines])
     real, span = made.precision.real, "seconds(filter->time_ns, time_ns)"
     used = {

@@ -1,7 +1,7 @@
 """Products of covariances with Jacobians in C, as loops over entries that are not known to be zero.
 
-Sums keep the order of `fuselog.replay.inference.linear_algebra.sparse`. Names are those of `algebra`;
-`columns` lists the columns of a matrix row by row, and each row ends with -1.
+Sums have the same order as in `fuselog.replay.inference.linear_algebra.sparse`. Placeholders are those
+of `algebra`. `columns` lists the columns of a matrix row by row; each row ends with -1.
 """
 
 from collections.abc import Mapping
@@ -112,7 +112,7 @@ _TIMES_FACTOR = """\
 
 
 def slope_text(*, is_root: bool) -> str:
-    """Write the slope of the state along its curvature, from a covariance or from its factor."""
+    """Write the direction in which the curved state changes, from a covariance or its factor."""
     return SLOPE.replace("PRODUCT", _TIMES_FACTOR if is_root else _TIMES)
 
 
@@ -131,6 +131,6 @@ def columns_text(name: str, columns: list[list[int]], size: str) -> str:
 
 
 def turn_text(factors: str, *, is_root: bool) -> str:
-    """Write the rotation of a covariance with an orientation; that of a factor is one-sided."""
+    """Write the rotation of a covariance with an orientation; for a factor, it is one-sided."""
     what, sides = ("A factor P = J P", "1") if is_root else ("P = J P J'", "2")
     return TURN.replace("WHAT", what).replace("SIDES", sides).replace("FACTORS\n", factors)

@@ -1,7 +1,7 @@
 """Functions at weighted samples in C, as in `fuselog.replay.inference.kalman.regression`.
 
-Names are those of `algebra`. SAMPLES, DRAWN, VALUES and PLACES are the largest numbers of samples, of
-numbers in one, and of tangent components and components of a function's values.
+Placeholders are those of `algebra`. SAMPLES is the largest number of samples, DRAWN of numbers in a
+sample, VALUES of tangent components, and PLACES of components of a function's values.
 """
 
 import re
@@ -162,7 +162,7 @@ static void find_moments(const drawn_samples *samples, int count, const REAL *we
 
 
 def samples_text(made: CFilter) -> list[str]:
-    """Write tables of samples, and the functions of motion and sensors at samples."""
+    """Write the tables of samples, and the functions of motion and sensors at samples."""
     functions = [each for each in made.steps.sampled if each is not None]
     if not functions:
         return []
@@ -189,7 +189,7 @@ def samples_text(made: CFilter) -> list[str]:
 
 
 def _narrowing(made: CFilter, sampled: SampledFunction) -> list[str]:
-    """Write the functions that keep samples within half a turn; none without angles in the state."""
+    """Write the functions that keep angles of samples within half a turn; none without angles."""
     if not sampled.turns:
         return []
     first, width, times = zip(*sampled.turns, strict=True)
@@ -236,7 +236,7 @@ def weighed(sampled: SampledFunction) -> str:
 
 
 def sampling_call(made: CFilter, number: int) -> str:
-    """Write the call that fills `samples` with the results of the motion (0) or a sensor."""
+    """Write the call that evaluates the motion (0) or a sensor at `samples`."""
     return _sampling(made, number)[1]
 
 
@@ -305,7 +305,7 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
 def _in_loop(
     made: CFilter, named: dict[str, Node], names: dict[Any, str], varying: Collection[int]
 ) -> tuple[list[str], list[str]]:
-    """Write the lines of a loop over samples, and before it those that are the same for all samples.
+    """Write the lines of a loop over samples, preceded by lines that are the same for all samples.
 
     `varying` are the arguments that differ from sample to sample.
     """
@@ -316,7 +316,7 @@ def _in_loop(
 
 
 def _settling(made: CFilter, number: int) -> list[str]:
-    """Write the iteration in which a centre becomes the mean of values with angles or orientations."""
+    """Write the iteration that moves a centre to the mean of values with angles or orientations."""
     sampled, name = made.steps.sampled[number], made.parts[number]
     assert sampled is not None
     if sampled.recentre is None:

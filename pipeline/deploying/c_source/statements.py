@@ -1,4 +1,4 @@
-"""The names, declarations and loops from which the functions of a filter in C are made."""
+"""The names, declarations and loops of which the functions of a filter in C consist."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -71,7 +71,7 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
 
 
 class Loops(NamedTuple):
-    """Loops: declarations, the graph's results that they need, and the calls."""
+    """Loops, with their declarations, the results of the graph that they need, and their calls."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -82,11 +82,11 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
     """Write the products with a step's Jacobian, and the sum with its noise.
 
     Args:
-        step: a step that gives the Jacobian, G and u, N.
+        step: a step that returns the Jacobian, G and u, N.
         jacobian: the name of the Jacobian, F or H.
         rows: its number of rows.
         multiply: the call that forms the product.
-        into: the matrix that becomes the product.
+        into: the matrix that receives the product.
         what: `states` or `components`, for the size of that matrix.
     """
     size = "T" if what == "states" else "M"
@@ -121,7 +121,7 @@ def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
 
 
 def entries(step: Step, array: str) -> dict[str, Node]:
-    """Name the entries of an array that a step gives, as in C."""
+    """Name the entries of an array that a step returns, as they are named in C."""
     return {
         array + "".join(f"[{each}]" for each in place): node
         for (name, place), node in step.outputs.items()
@@ -135,14 +135,14 @@ def count_gains(step: Step) -> int:
 
 
 def turned_axes(made: CFilter) -> list[int]:
-    """List the first axes of orientations with which the covariance is rotated."""
+    """List the first axes of the orientations with which the covariance is rotated."""
     model = made.filtering.bound_model.model
     blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
     return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
 
 
 def retriangulates(made: CFilter) -> bool:
-    """Test whether a correction rotates the covariance, so that its factor is no longer triangular."""
+    """Test whether a correction rotates the covariance, which makes its factor non-triangular."""
     model = made.filtering.bound_model.model
     return bool(made.sensors) and model.correct is None and not is_flat(model.kinds)
 

@@ -1,4 +1,4 @@
-"""The updating functions of a filter in C: what sensors measure, how the state moves."""
+"""The update functions of a filter in C, which correct the state with measurements."""
 
 import re
 
@@ -23,7 +23,7 @@ from fuselog.replay.tracing.c_text import c_lines
 
 
 def correcting_text(made: CFilter) -> list[str]:
-    """Write the functions that move the state and find its curvature."""
+    """Write the functions that correct the state and find its curvature."""
     if not made.sensors:
         return []
     step, direction = made.steps.correct, made.steps.direction
@@ -62,7 +62,7 @@ def correcting_text(made: CFilter) -> list[str]:
 
 
 def _bending(made: CFilter, text: str) -> str:
-    """Write the calls for curvature, or remove them if nothing is curved."""
+    """Write the calls for curvature, or remove them if the state is not curved."""
     if made.steps.direction is not None:
         return text.replace("FIND_SLOPE;", filled(made, "REAL slope[T];\n    bend(filter, slope);"))
     text = re.sub(r"\n *FIND_SLOPE;", "", text)
@@ -70,7 +70,7 @@ def _bending(made: CFilter, text: str) -> str:
 
 
 def algebra_text(made: CFilter) -> list[str]:
-    """Write the update that all sensors have in common."""
+    """Write the part of an update that all sensors share."""
     if not made.sensors:
         return []
     if made.is_root:
@@ -138,7 +138,7 @@ def update_text(made: CFilter, number: int) -> str:
 
 
 def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
-    """Write the innovation of a sensor: its loops with their declarations, and the lines."""
+    """Write the innovation of a sensor, as loops with their declarations and lines."""
     (name, sensor), step = made.sensors[number], made.steps.innovate[number]
     m, t, sampled = len(sensor.measured), made.tangent, made.steps.sampled[number + 1]
     into = "noise" if made.is_root else "S"

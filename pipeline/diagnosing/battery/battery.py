@@ -1,6 +1,6 @@
 """A benchmark of how often a diagnosis names the planted fault of a car's log first.
 
-Faults of the inertial unit are found without a filter.
+Faults of the inertial unit are found without running a filter.
 """
 
 import re
@@ -27,11 +27,11 @@ from fuselog.recorders.checks.lint import compared
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
 UNIT, VELOCITY = "/car/inertial", "/car/velocity"
-UNIT_RUNS = 5  # runs of each fault of the unit per run of a cell: they take a tenth of the time
+UNIT_RUNS = 5  # runs of each fault of the unit per run of a cell; they take a tenth of the time
 
 
 class Right(NamedTuple):
-    """The diagnosis that is right: kind, topic, component, and the number if there is one."""
+    """The correct diagnosis, with kind, topic, component, and the value if there is one."""
 
     kind: Kind
     topic: str
@@ -67,7 +67,7 @@ RIGHT: dict[str, Sequence[Right]] = {
 }
 
 # Standard deviations of the reference implementation's estimates over runs, with and without a compass;
-# for noise, those of the logarithm of a sigma, which is half of that of a variance.
+# for noise, those of the logarithm of a standard deviation.
 SPREADS: dict[str, tuple[float, float]] = {
     "fixes .3 s late": (0.00685, 0.0113),
     "turn rate's sign": (0.0056, 0.00616),
@@ -99,7 +99,7 @@ UNIT_RIGHT: dict[str, tuple[Kind, str, float] | None] = {
     "E, N exchanged": ("sign", VELOCITY, -1.0),
 }
 
-# Two faults together, each of which hides how large the other is.
+# Pairs of faults in which each fault hides the size of the other.
 PAIRS = (
     ("speed x 3.6", "fixes 18 s late"),
     ("E, N exchanged", "speed / 3.6"),
@@ -119,13 +119,13 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return the fault and what the log has in addition."""
+        """Return the names of the fault and of the additional sensors."""
         more = [*["compass"] * self.has_compass, *["prior"] * self.has_prior]
         return ", ".join([self.fault, *more])
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """Yield all faults with a compass and, unless they concern the compass, without one."""
+    """Yield all faults with a compass, and without one unless the fault concerns the compass."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):
@@ -169,7 +169,7 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
 
 
 def unit_tried(fault: str, seed: int) -> dict[str, Any]:
-    """Plant a fault in the unit's log and test whether it is found without a filter."""
+    """Plant a fault in the unit's log, and test whether it is found without a filter."""
     found = compared(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
     right = UNIT_RIGHT[fault]
     named = [(each.kind, each.where) for each in found]
@@ -179,12 +179,12 @@ def unit_tried(fault: str, seed: int) -> dict[str, Any]:
         "findings": len(named),
         "is_first": named[:1] == [right[:2]] if right else not named,
         "first": " ".join(named[0]) if named else "",
-        "value": abs(found[0].value) if found else np.nan,  # for half a turn the sign has no meaning
+        "value": abs(found[0].value) if found else np.nan,  # the sign of half a turn has no meaning
     }
 
 
 def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False) -> dict[str, Any]:
-    """Plant several faults in a log with a compass and test whether three causes name all of them."""
+    """Plant several faults in a log with a compass, and test whether the causes name all of them."""
     log = recorded(faulty(seed, *faults), has_prior=has_prior)
     found = seek(log, "ekf", OPEN, 3)
     named = {one[:3] for cause in found.causes for one in named_by(cause)}
@@ -198,7 +198,7 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
 
 
 def named_by(cause: Cause) -> Iterator[Right]:
-    """Yield what a cause names, with alternatives that the log does not distinguish."""
+    """Yield the names of a cause, including alternatives that the log does not distinguish."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for estimate in each.numbers:
@@ -211,7 +211,7 @@ def results(
 ) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
     """Compute tables and metrics over all cells with and without a prior, all pairs, and the unit.
 
-    The unit gets more seeds than the others.
+    There are more seeds for the unit than for the other logs.
     """
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:
@@ -250,7 +250,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Count, by cell, runs whose fault is named first, and those whose number is within 4 sigma."""
+    """Count, by cell, the runs whose fault is named first, and those whose value is within 4 sigma."""
     found = {
         f"diagnosis.battery_{quantity}.{case_of(row['cell'])}": float(row[quantity])
         for row in summary(rows).to_dict("records")
@@ -268,7 +268,7 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
-    """Compute by fault how often the unit's fault is found first, and the number's mean and spread."""
+    """Count, by fault, how often the unit's fault is found first, with the value's mean and spread."""
     found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
     for fault, own in rows.groupby("fault", sort=False):
         found[f"diagnosis.unit_first.{case_of(str(fault))}"] = float(own["is_first"].sum())

@@ -1,7 +1,7 @@
 """Faults in logs of a car that drives after 10 s at rest, with or without a prior.
 
-Faults of the car and of an inertial unit on it are selected by name. They change the columns directly,
-not with the alterations by which a diagnosis corrects them.
+Faults of the car and of its inertial unit are selected by name. They change the columns directly, not
+with the alterations with which a diagnosis corrects them.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ CLEAN: dict[str, Any] = {
 
 
 def drive(seed: int, **changed: float) -> Car:
-    """Simulate the car without a fault; `changed` are parameters of the simulation."""
+    """Simulate a car without faults; `changed` contains parameters of the simulation."""
     return simulated(CarParameters(**{**CLEAN, **changed}), philox(seed))._replace(seed=seed)
 
 
@@ -36,12 +36,12 @@ def drive(seed: int, **changed: float) -> Car:
 
 
 def late(by_s: float) -> Callable[[Car], Car]:
-    """Make fixes report where the antenna was `by_s` earlier."""
+    """Make a fault by which fixes report the position of the antenna `by_s` earlier."""
     return lambda car: _seen(car._replace(fix_late_s=by_s), car)
 
 
 def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
-    """Make fixes report an antenna away from the car's reference point."""
+    """Make a fault by which fixes report an antenna away from the car's reference point."""
     return lambda car: _seen(car._replace(lever_m=(forward_m, left_m)), car)
 
 
@@ -91,12 +91,12 @@ FAULTS: dict[str, Callable[[Car], Car]] = {
 
 
 def faulty(seed: int, *names: str) -> Car:
-    """Simulate the car with one or several of the `FAULTS`, applied in order."""
+    """Simulate the car with one or more of the `FAULTS`, applied in order."""
     return reduce(lambda car, name: FAULTS[name](car), names, drive(seed))
 
 
 def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
-    """Make a log of the car, which `fl.write` can write; a prior is centred on the true start."""
+    """Make a log of the car, in a form that `fl.write` accepts; a prior is centred on the true start."""
     return source(streams_of(car, has_compass=has_compass, has_prior=has_prior))
 
 
@@ -106,7 +106,7 @@ def source(streams: list[Stream]) -> MemorySource:
 
 
 def car(seed: int, stated: float = 1.0) -> MemorySource:
-    """Make a log without a compass whose fixes state `stated` times their true variance."""
+    """Make a log without a compass, in which fixes state `stated` times their true variance."""
     clean = drive(seed)
     return recorded(clean._replace(fix_variance_m2=stated * clean.fix_variance_m2), has_compass=False)
 
@@ -115,7 +115,7 @@ def car(seed: int, stated: float = 1.0) -> MemorySource:
 
 
 class Unit(NamedTuple):
-    """Samples of an inertial unit on the car, and a receiver's east and north velocities (m, 2)."""
+    """Samples of an inertial unit on the car, and the east and north velocities (m, 2) of a receiver."""
 
     sample_s: Floats
     force_mps2: Floats
@@ -149,7 +149,7 @@ def ride(seed: int) -> Unit:
 
 
 def remapped(*axes: tuple[int, int]) -> Callable[[Unit], Unit]:
-    """Make a fault that maps each axis of the specific force to another axis with a sign."""
+    """Make a fault that maps each axis of the specific force to another axis or its opposite."""
 
     def put(unit: Unit) -> Unit:
         return unit._replace(

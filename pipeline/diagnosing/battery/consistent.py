@@ -1,7 +1,7 @@
-"""A count of causes that are named in logs of the car without any fault, for many ratios of noise.
+"""A count of the causes that are named in logs of the car without faults, for many noise ratios.
 
-The wheels have the noise of `car`. Their error between two fixes is a multiple of a fix's error, and
-between two headings a multiple of a heading's error; the options list these ratios.
+The wheels have the noise of `car`. Their error between two fixes is a multiple of the error of a fix,
+and between two headings a multiple of the error of a heading. The options list these ratios.
 """
 
 from itertools import product
@@ -21,11 +21,11 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 
 class FalseCausesOptions(Parameters):
-    """Options of the study: noise ratios, each combined with each of the other list.
+    """Options of the study: lists of noise ratios, of which all combinations are used.
 
     Attributes:
         to_fix: ratios of the wheels' error between two fixes to the error of a fix.
-        to_compass: ratios of their error between two headings to that of a heading; 0 stands for no
+        to_compass: ratios of their error between two headings to that of a heading; 0 means no
             compass.
     """
 
@@ -64,7 +64,7 @@ def log_of(ratios: Ratios, seed: int) -> MemorySource:
 
 
 def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
-    """Search for a cause in a log without a fault; its name is empty if none is found."""
+    """Search for a cause in a log without faults; its name is empty if none is found."""
     found = seek(log_of(ratios, seed), "ekf", {"kind": "ekf", "gate_probability": 1.0}, 1)
     named = [cause.hypothesis.name for cause in found.causes]
     return {**ratios._asdict(), "seed": seed, "cause": named[0] if named else ""}

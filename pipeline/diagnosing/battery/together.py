@@ -1,6 +1,6 @@
-"""A count of how often several faults planted in a car's log are all named, with their values.
+"""A count of how often several faults in a car's log are all named, with their correct values.
 
-The logs have a compass and a prior, so that most faults can be distinguished.
+The logs have a compass and a prior, so most faults can be distinguished.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ from fuselog.replay.judging.intervals import Interval
 
 PAIRS, TRIPLES = 135, 40
 AXES = "E, N exchanged"
-# The quantity that each fault changes. Two faults of one quantity hide each other, such as opposite
-# factors.
+# The quantity that each fault changes. Faults of the same quantity, such as opposite factors, hide each
+# other.
 FIELDS: dict[str, Sequence[str]] = {
     "stamps of fixes": ("fixes .3 s late", "fixes 18 s late"),
     "turn rate": ("turn rate's sign", "degrees as radians", "gyro bias .02", "gyro bias .0004 t"),
@@ -38,11 +38,11 @@ FIELDS: dict[str, Sequence[str]] = {
     "noise of turns": ("gyro density / 5",),
     "compass": ("compass + 4.5 deg", "compass clockwise from north"),
 }
-# Any two of these amount to the third: each mirrors one of turn rate, position and heading.
+# Any two of these have the effect of the third: each mirrors turn rate, position or heading.
 MIRRORS = {"turn rate's sign", AXES, "compass clockwise from north"}
 # Fixes that are 3.6 times too far apart explain both: they also look 3.6 times noisier.
 ALIKE = {"speed / 3.6", "fix variance / 16"}
-# Lost messages are found by the stamps, and "nothing" is no fault.
+# Lost messages are found from the stamps, and "nothing" is not a fault.
 NOT_PAIRED = {"nothing", "half of the odometry lost"}
 
 
@@ -58,7 +58,7 @@ class TogetherOptions(Parameters):
     triples: Annotated[int, Field(ge=1, le=TRIPLES)] = TRIPLES
 
     def sets(self) -> list[tuple[str, ...]]:
-        """Return the pairs, followed by the triples."""
+        """Return the sets of faults, first the pairs and then the triples."""
         return [*pairs()[: self.pairs], *triples()[: self.triples]]
 
 
@@ -68,14 +68,14 @@ def pairs() -> list[tuple[str, ...]]:
 
 
 def triples() -> list[tuple[str, ...]]:
-    """Return a fixed random choice of triples whose faults a log can distinguish in pairs."""
+    """Return a random but fixed choice of triples whose faults a log can distinguish in pairs."""
     every = [each for each in combinations(_in_order(), 3) if _is_told(each)]
     chosen = philox(63).choice(len(every), TRIPLES, replace=False)
     return [every[place] for place in sorted(chosen.tolist())]
 
 
 def _in_order() -> list[str]:
-    """Return the faults in the order in which they are planted: axes are swapped last."""
+    """Return the faults in the order in which they are planted; swapped axes come last."""
     return sorted((name for name in FAULTS if name not in NOT_PAIRED), key=lambda name: name == AXES)
 
 
@@ -86,7 +86,7 @@ def _is_told(faults: Sequence[str]) -> bool:
 
 
 def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
-    """Plant faults, and test whether causes name them with intervals that cover the values."""
+    """Plant faults, and test whether causes name them with intervals that cover the true values."""
     log = recorded(faulty(seed, *faults), has_prior=True)
     causes = seek(log, "ekf", OPEN, MOST_SENTENCES).causes
     planted = [RIGHT[name][0] for name in faults]
@@ -110,7 +110,7 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def _estimate(causes: Sequence[Cause], right: Right) -> Interval | None:
-    """Return the number that causes give for a planted fault, under any name; logarithms for noise."""
+    """Return the value that causes give for a planted fault, under any name; a logarithm for noise."""
     for cause in causes:
         for each in (cause, *cause.others):
             for number in each.numbers:
@@ -138,7 +138,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _seeds(experiment: Experiment, case: int) -> range:
-    """Return the seeds of a case; logs of one seed would share their noise, and so their misses."""
+    """Return the seeds of a case; logs with the same seed would have the same noise and errors."""
     first = experiment.seed + case * experiment.runs
     return range(first, first + experiment.runs)
 

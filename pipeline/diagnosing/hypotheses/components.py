@@ -1,4 +1,4 @@
-"""Hypotheses on the numbers read from a topic: factors, signs, biases, axes, conventions."""
+"""Hypotheses on the numbers that are read from a topic: factors, signs, biases, axes, conventions."""
 
 from collections.abc import Iterator
 from itertools import combinations
@@ -23,10 +23,11 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.units import mistaken, unit_of
 from fuselog.replay.engine.replaying.estimator import Reading
 
-FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
+FACTORS = (-0.02, 0.02, -0.4, 0.4)  # first values of the search for a logarithm
 ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)
 TURNS_RAD = (0.5 * np.pi, -0.5 * np.pi, np.pi)
-SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # shares of the variation of the numbers
+# first values of the search, relative to the variation of the numbers
+SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)
 LARGEST_FACTOR = 12.0  # a logarithm
 
 
@@ -58,17 +59,17 @@ def of_components(
             continue
         whole = Entry(field, None, field, False, None, 1.0)
         yield _factor(stream.topic, whole, 0.0 if is_control else len(places), None)
-        if len(places) > 2:  # for two axes this is half a turn
+        if len(places) > 2:  # two swapped axes amount to half a turn
             yield _sign(stream.topic, whole)
         for pair in combinations(places, 2):
             yield _exchange(stream.topic, field, pair)
 
 
 class _Own(NamedTuple):
-    """The parameters of a number of a topic: its bias and its factor.
+    """The parameters for the bias and the factor of a topic's number.
 
-    A bias of the number is multiplied by `bias_sign` to give that of the parameter, whose value is
-    `bias_value`.
+    A bias of the number is multiplied by `bias_sign` to obtain the change of the parameter, which has
+    the value `bias_value`.
     """
 
     bias: str

@@ -1,4 +1,4 @@
-"""Hypotheses on identifiers: two numbers of a map, or two topics, are swapped."""
+"""Hypotheses that two numbers of a map, or two topics, are swapped."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -16,7 +16,7 @@ from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 SUSPECT = 2.0  # mean NIS per component above which numbers may be swapped
-SUSPECTS = 12  # number of suspects of which all pairs are tried
+SUSPECTS = 12  # number of suspects; all pairs of them are tried
 
 
 def of_numbers(
@@ -55,12 +55,12 @@ def of_numbers(
 
 
 def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
-    """Make a function that swaps the messages of two topics in a trial."""
+    """Make a function that swaps the messages of two topics back in a trial."""
     return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Choose the parts with the largest mean NIS, if any is too large."""
+    """Choose the parts with the largest mean NIS, if it is too large."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

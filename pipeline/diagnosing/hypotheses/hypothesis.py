@@ -1,4 +1,4 @@
-"""The definition of a hypothesis: one possible fault, and how to correct it."""
+"""The definition of a hypothesis, which is a possible fault with its correction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,15 +16,16 @@ from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters, field_of
 from fuselog.replay.engine import chi2
 
-Number = Any  # a float, or a tuple of floats for a fault of several numbers
+Number = Any  # a float, or a tuple of floats for a fault with several values
 NOISES = ("measurement noise", "process noise")
-COMPONENTS = 3  # of a measurement; rarely more
-# drop in log-likelihood within a standard error above which a peak is a spike: 20 times the expected
+COMPONENTS = 3  # largest number of components of a measurement; more are rare
+# a peak is a spike if the log-likelihood drops by more than this within a standard error: 20 times
+# the expected drop
 SPIKE = 10.0
 SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
-PARTS = 20  # parts of a log whose slopes are compared
-FALL = 2.0  # approximate drop in log-likelihood from the maximum to where the slope is taken
-# an inflation that occurs in 1 of 1,000 logs
+PARTS = 20  # number of parts of a log whose slopes are compared
+FALL = 2.0  # approximate drop in log-likelihood from the maximum to where the slope is computed
+# an inflation that only 1 of 1,000 logs exceed by chance
 BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)
 
 
@@ -36,17 +37,17 @@ class Hypothesis:
         kind: the common name of faults that cannot be distinguished.
         topic: the topic, or the parameter, that is wrong.
         part: the component of the topic, if only one is wrong.
-        tried: numbers to begin the search with, the first two nearest to zero; empty for a fault without
-            a number. For a fault of several numbers, the step of each.
-        limit: the largest magnitude of the number.
-        without: returns the trial without a fault of this number.
-        words: describes the fault, from the number and the ends of its 95 % interval.
-        remedy: returns advice for this number; None if it is followed already.
-        specials: numbers that are tried exactly, such as the factor of a unit.
-        size: how many numbers the fault has.
-        floor: the magnitude below which the number is no fault.
-        reported: converts the number for tables, for example from a logarithm to a factor.
-        already: the part that a parameter corrects already, to which the number is added.
+        tried: values at which the search begins, the first two nearest to zero; empty for a fault
+            without a value. For a fault with several values, the step of each.
+        limit: the largest magnitude of the value.
+        without: function that returns the trial without a fault of this value.
+        words: function that describes the fault, from the value and the ends of its 95 % interval.
+        remedy: function that returns advice for this value, or None if it is already followed.
+        specials: values that are tried exactly, such as the factor of a unit.
+        size: number of values of the fault.
+        floor: the magnitude below which the value is no fault.
+        reported: function that converts the value for tables, for example from a logarithm to a factor.
+        already: the value that a parameter already corrects, to which the found value is added.
     """
 
     kind: Kind
@@ -65,7 +66,7 @@ class Hypothesis:
 
     @property
     def has_end(self) -> bool:
-        """Test whether the search ends at the limit; that of an angle does not, since it wraps."""
+        """Test whether the search ends at the limit; it does not for an angle, which wraps."""
         return bool(self.tried) and self.size == 1 and self.limit not in (np.pi, np.inf)
 
     @property
@@ -86,7 +87,7 @@ def supposed(
     advice: Advice | None,
     reported: Callable[[float], float] = float,
 ) -> Hypothesis:
-    """Make a hypothesis without a number, see `Hypothesis`."""
+    """Make a hypothesis without a value; see `Hypothesis`."""
     return Hypothesis(
         kind,
         topic,
@@ -106,7 +107,7 @@ def in_topic(
 ) -> Callable[[Trial, Any], Trial]:
     """Make a function that applies the opposite of an alteration to a topic of a trial.
 
-    `stretched` is the factor by which the number stretches measurements, see `Trial`.
+    `stretched` is the factor by which the value stretches measurements; see `Trial`.
     """
 
     def without(trial: Trial, value: Any) -> Trial:
@@ -122,12 +123,12 @@ def in_topic(
 
 
 def has(parameters: Parameters | None, name: str) -> bool:
-    """Test whether the parameters have one of this name."""
+    """Test whether the parameters contain this name."""
     return parameters is not None and name in type(parameters).model_fields
 
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
-    """Return a parameter of a topic: as given, or as stated by the channel, or zero."""
+    """Return a parameter of a topic, as it is set, as the channel states it, or zero."""
     if not has(parameters, field_of(name)):
         return 0.0
     value = getattr(parameters, field_of(name))
@@ -145,14 +146,14 @@ def times(at: float, low: float, high: float) -> str:
 
 
 def size_of(at: float) -> str:
-    """Return "small" or "large" for what is too small or too large by this logarithm."""
+    """Return "small" or "large" for a standard deviation that is wrong by this logarithm."""
     return "small" if at > 0.0 else "large"
 
 
 def in_sense(
     at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
 ) -> tuple[str, float, float, float]:
-    """Describe a number as a direction, such as "too small", with its size and the interval of the size.
+    """Describe a value as a direction, such as "too small", with its size and the interval of the size.
 
     >>> in_sense(-0.3, -0.4, -0.2)
     ('too small', 0.3, 0.2, 0.4)
@@ -163,7 +164,7 @@ def in_sense(
 
 
 def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
-    """Make a function that computes the gains of correcting single faults over a trial."""
+    """Make a function that computes the gains of correcting single faults in a trial."""
     known: list[float] = []  # the trial's own log-likelihood
 
     def gains(asked: Sequence[tuple[Hypothesis, Number]]) -> list[float]:
@@ -175,12 +176,11 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
 
 
 def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, gain: float) -> bool:
-    """Test whether the gain of a noise falls faster next to its peak than the measurements allow.
+    """Test whether the gain of a noise falls faster next to its peak than measurements can explain.
 
-    Each of n measurements with m components holds at most 2 m of the (Fisher) information on the
-    logarithm of a standard deviation, so that the gain falls by about 1/2 within (2 m n)^-1/2. A faster
-    fall means that the filter diverges for most values: the likelihood is jagged there, and its peak has
-    no meaning.
+    Each of n measurements with m components has at most 2 m of the (Fisher) information on the
+    logarithm of a standard deviation, so the gain falls by about 1/2 within (2 m n)^-1/2. If it falls
+    faster, the filter diverges for most values, the likelihood is jagged, and the peak has no meaning.
     """
     if of.kind not in NOISES:
         return False
@@ -191,13 +191,14 @@ def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, g
 def noise_gain_over(
     likelihood: Likelihood, now: Trial
 ) -> Callable[[Hypothesis, Number], tuple[float, float]]:
-    """Make a function that computes the gain of correcting a fault caused by control noise.
+    """Make a function that computes the gain of a fault's correction under control noise.
 
-    It returns the mean and the standard deviation over logs, see
-    `fuselog.pipeline.tuning.control_noise`. For noises and outliers both are zero: their likelihood is
-    meant to contain that noise.
+    It returns the mean and the standard deviation of the gain over logs; see
+    `fuselog.pipeline.tuning.control_noise`. For noises and outliers both are zero, because their
+    likelihood is meant to contain this noise.
     """
-    most = 0.5 * COMPONENTS * sum(likelihood.count.values())  # half of NIS, if all of it were this noise
+    # half of the NIS, if all of it were caused by this noise
+    most = 0.5 * COMPONENTS * sum(likelihood.count.values())
 
     @cache
     def disturbed() -> tuple[list[Trial], NDArray[np.float64]]:
@@ -214,16 +215,16 @@ def noise_gain_over(
         gained = gained[np.isfinite(gained)]  # a filter may fail with more noise
         if len(gained) < 2:
             return 0.0, 0.0
-        mean = float(np.clip(np.mean(gained), -most, most))  # it would be larger if a filter diverges
+        mean = float(np.clip(np.mean(gained), -most, most))  # it would be larger if a filter diverged
         variance = min(float(np.var(gained, ddof=1)) * (1.0 + 1.0 / len(gained)), most)
-        # with the noise of the measurements: the variance of a likelihood ratio is twice its mean
+        # with measurement noise, the variance of a likelihood ratio is twice its mean
         return mean, (variance + 2.0 * max(mean, 0.0)) ** 0.5
 
     return gain
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute the costs (pairs,) of pairs of opposite noises on the first trial in log-likelihood."""
+    """Compute the costs (pairs,) in log-likelihood of pairs of opposite noises on the first trial."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)
@@ -232,17 +233,17 @@ def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:
     """Make a function that computes the inflation of a fault's gain.
 
-    If parts of the log disagree about the number more than their likelihoods imply, the gain is inflated
-    by this factor: the variance of the slopes of PARTS of the log at the maximum is compared with the
-    curvature of the whole, which is equal to it for a correct model. Kent, Robust properties of
-    likelihood ratio tests, Biometrika 69, 1982, pages 19 to 27. The factor is 1 if chance may explain
-    the disagreement, and for faults without a number.
+    The gain is inflated if parts of the log disagree about the value more than their likelihoods imply:
+    the variance of the slopes of PARTS of the log at the maximum is compared with the curvature of the
+    whole, which equals it for a correct model. Kent, Robust properties of likelihood ratio tests,
+    Biometrika 69, 1982, pages 19 to 27. The factor is 1 for faults without a value, and if chance can
+    explain the disagreement.
     """
 
     def inflation(of: Hypothesis, value: Number, gain: float) -> float:
         if not of.tried:
             return 1.0
-        step = min(1.0, (FALL / gain) ** 0.5)  # from zero, the gain is about a parabola
+        step = min(1.0, (FALL / gain) ** 0.5)  # seen from zero, the gain is approximately a parabola
         below, at, above = likelihood.over_parts(
             [of.without(now, _times(value, each)) for each in (1.0 - step, 1.0, 1.0 + step)], PARTS
         )

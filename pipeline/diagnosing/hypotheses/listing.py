@@ -1,4 +1,4 @@
-"""A list of all hypotheses on a run and the estimator that is bound to it."""
+"""List of all hypotheses on a run and the estimator that is bound to it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -33,8 +33,8 @@ def hypotheses(
     Args:
         bound: the bound estimators.
         base: the unaltered run, and the settings.
-        innovations: of the unaltered run, without a gate.
-        readings: what is read, by the name of what is estimated.
+        innovations: those of the unaltered run, without a gate.
+        readings: functions that read the measured numbers, by the name of the estimate.
     """
     source, parameters = base.source, bound[0].parameters
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))

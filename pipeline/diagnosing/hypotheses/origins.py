@@ -1,4 +1,4 @@
-"""Hypotheses on the origin of positions, or of the tangent plane of geodetic fixes."""
+"""Hypotheses on the origin of positions or of geodetic fixes."""
 
 from collections.abc import Callable, Iterator
 
@@ -19,7 +19,7 @@ Metres = tuple[float, float]
 
 
 def of_origin(stream: Stream, reading: Reading | None) -> Iterator[Hypothesis]:
-    """Yield another origin than that of a topic's positions, or than geodetic fixes state."""
+    """Yield the hypothesis that the origin of a topic's positions or geodetic fixes is different."""
     if "latitude_deg" in stream.columns:
         yield from _of_geodetic(stream)
     elif "position_m" in stream.columns and reading and stream.topic not in reading.controls:
@@ -45,7 +45,7 @@ def _of_positions(stream: Stream) -> Hypothesis:
 
 
 def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
-    """Yield another origin than geodetic fixes state; nothing if they state none."""
+    """Yield the hypothesis that geodetic fixes state a wrong origin, if they state one."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return

@@ -1,4 +1,4 @@
-"""Hypotheses on parameters: noise, what may be estimated in addition to the state, and the gate."""
+"""Hypotheses on parameters of noise, on parameters that can be estimated, and on the gate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -42,14 +42,14 @@ from fuselog.replay.foreign.programs import ProgramParameters
 GATE = 0.999
 REOPENS_S, NEVER_S = 1.0, 1e9
 LARGEST_SCALE = 12.0  # a logarithm
-# First step of the search for a parameter, by unit; without a unit, it is a factor.
+# First step of the search for a parameter, by unit; without a unit, the parameter is a factor.
 STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0.1, "": 0.02}
 
 
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """Yield noises that are assumed, or stated by the estimator's parameters or by channels."""
+    """Yield noises that the model assumes, or that parameters or channels state."""
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
     parameters = bound[0].parameters
     if parameters is None:
@@ -64,8 +64,8 @@ def of_noises(
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
     """Yield other values of the numbers that an estimator declares, if its reading is unknown.
 
-    Noises and numbers that cannot be negative are scaled, and so are positive numbers in the command of
-    a program that reads a log, which states no more about them.
+    Noises and numbers that cannot be negative are multiplied by factors, and so are positive numbers in
+    the command of a program that reads a log, about which nothing else is known.
     """
     parameters = bound[0].parameters
     if parameters is None:
@@ -103,7 +103,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
-    """Return the value of a number: given, stated by a channel, or assumed; NaN if there is none."""
+    """Return the value of a number, as it is set, stated by a channel, or assumed; else NaN."""
     for each in bound:
         with suppress(BadInput):
             value, _ = value_at_start(name, source, each)
@@ -148,11 +148,11 @@ def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float
 
 
 def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
-    """Yield other values of parameters that may be estimated; those of one unit form a vector.
+    """Yield other values of parameters that can be estimated; those with the same unit form a vector.
 
-    Biases and factors of a topic's numbers are left out, because they are tried separately. Angles are
-    also tried one by one over the full circle: a unit is mounted a quarter turn off about one axis, not
-    about three.
+    Biases and factors of a topic's numbers are omitted, because they are tried separately. Angles are
+    also tried one by one over the full circle, because units are often mounted a quarter turn off about
+    one axis.
     """
     parameters = bound[0].parameters
     groups: dict[tuple[Any, ...], list[str]] = {}
@@ -181,7 +181,7 @@ def _parameters(
     *,
     is_angle: bool,
 ) -> Hypothesis:
-    """Make a hypothesis that some parameters have other values; its numbers are the differences."""
+    """Make a hypothesis that some parameters have other values, with the differences as its values."""
     size = len(names)
 
     def numbers(by: Any) -> tuple[float, ...]:
@@ -227,8 +227,8 @@ def _parameters(
 def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
     """Yield the hypothesis that some measurements are outliers; a gate rejects them.
 
-    The number is the time in seconds after which the gate opens again: `REOPENS_S` for single outliers,
-    and `NEVER_S` for a stretch of them, of which another one would be accepted every second.
+    The value is the time in seconds after which the gate opens again: `REOPENS_S` for single outliers,
+    and `NEVER_S` for a stretch of outliers, of which one would be accepted every second otherwise.
     """
     if not has(parameters, "gate_probability"):
         return

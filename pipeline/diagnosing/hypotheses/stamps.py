@@ -1,4 +1,4 @@
-"""Hypotheses on stamps: delayed messages, or a drifting clock."""
+"""Hypotheses on stamps: delayed messages or a drifting clock."""
 
 from collections.abc import Iterator, Mapping
 
@@ -18,8 +18,8 @@ SPECIAL_S = {18.0: "the leap seconds between GPS and UTC", -18.0: "the leap seco
 RATES = (-1e-4, 1e-4, -1e-3, 1e-3, -0.01, 0.01, -0.03, 0.03, -0.1, 0.1)
 LONGEST_DELAY_S, LARGEST_RATE = 30.0, 0.2
 LAGS_S = np.arange(-30.0, 30.05, 0.1)
-FEWEST = 20  # fewest speeds from which a lag is found
-MOST_CELLS = 1_000_000  # lags times speeds in memory at a time
+FEWEST = 20  # fewest speeds from which a lag can be estimated
+MOST_CELLS = 1_000_000  # largest product of lags and speeds in memory
 
 
 def of_stamps(
@@ -34,10 +34,10 @@ def of_stamps(
 
     Args:
         stream: the topic's messages.
-        reading: what is read for the estimated object.
+        reading: function that reads the measured numbers of the estimated object.
         parameters: the estimator's parameters, one of which may be this delay.
         first_ns: the first stamp of the run.
-        hold_s: half of the time for which a control holds; a smaller delay is no fault.
+        hold_s: half of the time for which a control applies; a smaller delay is no fault.
         lags_s: further delays to try.
     """
     topic = stream.topic
@@ -92,10 +92,10 @@ def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
 
 
 def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
-    """Estimate the lag of the speeds of positions behind a control that correlates with them, in s.
+    """Estimate the lag in s of the speeds of positions behind a control that correlates with them.
 
-    The lag has the best correlation over a grid of a tenth of a second, which is near enough to begin a
-    search.
+    The lag with the best correlation is found on a grid of a tenth of a second, which is accurate enough
+    for the start of a search.
     """
     if "position_m" not in stream.columns or len(stream) < FEWEST:
         return ()
@@ -127,5 +127,5 @@ def _correlations(rows: Floats, column: Floats, is_in: NDArray[np.bool_]) -> Flo
         for each in (rows, column)
     )
     size = np.sqrt((rows**2).sum(axis=1) * (columns**2).sum(axis=1))
-    is_known = (count[:, 0] >= FEWEST) & (size > 0.0)  # false if one is NaN
+    is_known = (count[:, 0] >= FEWEST) & (size > 0.0)  # false if one of them is NaN
     return np.where(is_known, (rows * columns).sum(axis=1) / np.where(is_known, size, 1.0), -1.0)

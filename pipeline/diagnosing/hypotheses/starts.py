@@ -1,4 +1,4 @@
-"""Hypotheses on the initial state that a log states."""
+"""Hypotheses on the initial state that a log contains."""
 
 from collections.abc import Iterator
 
@@ -11,11 +11,11 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sen
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.vectors.components import components_of, stated_components
 
-SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # standard deviations of a prior
+SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # limit in standard deviations of a prior
 
 
 def of_start(prior: Stream) -> Iterator[Hypothesis]:
-    """Yield hypotheses that the initial state is different."""
+    """Yield hypotheses that a component of the initial state is different."""
     if len(prior) != 1 or not prior.components:
         return
     covariance = prior["covariance"][0]
@@ -27,7 +27,8 @@ def of_start(prior: Stream) -> Iterator[Hypothesis]:
     column = 0
     for place, (name, kind) in enumerate(zip(prior.components, kinds, strict=True)):
         if kind == "quaternion" and place and kinds[place - 1] == "quaternion":
-            column += kinds[: place + 1].count("quaternion") < 4  # three of four components are tangent
+            # a quaternion has three tangent components
+            column += kinds[: place + 1].count("quaternion") < 4
             continue
         sigma = float(np.sqrt(variances[min(column, size - 1)]))
         column += 1

@@ -1,7 +1,7 @@
-"""The report: results as one HTML page that loads nothing and runs only our scripts.
+"""The report, which shows results as one HTML page that loads nothing and runs only our scripts.
 
-Begin here; `kinds` writes the opening of a section, `story` the first sentences and the cards, `scene`
-the pictures of a run.
+Begin here. `kinds` writes the opening of a section, `story` the first sentences and the cards, and
+`scene` the pictures of a run.
 
 Plotly draws the charts. Its bundle of basic traces, small enough to be part of every page, is in this
 folder as published (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
@@ -43,12 +43,12 @@ from fuselog.recorders.errors import BadInput, printable
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
 
-# Each has a fixed colour on pages that show one of them.
+# Colours of estimators, the same in all sections of a page.
 USUAL = ("dead-reckoning", "ekf", "ukf")
 # Longer tables, such as one row per step, are only in their Parquet and CSV files.
 LONGEST_TABLE = 60
-SCENES = ("scene", "lens")  # figures kept by a comparison, which has no logs to draw
-MOST_DOUBTS = 3  # on the first screen; more are folded
+SCENES = ("scene", "lens")  # figures to keep for a comparison, which has no logs to draw
+MOST_DOUBTS = 3  # doubts on the first screen; the others are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
@@ -165,7 +165,7 @@ def _visible(value: object) -> object:
 
 
 def empty_cells(table: pd.DataFrame) -> list[str]:
-    """Explain why cells of a table are empty: nothing to compute them from, or an infinite value."""
+    """Explain why cells of a table are empty: no input data, or an infinite value."""
     cells = [value for row in table.itertuples(index=False) for value in row if not is_value(value)]
     infinite = sum(isinstance(value, float) and math.isinf(value) for value in cells)
     counts = {
@@ -186,18 +186,18 @@ def _hashes(scripts: Sequence[str]) -> Markup:
 
 
 def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
-    """Write a chart as JSON for the script, with fixed colours per estimator; `<` is escaped."""
+    """Write a chart as JSON for the script, with a fixed colour for each estimator and `<` escaped."""
     values = {**chart.model_dump(mode="json"), "colours": chart.colours(estimators)}
     return Markup(json.dumps(values, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _hues(labels: Sequence[str]) -> dict[str, str]:
-    """Assign a CSS class for its colour to the name of each estimator."""
+    """Assign to each estimator the CSS class of its colour."""
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
 
 
 def _named(text: str, labels: Sequence[str]) -> Markup:
-    """Write a sentence in which the names of estimators are coloured."""
+    """Format a sentence as HTML in which the names of estimators are coloured."""
     hues = _hues(labels)
     if not hues:
         return escape(text)
@@ -292,7 +292,7 @@ def _rank(shown: Shown) -> tuple[bool, bool, int]:
 
 
 def _figure(path: Path) -> Shown:
-    """Load a figure by its SVG file: as a chart if it has a description, otherwise as a picture."""
+    """Load a figure by its SVG file: as a chart if it has a description, else as a picture."""
     name = unquote(path.stem)
     described = path.with_suffix(".json")
     if described.is_file():
@@ -313,7 +313,7 @@ def _chart(name: str, chart: Chart) -> Shown:
 
 
 def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: bool) -> list[Shown]:
-    """Show the first run in space: as in the viewer, or from above with a magnified detail."""
+    """Show the first run, as the viewer draws it or from above with a magnified detail."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
         return [Shown("", "first run in the viewer", "The first run in the viewer", picture=address)]

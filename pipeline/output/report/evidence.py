@@ -1,6 +1,6 @@
-"""Evidence about each estimator of a result, run by run: error, consistency, failures.
+"""Evidence about each estimator of a result: its errors, consistency and failures in every run.
 
-It is computed from the metrics and from the table of runs, which all kinds of results share.
+It is computed from the metrics and the table of runs, which exist in all kinds of results.
 """
 
 import math
@@ -32,7 +32,7 @@ from fuselog.replay.judging.intervals import (
 )
 from fuselog.replay.judging.verdicts import DIFFER, Comparison, Consistency, Squares, decisive
 
-Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds and number of messages
+Timings = Mapping[str, Mapping[str, float]]  # by estimator: run time in s, number of messages
 # Estimators are compared by the first of these that they have, or else by the first error.
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
 MARGIN = 0.02  # the default of `fuselog compare`
@@ -40,7 +40,7 @@ MARGIN = 0.02  # the default of `fuselog compare`
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything known about one estimator.
+    """Everything that is known about one estimator.
 
     Attributes:
         estimator: its label.
@@ -83,12 +83,12 @@ class Evidence:
 
     @property
     def has_diverged(self) -> bool:
-        """Test whether its errors are too large to be a matter of covariances."""
+        """Test whether its errors are too large to be explained by wrong covariances."""
         return self.decisive is not None and self.decisive.has_diverged
 
 
 class Pair(NamedTuple):
-    """How much larger a quantity is for one estimator than for another; NaN if unknown."""
+    """The ratio or difference of a quantity between two estimators; NaN if it is unknown."""
 
     first: str
     second: str
@@ -99,7 +99,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """Everything that a result knows about its estimators.
+    """Everything that a result contains about its estimators.
 
     Attributes:
         tables: its metrics by case.

@@ -20,7 +20,7 @@ from fuselog.replay.judging.judge import Judge
 Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
 PICTURE_PX = (1280, 800)
-# Innovations are read from at most this many runs; more would hardly change their mean over time.
+# Innovations of at most this many runs are read; more would hardly change their mean over time.
 RUNS = "estimates/run-*.mcap"
 MOST_RUNS = 20
 GAP_LIMIT_S = 0.2
@@ -43,7 +43,7 @@ class Followed:
 
     @property
     def estimate(self) -> Floats:
-        """Return the estimated positions, (n, 2)."""
+        """Return the estimated positions (n, 2)."""
         return self.truth + self.error
 
     @property
@@ -67,9 +67,9 @@ class FirstRun:
 
 
 def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None:
-    """Find the first run whose log has a truth in the plane and estimates of it; None if there is none.
+    """Find the first run whose log has a truth and estimates in the plane; None if there is no such run.
 
-    If several objects, such as robots, are estimated, the first is used. Raises BadInput if a log is
+    If the log has several objects, such as robots, the first is used. Raises BadInput if a log is
     damaged.
     """
     for log in sorted(folder.rglob("logs/run-0000.mcap")):
@@ -82,7 +82,7 @@ def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None
 
 
 def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> FirstRun | None:
-    """Read a run from its log and estimates; None without truth and estimates in the plane."""
+    """Read a run from its log and estimates; None if one of them has no positions in the plane."""
     found = _followed(source, output, gap_limit_s)
     if not found:
         return None
@@ -150,9 +150,9 @@ def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats
 
 
 def picture_of_timeline(timeline: Path) -> bytes:
-    """Take a picture of a timeline in the viewer, as WebP.
+    """Draw a timeline with the viewer, and return the picture as WebP.
 
-    Raises BadInput if there is no timeline, or no Vulkan driver to draw it with.
+    Raises BadInput if there is no timeline, or no Vulkan driver.
     """
     from fuselog.replay.timeline.viewer import screenshot
 

@@ -1,4 +1,4 @@
-"""Glossary at the end of a page: two sentences per word, and a link for further reading."""
+"""The glossary at the end of a page, with two sentences and a link for each word."""
 
 from typing import NamedTuple
 

@@ -1,6 +1,6 @@
-"""Openings of pages by kind of result: experiment, comparison, sweep, tuning, diagnosis.
+"""Openings of report pages, by kind of result: experiment, comparison, sweep, tuning, diagnosis.
 
-Begin with `opening`. Each kind writes its own first sentences; `story` writes cards and differences.
+Begin with `opening`. It writes the first sentences; `story` writes the cards and differences.
 """
 
 import math
@@ -39,7 +39,7 @@ from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.verdicts import DIFFER, MATERIAL, Claimed, Comparison
 
 Tables = Mapping[str, pd.DataFrame]
-# More estimators are counted instead of named; more refuted claims are only in the table.
+# More estimators than this are counted instead of named; more refuted claims are only in the table.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
 OF_CLAIMS: Mapping[Claimed, str] = {
@@ -50,7 +50,7 @@ OF_CLAIMS: Mapping[Claimed, str] = {
     Claimed.NO_VERDICT: "does not judge {}",
 }
 MOST_PAIRS = 3
-# The tables from which the sentences are written.
+# Names of the tables from which the sentences are written.
 TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
 
@@ -64,7 +64,7 @@ class Opening:
         found: what is known about the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture specific to this kind of result.
-        numbers_of: what the table of numbers covers, if not everything that was run.
+        numbers_of: the part of the runs that the table of numbers shows, if not all.
     """
 
     tried: str
@@ -76,7 +76,7 @@ class Opening:
 
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
-    """Write the beginning of a result's page; `timings` are the run times of its estimators, if kept."""
+    """Write the beginning of a result's page; `timings` are the estimators' run times, if known."""
     if result.made_by == "compare":
         return _of_comparison(result, tables)
     if result.made_by == "sweep":
@@ -100,7 +100,7 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
 
 
 def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
-    """Write what was tried, and the outcome, for the terminal; `folder` is the result's folder."""
+    """Describe for the terminal what was run and the outcome; `folder` is the result's folder."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(
@@ -126,7 +126,7 @@ def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
 
 
 def _length(tables: Tables) -> str:
-    """Describe the duration of a run, if a table has the time."""
+    """Describe the duration of a run, if a table contains the time."""
     for name, column in (("times", "until_s"), ("steps", "elapsed_s")):
         if name in tables and column in tables[name] and len(tables[name]):
             seconds = float(tables[name][column].max())
@@ -135,9 +135,9 @@ def _length(tables: Tables) -> str:
 
 
 def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Story:
-    """Write the story of an experiment's estimators, unless they cannot be compared.
+    """Write the story of an experiment's estimators, or an empty one if they cannot be compared.
 
-    A quantity that only one of several estimators has is not an error by which to choose.
+    A quantity that only one of several estimators has cannot be used to compare them.
     """
     stated = result.settings.get("estimators") or {}
     own = replace(found, labels=[label for label in found.labels if label in stated] or found.labels)
@@ -147,7 +147,7 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
 
 
 def _with_claims(base: Story, result: Result) -> Story:
-    """Add to a story how many claims hold, and a card with those that do not."""
+    """Add to a story how many claims are confirmed, and a card with the others."""
     counts = Counter(claim.verdict for claim in result.claims)
     refuted = [claim.claim for claim in result.claims if claim.verdict == Claimed.REFUTED]
     notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
@@ -165,7 +165,7 @@ def _with_claims(base: Story, result: Result) -> Story:
 
 
 def claims_sentences(result: Result) -> list[str]:
-    """Summarise how many claims hold, and how many do not."""
+    """Summarise how many claims are confirmed and how many are not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
     if counts[Claimed.CONFIRMED] == len(result.claims):
@@ -178,7 +178,7 @@ def claims_sentences(result: Result) -> list[str]:
 
 
 def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
-    """Begin the story with what is wrong; the card says that the estimator is inconsistent."""
+    """Begin the story with the cause of the inconsistency, and add a card for the estimator."""
     first = notes[0].removeprefix("1. ") if notes else ""
     what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
@@ -187,7 +187,7 @@ def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
 
 
 def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
-    """Begin the story with the values found, followed by their effect on the estimator."""
+    """Begin the story with the tuned values, followed by their effect on the estimator."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
         low, high = row["low"], row["high"]
@@ -255,7 +255,7 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
 
 
 def how_many_differ(rows: pd.DataFrame) -> str:
-    """Summarise in how many metrics each pair differs; many pairs are counted together."""
+    """Summarise in how many metrics each pair differs, or all pairs together if they are many."""
     pairs = rows.groupby(["first", "second"], sort=False)
     if len(pairs) > MOST_PAIRS:
         number_of = int(rows["verdict"].isin(DIFFER).sum())

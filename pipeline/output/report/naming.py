@@ -1,7 +1,7 @@
 """Names of the report's sections, and text colours for the names of estimators.
 
-A section is named by its experiment and the settings that differ; a curve's colour is made dark or light
-enough for text.
+A section is named after its experiment and the settings in which it differs from the others. The colour
+of a curve is made dark or light enough for text.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,13 +14,13 @@ from fuselog.pipeline.output.results import Result
 from fuselog.pipeline.output.terminal import format_value
 from fuselog.pipeline.output.words import count, listed
 
-# Background colours behind names; the first of each is that of the page.
+# Background colours behind names; the first of each tuple is that of the page.
 LIGHT, DARK = ("#ffffff", "#fdf1f5"), ("#14171a", "#2a1a20")
 READABLE = 4.6  # WCAG 2.2, 1.4.3 asks for 4.5 to 1
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
-    """Name each result by its experiment, plus settings that differ from others of the experiment.
+    """Name each result after its experiment and the settings that differ from its other results.
 
     Results with the same experiment and settings are distinguished by their folders.
     """
@@ -37,7 +37,7 @@ def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[s
 def _name(result: Result, alike: Sequence[Result]) -> str:
     settings = [dict(_flat(each.settings)) for each in alike]
     own = dict(_flat(result.settings))
-    # the settings of an estimator are among its parameters as well
+    # an estimator's settings are already among its parameters
     given = {key[1:] for each in settings for key in each if key[0] == "estimators"}
     keys = dict.fromkeys(
         key
@@ -58,7 +58,7 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
 def _flat(
     values: Mapping[str, Any], path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield all settings with the path of names that leads to each."""
+    """Yield all nested settings, with the names that lead to each."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _flat(value, (*path, name))
@@ -67,7 +67,7 @@ def _flat(
 
 
 def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
-    """Write the heading: the experiment's title, or what was done with which logs."""
+    """Write the heading of a result: the experiment's title, or the command and the logs."""
     settings = result.settings
     title = str(settings.get("title") or result.experiment)
     if result.made_by == "compare":

@@ -23,11 +23,11 @@ from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.evaluation import chi_square_band, split_topic
 
 Floats = NDArray[np.float64]
-# Number of times at which particles are drawn, and of equally weighted particles per cloud.
+# Number of times at which particles are drawn, and number of equally weighted particles at each.
 CLOUDS, CLOUD_POINTS = 6, 150
 ELLIPSES, CORNERS = 6, 48
 INSIDE = float(chi2.ppf(0.95, 2))  # 95 % quantile of a normalised squared error in the plane
-# A lens shows ellipses smaller than this share of the scene.
+# If ellipses are smaller than this share of the scene, a lens magnifies them.
 SMALL = 0.04
 MOST_LENSES = 3
 LENS_S, DOTS = 1.0, 6
@@ -39,7 +39,7 @@ MOST_FIXES = 600
 
 
 def plan(run: FirstRun) -> Chart:
-    """Draw the scene: truth, estimates, landmarks, fixes, ellipses if large enough, particles."""
+    """Draw truth, estimates, landmarks, fixes, particles, and ellipses that are large enough."""
     longest = max(run.followed.values(), key=lambda each: len(each.time_s))
     series: list[Series] = []
     clouds = _clouds(run)
@@ -63,11 +63,11 @@ def plan(run: FirstRun) -> Chart:
 
 
 def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
-    """Draw one second of the run for estimators whose ellipses are too small for the scene.
+    """Draw one second of the run for the estimators whose ellipses are too small for the scene.
 
-    It is the second whose share of truths outside the ellipses is closest to that of the whole run,
-    over all estimators shown; among equals, the one closest to the middle. None if the scene shows
-    everything.
+    Choose the second in which the share of truths outside the ellipses is closest to that of the whole
+    run, over all estimators shown, and of several such seconds the one closest to the middle. None if
+    all ellipses are large enough for the scene.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
@@ -113,7 +113,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
-    """Find the start and length of that second, longer if estimates are rare; else (0, 0)."""
+    """Find the start and length of the typical second, longer if estimates are rare; else (0, 0)."""
     if not followed or min(len(each.time_s) for each in followed) < DOTS:
         return 0.0, 0.0
     step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)
@@ -162,7 +162,7 @@ def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
 
 
 def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
-    """Compute the borders of ellipses, joined with NaN between them."""
+    """Compute the outlines of ellipses as one curve, with NaN between them."""
     turn = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     circle = np.stack([np.cos(turn), np.sin(turn)])
     values, axes = np.linalg.eigh(each.covariance[rows])
@@ -195,7 +195,7 @@ def _fixes(run: FirstRun) -> list[Series]:
 def _clouds(run: FirstRun) -> list[Series]:
     """Draw particles of densities at a few times spread over the run.
 
-    They are sampled systematically, so that a particle's chance of being drawn is its weight.
+    The particles are sampled systematically: the chance that a particle is drawn is its weight.
     """
     found = []
     for topic in topics_of(run.output.topics, schemas.DENSITY_ESTIMATE):
@@ -230,10 +230,10 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
 def tracked(
     folder: Path, labels: Sequence[str], errors: Mapping[str, float], of_what: str
 ) -> Chart | None:
-    """Draw the first run of trackers from above, with tracks and true paths, one panel each.
+    """Draw the first run from above, with tracks and true paths, in a panel for each tracker.
 
-    Of several cases, the one with the median error is drawn. None if no run has both truths and
-    tracks. Raises BadInput if a log is damaged.
+    If there are several cases, the one with the median error is drawn. None if no run has both truths
+    and tracks. Raises BadInput if a log is damaged.
 
     Args:
         folder: the result's folder.
@@ -269,19 +269,19 @@ def tracked(
 
 
 def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
-    """Find the first log with estimates of each case, beginning with the case of the median error."""
+    """Find the first log with estimates of each case, and begin with the case of the median error."""
     logs = {
         "/".join(log.parent.parent.relative_to(folder).parts): log
         for log in sorted(folder.rglob("logs/run-0000.mcap"))
         if (log.parent.parent / "estimates" / log.name).is_file()
     }
     by_error = sorted((case for case in logs if case in errors), key=errors.__getitem__)
-    middle = (len(by_error) - 1) // 2  # of two, the smaller
+    middle = (len(by_error) - 1) // 2  # of two middle cases, the one with the smaller error
     return {case: logs[case] for case in dict.fromkeys([*by_error[middle : middle + 1], *logs])}
 
 
 def _detections(source: LogSource) -> list[Series]:
-    """Draw the detections of a log's sensors as dots; bearings alone have no position."""
+    """Draw the detections of a log's sensors as dots; bearings have no position and are not drawn."""
     found = []
     for topic, each in source.topics.items():
         name = f"{topic.rpartition('/')[0]}/detection"
@@ -298,7 +298,7 @@ def _detections(source: LogSource) -> list[Series]:
 
 
 def _dots(label: str, points: Floats) -> Series:
-    """Draw measured positions (n, 2), thinned to what a picture can show."""
+    """Draw measured positions (n, 2) as dots, at most as many as a picture can show."""
     return path(label, points[thinned(len(points), MOST_FIXES)], "dots", reference=True)
 
 
@@ -324,13 +324,13 @@ def _tracks(output: LogSource, label: str) -> list[Floats]:
 
 
 def _parted(ways: Sequence[Floats]) -> Floats:
-    """Join paths with NaN between them."""
+    """Join paths to one curve, with NaN between them."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for way in ways for part in (way, gap)])
 
 
 def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
-    """Draw NIS over time for runs whose estimates are kept, with its 95 % band."""
+    """Draw NIS over time, with its 95 % band, for the runs whose estimates are kept."""
     found = innovations_of_runs(folder)
     cases = list(dict.fromkeys(case for _, case in found))
     drawn = []

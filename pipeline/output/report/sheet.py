@@ -1,4 +1,4 @@
-"""The table of metrics: estimators as columns, a dozen rows, the rest folded below."""
+"""The table of metrics, with estimators as columns, a dozen rows, and the other rows folded below."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
 
 
 class Cell(NamedTuple):
-    """A number of a table, its small print, and whether it is the best or out of bounds."""
+    """A number in a table, with its small print, and whether it is the best or out of bounds."""
 
     text: str
     small: str = ""
@@ -70,7 +70,7 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """Make the table of a result, and one for each of several cases; None without numbers.
+    """Make the table of a result, then one for each case if there are several; None without numbers.
 
     The recommended estimator is in the first column, which is visible even if the table is wider
     than the page.
@@ -89,7 +89,7 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
 
 
 def table_of_pairs(found: Findings) -> pd.DataFrame:
-    """Tabulate differences between two estimators: a row per pair and quantity, a column per case."""
+    """Tabulate differences by pair of estimators and quantity, with a column per case."""
     rows: dict[tuple[str, str, str], dict[str, str]] = {}
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
@@ -102,7 +102,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
 
 
 def _medians(tables: list[MetricTable]) -> MetricTable:
-    """Compute the median over the cases that have a number."""
+    """Compute the median over the cases that have a value."""
     quantities: dict[str, dict[str, Measured]] = {}
     for key, of in _numbers(tables).items():
         quantities[key] = {label: Measured(float(median(values))) for label, values in of.items()}
@@ -198,7 +198,7 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
 
 
 def _aim(found: Findings, key: str) -> str:
-    """Write the right NEES, if all estimators have the same number of components."""
+    """Write the ideal NEES, if all estimators have the same number of components."""
     squares = [by for each in found.of.values() for by in each.squares]
     sizes = {number(by.aim) for by in squares if by.name == "NEES"}
     return next(iter(sizes)) if key == "nees" and len(sizes) == 1 else ""

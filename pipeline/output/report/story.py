@@ -1,6 +1,6 @@
-"""The story of a result: what was tried, what to do, a card per estimator, what differs.
+"""The story of a result: advice, a card for each estimator, and the differences between estimators.
 
-It is data (sentences and numbers); the template only lays it out.
+A story consists of sentences and numbers; the template only arranges them.
 """
 
 import math
@@ -34,14 +34,14 @@ from fuselog.replay.judging.diagnostics import LEAST_SHARE
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
 
-CHEAPER = 0.9  # a run time below this share of another's is mentioned,
-TIMED_S = 0.02  # if it was measured over at least this time
+CHEAPER = 0.9  # a run time is mentioned if it is below this share of another's
+TIMED_S = 0.02  # and was measured over at least this time
 
 NONE_SOUND = "None of the estimators can be trusted with its current settings."
 NONE_SOUND_AT_BEST = "Even at the point with its smallest error, none of the estimators can be trusted."
 MOST_CARDS = 4
-MOST_NAMED = 4  # more estimators are counted instead of named
-# Findings of the checks of a replay, phrased for the estimators concerned.
+MOST_NAMED = 4  # more estimators than this are counted instead of named
+# Warnings about a replay, phrased for the estimators concerned.
 _OF_COVARIANCES = {"innovations": "innovations", "errors": "errors"}
 _CHECKS: dict[str, Callable[[str], str]] = {
     "uninformed": lambda whose: (
@@ -61,7 +61,7 @@ _CHECKS: dict[str, Callable[[str], str]] = {
     "unused": lambda whose: f"{whose}, because measurements were not used",
     "gates": lambda _: "likelihoods: the gates differ, so they are based on different measurements",
 }
-# The scale is logarithmic, from a third of the aim to ten times the aim.
+# The scale is logarithmic, from a third of the ideal value to ten times the ideal value.
 GAUGE_ENDS = (1 / 3, 10.0)
 Look = Literal["broken", "careful", "best", "fair", "claims"]
 
@@ -70,8 +70,8 @@ class Gauge(NamedTuple):
     """The position of a mean of squares on a scale from conservative to overconfident, in percent.
 
     Attributes:
-        usual: the range that counts as consistent: the 95 % range, or small deviations.
-        aim, value: the right value, and the one found.
+        usual: the range that counts as consistent, which is the 95 % range or a small deviation.
+        aim, value: the ideal value, and the measured one.
         spread: the 95 % interval of the value; both ends are the value if it is unknown.
         is_beyond: whether the value is beyond the end of the scale.
         words: a description for screen readers.
@@ -87,9 +87,9 @@ class Gauge(NamedTuple):
 
 @dataclass(frozen=True)
 class Card:
-    """The card of one estimator: its accuracy, whether it can be trusted, why not, and its cost.
+    """The card of one estimator, with its accuracy, run time, and reasons not to trust it.
 
-    The card with the look `claims` states how many of a result's claims hold.
+    If its look is `claims`, the card states how many of a result's claims are confirmed.
     """
 
     estimator: str
@@ -113,11 +113,11 @@ class Story:
     """The opening of a page about a result.
 
     Attributes:
-        verdict: what to do, the most important sentence first.
-        cards: of the estimators: the recommended one, then those that cannot be trusted.
+        verdict: advice on which estimator to use, the most important sentence first.
+        cards: cards of estimators: the recommended one, then those that cannot be trusted.
         draws: sentences on pairs that cannot be distinguished; `differences` on those that can.
         left_out: estimators without a card.
-        doubts: what is doubtful, in a few words each, the worst first.
+        doubts: reasons to doubt the result, in a few words each, the worst first.
     """
 
     verdict: list[str]
@@ -136,7 +136,7 @@ def story(
     *,
     at_best: bool = False,
 ) -> Story:
-    """Write the story of judged estimators; with `at_best`, each at its point of smallest error.
+    """Write the story of judged estimators; with `at_best`, each is at the point of its smallest error.
 
     Causes, run times and warnings are included if they are given.
     """
@@ -167,7 +167,7 @@ def _verdict(
     timings: Timings,
     none_sound: str,
 ) -> list[str]:
-    """Write what to do, then which estimators cannot be trusted, and why."""
+    """Write advice, then name the estimators that cannot be trusted, and the reasons."""
     if not found.labels:
         return []
     if len(found.labels) == 1:
@@ -191,7 +191,7 @@ def _advice(
     own: Scale,
     timings: Timings,
 ) -> str:
-    """Recommend an estimator, or write that the one with the smallest error cannot be trusted."""
+    """Recommend an estimator, or explain that the one with the smallest error cannot be trusted."""
     error = found.of[take].error
     main = found.error_name
     better = [
@@ -236,7 +236,7 @@ def _advice(
 
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
-    """Name the fastest of equally good estimators, if the difference matters."""
+    """Name the fastest of equally good estimators, if the difference in run time matters."""
     of = sorted((timings.get(label, {}).get("seconds", 0.0), label) for label in labels)[:2]
     if len(of) < 2 or not TIMED_S < of[0][0] < CHEAPER * of[1][0]:
         return ""
@@ -245,7 +245,7 @@ def _cheapest(labels: list[str], timings: Timings) -> str:
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
-    """Write what is known about the only estimator."""
+    """Describe the only estimator of a result."""
     error = f"{found.error_name} of {_value(only.error, own)} RMS"
     errs = f"{only.estimator} has a {error}" if only.error else ""
     if only.is_broken:
@@ -257,7 +257,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 
 
 def _of_innovations(found: Findings) -> str:
-    """Write what is known without a truth."""
+    """Describe the consistency of innovations, if there is no truth."""
     right = [each.estimator for each in found.of.values() if each.verdict == Consistency.CONSISTENT]
     without = "Without a truth, errors are unknown"
     if not right:
@@ -286,7 +286,7 @@ def _times(factor: float) -> str:
 
 
 def _claim(each: Evidence, runs: int) -> str:
-    """Compare errors with the claimed covariance in a few words."""
+    """Compare errors with the covariance that the estimator states, in a few words."""
     by = each.decisive
     if by is None:
         return "its covariance was not judged"
@@ -428,7 +428,7 @@ def _beside(factor: float, take: str) -> str:
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
-    """Write which estimators cannot be distinguished, and which differences exceed chance."""
+    """Describe the pairs of estimators that cannot be distinguished, and the significant differences."""
     draws, differences = [], []
     main = found.error_name
     for label in labels if take else ():
@@ -461,11 +461,11 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
     return draws, differences
 
 
-# Which estimator to take
+# The choice of an estimator
 
 
 def broken_of(found: Findings) -> list[Evidence]:
-    """List the estimators that cannot be trusted: failing ones, then overconfident ones, worst first."""
+    """List the estimators that cannot be trusted, failing ones first, then the most overconfident."""
 
     def badness(each: Evidence) -> float:
         return math.inf if each.has_failed else each.decisive.factor if each.decisive else 0.0
@@ -475,9 +475,9 @@ def broken_of(found: Findings) -> list[Evidence]:
 
 
 def choice_of(found: Findings) -> tuple[str, list[str]]:
-    """Choose the trusted estimator to take (empty if there is none), and those that tie with it.
+    """Choose the trusted estimator to use (empty if there is none), and list those that tie with it.
 
-    Among ties, conservative estimators come last.
+    Of those that tie, conservative estimators come last.
     """
     sound = [each for each in found.of.values() if each.error is not None and not each.is_broken]
     if not sound:
@@ -500,7 +500,7 @@ def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str
 
 
 def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
-    """Recommend one of the tied estimators; conservative ones are candidates only if all are."""
+    """Recommend one of the tied estimators, a conservative one only if all of them are conservative."""
     careful = [label for label in tied if found.of[label].verdict == Consistency.CONSERVATIVE]
     left = [label for label in tied if label not in careful] or tied
     whom = left[0] if len(left) == 1 else "either" if len(left) == 2 else "any of them"
@@ -517,7 +517,7 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
 
 
 def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequence[str]) -> list[str]:
-    """List what is doubtful: `take` is the recommended estimator, `equal` are those as good."""
+    """List the doubts about a result; `take` is the recommended estimator, `equal` are those as good."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),
@@ -530,7 +530,7 @@ def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequ
 
 
 def named(labels: Sequence[str], among: int = 0) -> str:
-    """Name estimators, or count them if they are many; `among` is the number of all."""
+    """Name estimators, or count them if they are many; `among` is the total number of estimators."""
     if len(labels) == among > 1:
         return "both" if among == 2 else f"all {among}"
     if len(labels) > MOST_NAMED:
@@ -561,7 +561,7 @@ def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
 
 
 def _of_checks(alarms: Sequence[Finding]) -> list[str]:
-    """List what else the checks of a replay found."""
+    """List the other warnings of a replay."""
     whose: dict[str, list[str]] = {}
     for each in alarms:
         if each.kind in _CHECKS:
@@ -591,7 +591,7 @@ def _of_cases(found: Findings, take: str, equal: Sequence[str]) -> list[str]:
 
 
 def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Sequence[str]) -> list[str]:
-    """List what the number of runs leaves open."""
+    """List the questions for which the number of runs is too small."""
     runs = count(found.runs, "run")
     if compared and found.runs < FEWEST_RUNS:
         do = "does" if found.runs == 1 else "do"
@@ -630,7 +630,7 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
 
 
 def numbers_of(by: Squares) -> str:
-    """Write the mean of squares with its interval, and the right value."""
+    """Write the mean of squares with its interval, and the ideal value."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
@@ -639,7 +639,7 @@ def numbers_of(by: Squares) -> str:
 
 
 def gauge(by: Squares) -> Gauge:
-    """Place a mean of squares on the scale of a gauge."""
+    """Locate a mean of squares on the scale of a gauge."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)

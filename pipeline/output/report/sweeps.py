@@ -1,7 +1,7 @@
-"""Openings of the pages of sweeps: which estimator to take at which point, and what chance leaves open.
+"""Openings of the pages of sweeps, which recommend an estimator and its parameters.
 
 Each estimator is represented by the point with its smallest error, and `story` recommends one as in an
-experiment. Points at which it is overconfident count only if it is overconfident at all points.
+experiment. Points at which it is overconfident are used only if it is overconfident at all points.
 """
 
 import math
@@ -25,19 +25,19 @@ from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.judging.verdicts import Comparison, Consistency, Squares
 
-MOST_POINTS = 4  # more points are counted instead of named
-RUNS_TABLE = "sweep-runs"  # errors of every run at every point
+MOST_POINTS = 4  # more points than this are counted instead of named
+RUNS_TABLE = "sweep-runs"  # name of the table with the errors of every run at every point
 Tables = Mapping[str, pd.DataFrame]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep's result, and the data for its sentences.
+    """The result of a sweep, with the tables from which its sentences are written.
 
     Attributes:
         result: the result of the sweep.
         table: a row per point, estimator, quantity and case.
-        rows: errors of every run at every point; empty if the result does not have them.
+        rows: errors of every run at every point; empty if the result does not contain them.
         runs: the number of runs at each point.
     """
 
@@ -67,7 +67,7 @@ class Sweep:
         return own.groupby("point")["value"].mean()
 
     def consistency(self, label: str, point: int) -> Squares | None:
-        """Return NEES of the first case at a point, if the sweep stored its interval."""
+        """Return the NEES of the first case at a point, if the sweep stored its interval."""
         table = self.table
         if "bound_low" not in table:
             return None
@@ -85,7 +85,7 @@ class Sweep:
         return by is not None and by.verdict == Consistency.OVERCONFIDENT
 
     def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
-        """Collect findings for estimators at one point each, as if for an experiment."""
+        """Collect findings for estimators at one point each, as for the estimators of an experiment."""
         metrics, bounds, rows = {}, {}, []
         for name, (label, point) in places.items():
             own = self.table[(self.table["estimator"] == label) & (self.table["point"] == point)]
@@ -102,7 +102,7 @@ class Sweep:
 
     @property
     def of_world(self) -> bool:
-        """Test whether the scenario is swept too, so that no point is better than another."""
+        """Test whether the sweep changes the scenario too, so that no point is better than another."""
         estimators: Mapping[str, Any] = self.result.settings.get("estimators") or {}
         of_all = {key for values in estimators.values() for key in values}
         return any(
@@ -122,7 +122,7 @@ class Sweep:
         return findings(here, {"runs": self.rows})
 
     def where(self, point: int, *, brief: bool = False) -> str:
-        """Write the values at a point in words: with their names, or without if `brief`."""
+        """Describe a point by its values, with their names or, if `brief`, without."""
         parts = []
         for key, value in self.points[point].items():
             text = f"{_value(value)} {written(unit_of(key)) if _is_number(value) else ''}".rstrip()
@@ -137,7 +137,7 @@ class Sweep:
 
 
 def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings]:
-    """Write what was tried, which estimator to take at which point, and the findings behind it.
+    """Write the story of a sweep, with the findings on which it is based.
 
     If the scenario is swept, a user cannot choose the point, so estimators are judged over all
     points.
@@ -165,7 +165,7 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
 
 
 def _tried(sweep: Sweep, labels: list[str]) -> str:
-    """Describe the values, the number of runs, and the estimators of a sweep."""
+    """Describe the swept values, the number of runs, and the estimators."""
     over = []
     for key in sweep.points[0]:
         unit = written(unit_of(key))
@@ -179,7 +179,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
-    """Find the point with an estimator's smallest error, excluding overconfident ones if possible."""
+    """Find the point with an estimator's smallest error, without overconfident points if possible."""
     sure = [point for point in own.index if sweep.is_overconfident(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])
@@ -196,7 +196,7 @@ def _with_points(
     best: Mapping[str, int],
     still: list[str],
 ) -> Story:
-    """Add the best points to the story of estimators at these points."""
+    """Add the best points to the story of the estimators."""
     moved = [label for label in errors if label not in still]
     sentences = []
     for point in dict.fromkeys(best[label] for label in moved):
@@ -224,7 +224,7 @@ def _with_points(
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
-    """Find the other points with the same error, within chance or the margin."""
+    """Find the points whose error equals the smallest, within chance or the margin."""
     found = sweep.at({str(point): (label, int(point)) for point in own.index})
     return [
         int(point)
@@ -246,7 +246,7 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
 
 
 def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
-    """List what is doubtful about a best point."""
+    """List the doubts about a best point."""
     parts = []
     sure = [int(point) for point in own.index if sweep.is_overconfident(label, int(point))]
     if sure and best not in sure:
