@@ -11,10 +11,8 @@ from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
 
 Floats = NDArray[np.float64]
-LONG, TIMES = (
-    10,
-    10.0,
-)  # number of rows, and multiple of the usual run, for which a value may stay the same
+# Number of rows, and multiple of the usual run, for which a value may stay the same.
+LONG, TIMES = 10, 10.0
 NEXT = 2.5  # grid steps within which a value is a neighbour
 MOVING = 0.5  # share of the rows of a span in which another column changes
 LOOKED_AT = 20_000  # rows from which a resolution is determined
