@@ -118,7 +118,7 @@ class OverRuns:
         scratch: Callable[[], KernelArgument] | None = None,
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
-        """Process all runs; NaN and infinity raise no errors, in plain Python either."""
+        """Process all runs; NaN and infinity raise no errors, even in plain Python."""
         if self.compiled_loop is not None and not is_uncompiled():
             with done_once():
                 loop = self.compiled_loop()  # imports modules at first use
