@@ -48,7 +48,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find fields whose path in a full turn has a centre off zero (hard iron) or is an ellipse (soft)."""
+    """Find fields whose path in a full turn is off the centre (hard iron) or an ellipse (soft iron)."""
     field = _field(stream)
     circle = None if field is None else ellipse(field)
     if circle is None:
