@@ -30,7 +30,7 @@ _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers tha
 class Parameters(BaseModel):
     """The base class of all parameter types: immutable, without unknown names, NaN or infinity.
 
-    Defaults are converted to the declared type, as given values are: `sigma_m: float = 1` is 1.0.
+    Like given values, defaults are converted to the declared type: `sigma_m: float = 1` is 1.0.
 
     The meaning of a parameter is in one place: under `Attributes:` in the docstring of its type. Its
     unit is the ending of its name, or is written there too. `describe` returns both.
@@ -354,7 +354,7 @@ def numbers_of(kind: type[Parameters]) -> dict[str, Parameter]:
 
 
 def number_of(kind: type[BaseModel], name: str) -> Parameter:
-    """Describe one number of a type by its full name, in which `NAME` may replace a table's own name.
+    """Describe one number of a type by its full name; `NAME` in it may replace the name of a table.
 
     Raises BadInput if the type has no number of this name.
     """

@@ -1,6 +1,6 @@
 """Lookup of recorders, estimators, metrics and studies by name.
 
-Those of fuselog and of third parties register in the same way: as entry points of an installed
+Objects of fuselog and of third parties register in the same way: as entry points of an installed
 distribution (groups `fuselog.recorders`, `fuselog.models`, `fuselog.estimators`, `fuselog.judges`,
 `fuselog.metrics`, `fuselog.timelines`, `fuselog.drawings`, `fuselog.studies`, `fuselog.exports`).
 Listing names does not import anything.

@@ -278,7 +278,7 @@ def _is_numbered(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def _check_header(path: object, comment: str, name: Format) -> None:
-    """Raise BadInput if column names in a comment give another order of the quaternion."""
+    """Raise BadInput if column names in a comment state another order of the quaternion."""
     places = [re.search(rf"\bq\w*?_?{axis}\b", comment.lower()) for axis in "wx"]
     first, second = (place.start() if place else -1 for place in places)
     if name != "kitti" and min(first, second) >= 0 and (first < second) != (name == "euroc"):

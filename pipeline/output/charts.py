@@ -268,7 +268,7 @@ def coverage(title: str, held: Mapping[str, Mapping[str, float]]) -> Chart:
     places = np.arange(len(names), dtype=float)
     panel = Panel(
         x=Axis(ticks=dict(enumerate(names))),
-        y=Axis(label="of 100 intervals contain the truth", limits=(80.0, 100.5)),
+        y=Axis(label="intervals of 100 that contain the truth", limits=(80.0, 100.5)),
     )
     panel.bands.append(interval("90 to 99", places, 90.0, 99.0))
     for block, counts in held.items():

@@ -35,7 +35,7 @@ class Series:
     holds: bool = False
 
     def integral(self, times_s: Floats) -> Floats:
-        """Integrate the values from the first stamp to others (...); NaN beyond the last."""
+        """Integrate the values from the first stamp to given times (...); NaN after the last stamp."""
         flat = self.values.reshape(len(self.values), -1)
         means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
         total = np.zeros_like(flat)
@@ -97,8 +97,8 @@ class Body:
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
     """Group topics by body: one per namespace, or a single one if no role occurs twice.
 
-    A namespace within another also has the topics of that one: the body of `/imu2/inertial` also has
-    the positions of `/fix`.
+    A nested namespace also has the topics of the outer one: the body of `/imu2/inertial` also has the
+    positions of `/fix`.
     """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0

@@ -136,7 +136,7 @@ def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _apart(steps: Floats, half_turn: float) -> Floats:
-    """Return the sizes of steps; for angles, the smaller of both directions."""
+    """Return the sizes of steps; for angles, in the shorter direction."""
     sizes = np.abs(steps)
     return sizes if half_turn == np.inf else np.minimum(sizes, 2 * half_turn - sizes)
 
@@ -167,7 +167,7 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find columns that are clipped at the end of a common sensor range, or at another value.
 
-    A body at rest has constant values in all of its columns; exact zeros are standstills.
+    Values that are constant because the body rests, and exact zeros, are not reported.
     """
     entries = list(_entries(stream, is_regular=False))
     for field, name, column in entries:

@@ -1,4 +1,4 @@
-"""The result of a check: where, a sentence with the evidence, the severity, and the fix."""
+"""The result of a check: its location, evidence, severity and correction."""
 
 import warnings
 from dataclasses import asdict, dataclass
@@ -126,5 +126,5 @@ class Finding:
 
 
 def digits(value: float) -> float:
-    """Round a number to four digits, as a setting states it."""
+    """Round a number to four digits, for use in a setting."""
     return float(f"{value:.4g}")

@@ -27,7 +27,7 @@ UPRIGHT = {
 
 
 def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose forces, turn rates or fields are exactly zero throughout, unlike any sensor's."""
+    """Find units whose forces, turn rates or fields are exactly zero throughout: not measured."""
     if stream.schema.full_name not in UNITS or len(stream) < FEWEST:
         return
     for field, what in MEASURED.items():

@@ -1,4 +1,4 @@
-"""The checks of a log in tables, applied portion by portion so that memory is bounded."""
+"""Tables of the checks of a log, and their application, portion by portion to limit memory."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial

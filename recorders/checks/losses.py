@@ -78,7 +78,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find the longest silence of a topic, except of sensors of targets and in stated outages."""
+    """Find the longest silence of a topic outside stated outages; sensors of targets are exempt."""
     begin_ns, steps_s = _steps(stream, streams)
     if len(steps_s) < FEWEST or "target_id" in stream.columns:
         return
@@ -159,7 +159,7 @@ def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find clocks at another rate than the recorder's: of all topics, as in simulations, or of one."""
+    """Find clocks at another rate than the recorder's, of all topics (as in simulations) or of one."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }

@@ -22,7 +22,7 @@ SCATTER = 0.1  # about the ellipse, relative to the radius
 
 
 def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find fields that are the Earth's field in another unit, or in none."""
+    """Find measurements of the Earth's magnetic field in a wrong unit, or normalised."""
     field = _field(stream)
     if field is None:
         return
@@ -48,7 +48,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find fields whose circle in a full turn is off the origin (hard iron) or an ellipse (soft)."""
+    """Find fields whose path in a full turn is off the centre (hard iron) or an ellipse (soft iron)."""
     field = _field(stream)
     circle = None if field is None else ellipse(field)
     if circle is None:

@@ -222,7 +222,7 @@ def _ahead_s(stream: Stream) -> float:
 
 
 def _named_offset(offset_s: float, unix_s: float) -> str:
-    """Name a known offset of this many seconds at a time; empty if there is none."""
+    """Describe the known cause of a clock's offset in s at a Unix time; empty if there is none."""
     gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
     for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
         if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:

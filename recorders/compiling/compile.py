@@ -1,7 +1,7 @@
 """Compilation of functions of one run into loops over all runs, which the cores share.
 
-A kernel is a plain Python function of numbers and arrays that creates no arrays, with all functions that
-it calls. `fuselog.recorders.compiling.kernels` translates it to LLVM IR in milliseconds. With
+A kernel is a plain Python function of numbers and arrays, together with all functions that it calls. It
+creates no arrays. `fuselog.recorders.compiling.kernels` translates it to LLVM IR in milliseconds. With
 FUSELOG_UNCOMPILED=1, kernels run as plain Python, which a debugger can follow and which is the reference
 for compiled code.
 """
@@ -118,7 +118,7 @@ class OverRuns:
         scratch: Callable[[], KernelArgument] | None = None,
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
-        """Process all runs; NaN and infinity raise no errors, in plain Python either."""
+        """Process all runs; NaN and infinity raise no errors, even in plain Python."""
         if self.compiled_loop is not None and not is_uncompiled():
             with done_once():
                 loop = self.compiled_loop()  # imports modules at first use

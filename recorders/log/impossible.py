@@ -132,18 +132,18 @@ class Rejections(dict[str, Counter[str]]):
     """Counts of impossible messages that are left out, by topic and by reason."""
 
     def note(self, topic: str, found: Counter[str]) -> None:
-        """Record what one read of a topic, or of a part of it, left out; reads may repeat."""
+        """Record the messages that a read of a topic or a part of it left out; reads may repeat."""
         self[topic] = self.get(topic, Counter()) | found
 
     def sentence(self, topic: str) -> str:
-        """Describe what is left out of a topic."""
+        """Describe the messages that are left out of a topic."""
         return "; ".join(
             f"{count} {'message is' if count == 1 else 'messages are'} left out: {why}"
             for why, count in self[topic].items()
         )
 
     def plus(self, others: Iterable["Rejections"]) -> "Rejections":
-        """Add up what was left out of several runs."""
+        """Add the counts of several runs."""
         total = Rejections(self)
         for other in others:
             for topic, found in other.items():

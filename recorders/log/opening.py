@@ -1,4 +1,4 @@
-"""Opened logs: their topics, and what is missing."""
+"""Opened logs: their topics and missing parts."""
 
 import warnings
 from collections.abc import Mapping, Sequence

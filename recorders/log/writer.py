@@ -134,7 +134,7 @@ class LogWriter:
         return len(numbered)
 
     def _declare(self, stream: Stream) -> None:
-        """Register the stream's topic, or compare it with what is registered."""
+        """Register the stream's topic, or compare it with the registered one."""
         widths = {
             entry.name: stream.columns[entry.name].shape[1]
             for entry in stream.schema

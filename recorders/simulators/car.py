@@ -1,4 +1,4 @@
-"""Simulator of a car with wheels, an antenna that gives fixes, and a compass, with errors of each.
+"""Simulator of a car with wheels, a receiver of fixes, and a compass, all with errors.
 
 The car drives on exact arcs, one for each step of its odometry. It tests diagnosis and calibration.
 Begin with `drive`; `streams_of` makes a log.
@@ -25,7 +25,7 @@ SPEED_MPS, TURN_RADPS, CIRCLE_S = 8.0, 0.4, 15.708
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Return speeds and turn rates (n,) at times (n,) of a straight drive; so do the other motions."""
+    """Return speeds and turn rates (n,) at times (n,) of a straight drive, like the other motions."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
@@ -67,7 +67,7 @@ MOTIONS: dict[str, Motion] = {
 
 
 class CarParameters(Parameters):
-    """The motion of the car, and the noise and errors of its sensors; errors are zero by default.
+    """The motion of the car, and the noise and faults of its sensors; by default there are no faults.
 
     Attributes:
         duration_s: length of the drive.

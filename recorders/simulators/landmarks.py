@@ -1,6 +1,6 @@
 """Simulator of robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
-Odometry states the velocity from its stamp to the next; the robot's velocity is that plus white noise.
+Each odometry message states the velocity until the next one; the true velocity is that plus white noise.
 Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
 """
 

@@ -68,7 +68,7 @@ def of_moving_sights() -> tuple[Chart, Wanted]:
     }
     for name, own in wanted.items():
         if "NEES" in name:
-            own["as it should be"] = [[1, 2], [1, 1]]
+            own["expected"] = [[1, 2], [1, 1]]
         else:
             own |= {key: [x, 1e3 * np.sqrt(y)] for key, (x, y) in own.items()}
     return moving._chart(table), wanted
@@ -111,9 +111,9 @@ def of_bandwidth() -> tuple[Chart, Wanted]:
 
 def of_lies() -> tuple[Chart, Wanted]:
     names = {
-        "position_rmse_m": "RMSE of honest nodes (m)",
-        "nees": "mean NEES of honest nodes",
-        "liar_refused": "share of the liar's messages refused",
+        "position_rmse_m": "RMSE of the other nodes (m)",
+        "nees": "mean NEES of the other nodes",
+        "liar_refused": "share of the liar's messages rejected",
     }
     table = made(*names, estimator=BOTH, lie_m=[0.0, 5.0])
     return stress._lie_chart(table), {
@@ -150,7 +150,7 @@ def of_sounds() -> tuple[Chart, Wanted]:
     """The share of errors that are at most as large."""
     table = pd.DataFrame({"snr_db": [10.0] * 4 + [0.0] * 2, "error_m": [4.0, 1, 3, 2, 6, 5]})
     own = {"10 dB": [[1, 2, 3, 4], [0.25, 0.5, 0.75, 1]], "0 dB": [[5, 6], [0.5, 1]]}
-    return recordings._chart(table), {"share of the sounds below it over error (m)": own}
+    return recordings._chart(table), {"share of sounds with a smaller error over error (m)": own}
 
 
 def of_units() -> tuple[Chart, Wanted]:
@@ -207,7 +207,7 @@ def of_kinds_of_movement() -> tuple[Chart, Wanted]:
 def of_bounded_sets() -> tuple[Chart, Wanted]:
     """A metric that is missing has no mark."""
     metrics = {"box.containment_share": 1.0, "box.area_median_m2": 3.0, "l4.containment_share": 0.5}
-    labels = ("share of sets that hold the truth", "median area (m²)")
+    labels = ("share of sets that contain the truth", "median area (m²)")
     values = ([1.0, 0.5], [3.0, np.nan])
     return set_membership._bounds_chart(metrics), {
         f"{label} over ": {label: [["box", "l4"], own]}
@@ -218,7 +218,7 @@ def of_bounded_sets() -> tuple[Chart, Wanted]:
 def of_filtered_sets() -> tuple[Chart, Wanted]:
     """Of the first run."""
     table = made("area_m2", "inside", run=[0, 1], estimator=BOTH, case=["robot1", "robot2"])
-    labels = {"area_m2": "median area (m²)", "inside": "share that holds the robot"}
+    labels = {"area_m2": "median area (m²)", "inside": "share of frames with the robot inside"}
     return set_filter._chart(table), {
         f"{label} over ": of_both(table, "case", name, run=0) for name, label in labels.items()
     }
@@ -270,11 +270,11 @@ def of_vehicles() -> tuple[Chart, Wanted]:
     squared = np.array([[1.0, 4.0], [9.0, np.nan], [25.0, 16.0]])
     case: Any = SimpleNamespace(name="turning", scores={"kf": SimpleNamespace(assigned_by_step=squared)})
     own = {"kf": [[1, 2], [3.0, np.sqrt(10.0)]]}
-    return vehicles._chart(case), {"error of all vehicles, median (m) over step": own}
+    return vehicles._chart(case), {"median error of all vehicles (m) over step": own}
 
 
 def of_numbers_of_vehicles() -> tuple[Chart, Wanted]:
-    names = {"step_ms": "CPU time of a step (ms)", "position_rmse_m": "error of a vehicle (m)"}
+    names = {"step_ms": "CPU time per step (ms)", "position_rmse_m": "error per vehicle (m)"}
     table = made(*names, estimator=BOTH, vehicles=[2, 5, 10])
     return scaling._chart(table), {
         f"{label} over vehicles": of_both(table, "vehicles", name) for name, label in names.items()
@@ -312,7 +312,9 @@ def of_winds() -> tuple[Chart, Wanted]:
         }
     )
     own = {"torus": [[2, 3], [3.0, 8.0]]}
-    return torus_real._chart(table, 2), {"log density above persistence, summed over hour": own}
+    return torus_real._chart(table, 2), {
+        "cumulative log density minus that of persistence over hour": own
+    }
 
 
 def of_moved_samples() -> tuple[Chart, Wanted]:
@@ -343,7 +345,7 @@ def of_drives() -> tuple[Chart, Wanted]:
         (moments, "mean_error", "error of the mean (sigma)", f"waves {words}, N = 2", {"dimension": 2}),
         (moments, "mean_error", "error of the mean (sigma)", f"waves {words}, N = 4", {"dimension": 4}),
         (drives, "position_rmse_m", "RMSE of the position (m)", "slow, 7 states", {}),
-        (drives, "cpu_ms_per_s", "CPU time for a second (ms)", "slow, 7 states", {}),
+        (drives, "cpu_ms_per_s", "CPU time per second of log (ms)", "slow, 7 states", {}),
     ):
         table["samples"] = table["estimator"].map(samples)
         means = dict(zip(*over(table, "estimator", quantity, **where), strict=True))

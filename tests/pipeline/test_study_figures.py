@@ -54,7 +54,7 @@ def test_figures_of_lines_of_sight() -> None:
     cases = [sights(number, of) for of in ("narrow", "wide") for number in (1, 2)]
     figures = optical.figures(cases, RUNS)
     narrow, wide = figures["nees"].panels
-    assert (narrow.title, wide.title) == ("narrow: a mark is 7 runs", "wide: a mark is 7 runs")
+    assert (narrow.title, wide.title) == ("narrow: each mark is 7 runs", "wide: each mark is 7 runs")
     assert columns(wide.series, "CRLB at the truth") == [
         ([0.75, 1.25], [13.0, 17.0]),
         ([1.75, 2.25], [14.0, 18.0]),

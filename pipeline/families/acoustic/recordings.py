@@ -203,7 +203,9 @@ def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
 
 def _chart(simulated: pd.DataFrame) -> Chart:
     """Draw the cumulative distribution of errors of the simulated sounds, by noise level."""
-    panel = Panel(x=Axis(label="error (m)", log=True), y=Axis(label="share of the sounds below it"))
+    panel = Panel(
+        x=Axis(label="error (m)", log=True), y=Axis(label="share of sounds with a smaller error")
+    )
     for snr_db, rows in simulated.groupby("snr_db", sort=False):
         error_m = np.sort(rows["error_m"])
         share = np.arange(1, len(error_m) + 1) / len(error_m)

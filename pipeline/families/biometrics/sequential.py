@@ -44,8 +44,8 @@ RatioOf = Callable[[Integers], Floats]
 WAYS = {
     "independent": "independent probes",
     "one-identity": "impostors against one identity",
-    "alike": "probes of one person alike",
-    "matchers": "one person, matcher after matcher",
+    "alike": "correlated probes of one person",
+    "matchers": "one person, one matcher after another",
 }
 # The person scores like an impostor, impostors score like the person, or genuine scores drop.
 FAULTS = ("misses", "accepts", "drifts")

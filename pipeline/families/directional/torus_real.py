@@ -355,7 +355,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
     """Draw the cumulative gain in log density over persistence, for the second half."""
     wide = table.pivot_table(index="hour", columns="predictor", values="log_density").loc[half:]
     gains = wide.sub(wide["persistence"], axis=0).cumsum()
-    panel = Panel(x=Axis(label="hour"), y=Axis(label="log density above persistence, summed"))
+    panel = Panel(x=Axis(label="hour"), y=Axis(label="cumulative log density minus that of persistence"))
     for name in gains.columns.drop("persistence"):
         panel.series.append(curve(str(name), gains.index, gains[name]))
     return Chart(panels=[panel])

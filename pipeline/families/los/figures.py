@@ -49,7 +49,7 @@ def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
         bounds = chi_square_interval(len(cases[0].truth), runs)
         ends = [min(numbers) - 0.5, max(numbers) + 0.5]
         panel = Panel(
-            title=f"{name}: a mark is {runs} runs",
+            title=f"{name}: each mark is {runs} runs",
             x=Axis(label="scenario", ticks={float(number): str(number) for number in numbers}),
             y=Axis(label="mean NEES"),
             bands=[interval(EFFICIENT, ends, *bounds)],

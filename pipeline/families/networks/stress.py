@@ -231,9 +231,9 @@ def _bandwidth_chart(table: pd.DataFrame) -> Chart:
 def _lie_chart(table: pd.DataFrame) -> Chart:
     """Draw error and NEES of the other nodes, and the share of rejected messages, over the offset."""
     labels = {
-        "position_rmse_m": "RMSE of honest nodes (m)",
-        "nees": "mean NEES of honest nodes",
-        "liar_refused": "share of the liar's messages refused",
+        "position_rmse_m": "RMSE of the other nodes (m)",
+        "nees": "mean NEES of the other nodes",
+        "liar_refused": "share of the liar's messages rejected",
     }
     panels = [
         Panel(

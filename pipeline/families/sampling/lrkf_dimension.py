@@ -247,7 +247,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
         middle_m = float(rows["position_rmse_m"].mean())
         y = Axis(label="RMSE of the position (m)", limits=(0.0, 1.5 * middle_m))
         panels.append(_over_samples(rows, "position_rmse_m", y, title))
-        y = Axis(label="CPU time for a second (ms)", log=True)
+        y = Axis(label="CPU time per second of log (ms)", log=True)
         panels.append(_over_samples(rows, "cpu_ms_per_s", y, title))
     return Chart(panels=panels, columns=moments["dimension"].nunique())
 

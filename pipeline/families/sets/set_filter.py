@@ -174,7 +174,10 @@ def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]
 def _chart(summary: pd.DataFrame) -> Chart:
     """Draw area and containment by robot."""
     panels = []
-    for quantity, label in (("area_m2", "median area (m²)"), ("inside", "share that holds the robot")):
+    for quantity, label in (
+        ("area_m2", "median area (m²)"),
+        ("inside", "share of frames with the robot inside"),
+    ):
         series = curves(summary[summary["run"] == 0], ["estimator"], "case", quantity, "markers")
         panels.append(Panel(y=Axis(label=label, log=quantity == "area_m2"), series=series))
     return Chart(columns=2, panels=panels)

@@ -148,7 +148,7 @@ def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
     """Draw containment and area by estimator."""
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
     labels = {
-        "containment_share": "share of sets that hold the truth",
+        "containment_share": "share of sets that contain the truth",
         "area_median_m2": "median area (m²)",
     }
     panels = []

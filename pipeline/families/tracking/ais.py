@@ -91,7 +91,7 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
         if isinstance(each, Output) and each.leaf == "track":
             stream = each.rows.stream
             seen[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
-    below = Panel(x=Axis(label="time (s)"), y=Axis(label=f"heard within {options.live_s:g} s"))
+    below = Panel(x=Axis(label="time (s)"), y=Axis(label=f"received within {options.live_s:g} s"))
     for label, (time_ns, numbers) in seen.items():
         at_ns, live = live_counts(time_ns, numbers, options.live_s)
         rows = thinned(len(at_ns))

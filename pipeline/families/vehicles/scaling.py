@@ -149,8 +149,8 @@ def _chart(table: pd.DataFrame) -> Chart:
     ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
     x = Axis(label="vehicles", log=True, ticks=ticks)
     axes = {
-        "step_ms": Axis(label="CPU time of a step (ms)", log=True),
-        "position_rmse_m": Axis(label="error of a vehicle (m)", limits=(0, 3)),
+        "step_ms": Axis(label="CPU time per step (ms)", log=True),
+        "position_rmse_m": Axis(label="error per vehicle (m)", limits=(0, 3)),
     }
     panels = []
     for quantity, y in axes.items():

@@ -178,7 +178,7 @@ def _chart(case: Case) -> Chart:
     for label, scores in case.scores.items():
         median = np.sqrt(np.nanmedian(scores.assigned_by_step, axis=0))
         series.append(curve(label, np.arange(1, len(median) + 1), median))
-    y = Axis(label="error of all vehicles, median (m)", limits=(0, 4))
+    y = Axis(label="median error of all vehicles (m)", limits=(0, 4))
     return Chart(title=case.name, panels=[Panel(x=Axis(label="step"), y=y, series=series)])
 
 

@@ -48,7 +48,7 @@ OPERATORS: dict[type[ast.AST], Value] = {
 
 
 def is_known(value: Value) -> bool:
-    """Test whether no part of a value exists only at run time."""
+    """Test whether all parts of a value are known before run time."""
     if isinstance(value, Number | Array):
         return False
     parts = entries(value)

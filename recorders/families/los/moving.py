@@ -92,7 +92,7 @@ class Course(NamedTuple):
 
 
 def simulate(parameters: MovingOpticalParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raise BadInput if there is not one weave amplitude per sensor."""
+    """Record one run; raise BadInput unless there is one weave amplitude per sensor."""
     sensors = len(parameters.sensor_position_m)
     if len(parameters.weave_m) != sensors:
         raise BadInput(

@@ -22,7 +22,7 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """The scene of section V of the paper (without noise, its first pairs), or random scenes.
+    """The scene of section V of the paper (its first pairs, without noise), or random scenes.
 
     Attributes:
         scene: the paper's scene or random scenes.

@@ -22,7 +22,7 @@ from fuselog.recorders.importers.ros.parameters import RosParameters
 
 
 class Reader(NamedTuple):
-    """How the messages of a connection are read; `taken` is None for transforms."""
+    """The way in which the messages of a connection are read; `taken` is None for transforms."""
 
     type: MessageType
     taken: Taken | None
@@ -32,7 +32,7 @@ class Reader(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """How the messages of connections are read, and the reasons by topic why others are not."""
+    """The readers of the chosen connections, and by topic the reason why others are not read."""
 
     readers: dict[Connection, Reader]
     not_taken: dict[str, str]

@@ -28,7 +28,7 @@ class MessageMapping(StreamMapping):
     Attributes:
         name: last part of the stream's name.
         stamp: path of a time, or of a whole number of ns, at which the message was measured.
-        frame: path of the name of the frame.
+        frame: path of the field with the name of the frame.
     """
 
     name: str = "value"

@@ -106,7 +106,7 @@ def covariance(messages: Messages, path: str) -> Floats:
 
 
 def has_none(messages: Messages, path: str) -> NDArray[np.bool_]:
-    """Test which messages (n,) state by a covariance that begins with -1 that they have no such data."""
+    """Test which messages (n,) have a covariance that begins with -1, which marks missing data."""
     return np.asarray(messages.numbers(path)[:, 0] == -1.0)
 
 

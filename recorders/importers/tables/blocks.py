@@ -1,4 +1,4 @@
-"""Readers of texts in blocks of whole lines with a limited length, so that memory holds one block."""
+"""Readers of texts in blocks of whole lines with a limited length, to limit memory."""
 
 import io
 from collections import Counter

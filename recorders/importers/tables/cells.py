@@ -20,7 +20,7 @@ _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 def read_ns(
     cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, remedy: str
 ) -> Stamps:
-    """Convert cells (n,) to stamps; texts keep all digits, whereas doubles have steps of 200 ns today.
+    """Convert cells (n,) to stamps; texts keep all digits, which doubles do not.
 
     Args:
         cells: whole numbers, floats, texts of numbers, or timestamps or durations, which have their own

@@ -174,7 +174,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
 
 
 def _target(table: GuessedTable) -> Iterator[str]:
-    """Write ranges and bearings; a single one needs a column of target numbers to be recognised."""
+    """Write ranges and bearings; a range or bearing alone needs a column of target numbers."""
     columns = table.columns
     whole = list(columns)
     number = take(columns, _TARGET)
@@ -325,7 +325,7 @@ def _along_axes(
 
 
 def _turned(turn: Sequence[GuessedColumn]) -> list[str]:
-    """Write the assumption on the frames of a quaternion."""
+    """Write the assumption about the frames of a quaternion."""
     if not turn:
         return []
     names = ", ".join(each.name for each in turn)
@@ -360,7 +360,7 @@ _TRUE = r"(^|_)(ground_?truth|truth|gt|mocap|vicon|optitrack)(_|$)"
 
 
 def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[GuessedColumn]:
-    """Remove the columns that are named as truth from the list; return them without that word.
+    """Remove the columns named as truth from the list; return them, without the word in their names.
 
     Args:
         columns: columns of a table.

@@ -110,7 +110,7 @@ def known_of(column: GuessedColumn) -> NDArray:
 def stated_unit(column: GuessedColumn, usual: str) -> str:
     """Return the unit that a column's name states, if it measures the same quantity as the usual unit.
 
-    A turn rate in deg is in deg/s, and a latitude in minutes is in minutes of arc.
+    For a turn rate, deg means deg/s, and for a latitude, minutes are minutes of arc.
     """
     meant = {"rad/s": f"{column.unit}/s", "deg": "arcmin" if column.unit == "min" else ""}
     for stated in (column.unit, meant.get(usual, "")):

@@ -102,7 +102,7 @@ _ARDUPILOT, _RECEIVED = "TimeUS", "timestamp"
 
 
 class GuessedTime(NamedTuple):
-    """A table's time: TOML, the columns that it uses, and comments on what was seen and assumed.
+    """A table's time: TOML, the columns that it uses, and comments with facts and assumptions.
 
     `stamps` (n,) are the stamps of the rows, or None if no column has them; `vehicle` is the column that
     identifies the vehicle of each row.
@@ -200,7 +200,7 @@ def _vehicle(batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str
 
 
 def _separates(cells: pa.Array) -> bool:
-    """Test whether cells have few values, each of which occurs several times."""
+    """Test whether cells have only a few different values, each of them several times."""
     if pa.types.is_floating(cells.type) and not _are_whole(cells.to_numpy(zero_copy_only=False)):
         return False
     counts = pc.value_counts(cells.drop_null()).field("counts")
@@ -910,7 +910,7 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
 
 
 def _seen(parts: Sequence[Stamps]) -> list[str]:
-    """Write the rate, gaps and repetitions of stamps, with each vehicle on its own."""
+    """Write the rate, gaps and repetitions of stamps, separately for each vehicle."""
     steps_s = np.concatenate([np.diff(part) for part in parts]) * 1e-9
     if is_reversed(parts):
         steps_s = -steps_s

@@ -320,7 +320,7 @@ def _time(
 
 
 def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
-    """Sort the rows by time; with several vehicles, keep those of the one with the most rows."""
+    """Sort the rows by time; of several vehicles, keep only the one with the most rows."""
     rows = np.arange(len(next(iter(batch.values()))))
     if vehicle:
         names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
@@ -379,7 +379,7 @@ def _has_commas(cells: pa.Array) -> bool:
 
 
 def _split(name: str, cells: pa.Array) -> list[str]:
-    """Return names for the numbers in each cell of a column; empty unless all cells hold several."""
+    """Return names for the numbers in each cell of a column; empty unless all cells have several."""
     if not pa.types.is_string(cells.type) or not re.search(r"\d[\s,;]+[-+.\d]", first_cell(cells)):
         return []
     is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()

@@ -38,7 +38,7 @@ from fuselog.recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, and what differs between recordings.
+    """The mapping, and settings that differ between recordings.
 
     Attributes:
         mapping: the mapping, by its name (walk) or file (own.toml).

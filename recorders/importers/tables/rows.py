@@ -126,7 +126,7 @@ class Rows:
 
     @property
     def tag_name(self) -> str:
-        """Return the name of the time tag that states when the file was begun, or an empty string."""
+        """Return the name of the time tag with the start time of the file, or an empty string."""
         return self.path.name + self._time.tag if self._time.tag else ""
 
     def _clock(self, given: TimeMapping) -> TimeMapping:

@@ -58,7 +58,7 @@ class Undecided(BadInput):
 
 
 class TimeMapping(Parameters):
-    """Where the time of a row is, and in which format.
+    """The columns with the time of a row, and its format.
 
     Attributes:
         column: one column, or several that belong together, such as the texts of date and time, or
@@ -146,7 +146,7 @@ class TimeMapping(Parameters):
 
     @property
     def counts_all_weeks(self) -> bool:
-        """Test whether GPS weeks are used, and count from the first one."""
+        """Test whether there are GPS weeks that count from 1980 without restarts."""
         return self.week is not None and "zero" not in self.model_fields_set
 
     @property

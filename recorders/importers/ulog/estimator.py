@@ -131,7 +131,7 @@ class _Table(NamedTuple):
 
 
 def label_of(instance: int) -> str:
-    """Return the name of an instance of the filter as an estimator."""
+    """Return the estimator name of an instance of the filter."""
     return f"ekf2_{instance}" if instance else "ekf2"
 
 

@@ -219,7 +219,7 @@ class UlogFile:
     def _resumption(
         self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
     ) -> int:
-        """Find where messages resume: at a mark, which old firmware lacks, or at rows; or -1."""
+        """Find where messages resume: at a mark, which old firmware lacks, or at rows; -1 if nowhere."""
         found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
         return min((each for each in found if each >= 0), default=-1)
 
@@ -266,7 +266,7 @@ class UlogFile:
     def _count_strays(
         self, which: NDArray[np.int64], data: NDArray[np.uint8], at: NDArray[np.int64]
     ) -> None:
-        """Count the rows without a topic: of a number that no topic has, or that two have."""
+        """Count the rows without a topic: no topic has their number, or two topics have it."""
         begins = at[which] + HEAD_BYTES
         numbers = data[begins].astype(np.int64) + (data[begins + 1].astype(np.int64) << 8)
         is_known = self._known.since[numbers] < _NEVER

@@ -1,7 +1,7 @@
-"""A few threads that work ahead.
+"""A few threads that process items in advance.
 
-Packing and opening chunks is compiled code that runs in parallel to other threads, so it shares the
-cores, and the file is read or written at the same time.
+Chunks are packed and opened by compiled code that runs in parallel to other threads, so several cores
+are used, and the file is read or written at the same time.
 """
 
 import os
@@ -18,7 +18,7 @@ THREADS = min(4, os.cpu_count() or 1)
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Map in the same order, but a few items ahead, so that memory stays bounded."""
+    """Map items in their order, with a few of them in advance, so that memory stays bounded."""
     rest = iter(items)
     yield from map(work, islice(rest, 1))  # a log of one chunk needs no threads
     with ThreadPoolExecutor(THREADS) as pool:

@@ -60,7 +60,7 @@ _RECORDS: dict[int, Any] = {
 
 
 class Damaged(ValueError):
-    """An error for a part of a file that cannot be read; the text says which, and why."""
+    """An error for a part of a file that cannot be read; the text names the part and the reason."""
 
 
 class Span(NamedTuple):
@@ -159,7 +159,7 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
 
 
 def _stated_size(region: bytes) -> int:
-    """Return the uncompressed size of a region, as it states it."""
+    """Return the uncompressed size that a region states."""
     if region[0] != Opcode.CHUNK:
         return len(region)
     return int(_CHUNK_HEAD.unpack_from(region, HEAD_BYTES)[2])

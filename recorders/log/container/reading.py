@@ -123,7 +123,7 @@ class _Index(NamedTuple):
 
 
 class NotMcap(BadInput):
-    """An error for files of another kind, which some commands accept in another way."""
+    """An error for files that are not MCAP, some of which a command may accept in another way."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
@@ -183,7 +183,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
 
 
 def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
-    """Describe what is ignored after the data section; empty for nothing, or a damaged summary."""
+    """Describe bytes that are ignored after the data section; empty if there are none."""
     position = data_end
     while (place := _record_at(file, size, position)) is not None:
         position = place.end
@@ -202,7 +202,7 @@ def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
 
 
 def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
-    """Yield what the summary lists but the data section lacks (`chunks`, metadata), and the reverse."""
+    """Yield sentences on differences between the summary and the data section (`chunks`, metadata)."""
     for offset in sorted(chunks):
         yield f"there is no chunk at byte {offset}, although its index lists one"
     for entry in summary.records:

@@ -58,7 +58,7 @@ class Bag:
 
 
 def looks_like_bag(path: Path) -> bool:
-    """Test whether a path is named like a bag that is not MCAP: a folder of one, a .bag or a .db3."""
+    """Test whether a path looks like a bag that is not MCAP: a .bag or .db3 file, or a bag's folder."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_members(path, {}))
     return path.suffix in (".bag", ".db3")
