@@ -1,5 +1,5 @@
-"""Foreign filters in a replay: a library of `fuselog_filter.h`, or a program, streaming or not.
+"""Foreign filters in a replay: libraries with the functions of `fuselog_filter.h`, and programs.
 
-Begin with `filters`, which makes estimators of them; `description` defines how a filter describes
-itself.
+Begin with `filters`, which makes estimators from them; `description` defines the description of a
+filter.
 """

@@ -15,16 +15,16 @@ from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.channels import resolved
 from fuselog.replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
 
-MOST_COMPONENTS = 1000  # of a state; the covariance then has a million numbers
+MOST_COMPONENTS = 1000  # components of a state; the covariance then has a million numbers
 
 
 class ForeignParameters(Parameters):
     """Settings of a foreign filter; the parameters in its description are added to them.
 
     Attributes:
-        time_limit_s: a run fails if one message takes longer.
-        memory_limit_mb: a run fails if the filter's process takes more memory.
-        every_s: additional estimates are given at the multiples of this time.
+        time_limit_s: limit of the time for one message; a run that exceeds it fails.
+        memory_limit_mb: limit of the memory of the filter's process; a run that exceeds it fails.
+        every_s: interval of additional estimates, at multiples of this time.
         seed: seed of the filter's random numbers.
     """
 
@@ -44,12 +44,12 @@ class TopicRead(_Part):
     """Topic that a filter reads.
 
     Attributes:
-        topic: its name; one without a leading slash is searched under every prefix.
-        fields: fields that the filter is given, in this order; `position_m[2]` is a vector of two.
-        message: name of the message's schema, such as `fuselog.RangeBearing`; "" for any.
-        static: whether all of its messages are passed before the start, as for a map.
+        topic: name of the topic; a name without a leading slash is searched under every prefix.
+        fields: fields that the filter reads, in this order; `position_m[2]` is a vector of two numbers.
+        message: schema of its messages, such as `fuselog.RangeBearing`; "" for any schema.
+        static: whether all of its messages are passed to the filter before the start, as for a map.
         optional: whether a log may lack it.
-        estimates: whether estimates are wanted at its messages.
+        estimates: whether the filter is asked for an estimate after each of its messages.
         target: field with the identifier of the measured target.
     """
 
@@ -83,7 +83,7 @@ class TopicRead(_Part):
 
 
 class ParameterRead(_Part):
-    """Parameter: default (None: what the log's channels state), bounds, unit and meaning."""
+    """Parameter: default (None if the log's channels state it), bounds, unit and meaning."""
 
     default: float | None = None
     unit: str = ""
@@ -102,14 +102,15 @@ class Description(_Part):
         summary: one-line description.
         topics: topics that it reads.
         state: components of the state by name, with their kinds.
-        innovation: components of its innovations; empty if it gives none.
-        parameters: by name.
-        prior: topic of the prior; "" if it starts by itself.
+        innovation: components of its innovations; empty if it has none.
+        parameters: parameters by name.
+        prior: topic of the prior; "" if it starts without one.
         truth: topic of the truth.
         output: last part of the name of its topic of estimates.
-        failures: sentences; a function that returns n means the n-th one.
+        failures: sentences; if a function of the filter returns n, the n-th sentence describes the
+            failure.
         digest: for a filter written by `fuselog deploy`, the digest of its graphs and numbers.
-        protocol: for a program that answers messages, its version of the protocol.
+        protocol: for a streaming program, its version of the protocol.
     """
 
     summary: str
@@ -166,7 +167,7 @@ class Description(_Part):
         )
 
     def parameters_over(self, base: type[Parameters]) -> type[Any]:
-        """Make the type of all parameters: the settings in `base`, and the filter's own parameters."""
+        """Make the type of all parameters: the settings in `base`, and the parameters of the filter."""
         fields: dict[str, Any] = {}
         for name, each in self.parameters.items():
             bounds = {

@@ -1,7 +1,7 @@
-"""Estimators made from foreign filters, bound to the topics of a log like any other.
+"""Estimators made from foreign filters; they bind to the topics of a log like any estimator.
 
-A filter in this process gets its messages block by block. A filter in a process of its own gets all
-messages of a run when the replay ends, so that a run that crashes its process affects no other run.
+A filter in this process gets its messages block by block. A filter in a separate process gets all
+messages of a run at the end of the replay; if it crashes, only this run is affected.
 """
 
 import weakref
@@ -56,7 +56,7 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 from fuselog.replay.inference.run.timing import add_output_times
 
 Prior = tuple[Integers, Floats, Floats]
-# Processes runs by their filters in other processes; None for a run that does not take part.
+# Processes runs with their filters in other processes; None marks a run that does not take part.
 FollowRuns = Callable[[Sequence[RunGiven | None], Limits], list[Ran | None]]
 
 
@@ -65,7 +65,8 @@ class LibraryParameters(ForeignParameters):
 
     Attributes:
         path: the library, which has the functions of `fuselog_filter.h`.
-        in_process: call it in this process: this is faster, but a crash of the filter ends the replay.
+        in_process: whether it is called in this process; this is faster, but a crash of the filter ends
+            the replay.
     """
 
     path: str = ""
@@ -80,8 +81,8 @@ class FoundFilter:
         name: name of its output topics, after `/estimates/`.
         description: description of the filter.
         prefix: prefix of its topics.
-        topics: topics that the log has, by the names in the description.
-        prior: topic of the prior; "" if it starts by itself.
+        topics: topics of the log, by the names in the description.
+        prior: topic of the prior; "" if it starts without one.
         parameters: all of its parameters.
     """
 
@@ -94,7 +95,7 @@ class FoundFilter:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Return the filter's own parameters; raise BadInput if the log does not state a missing one."""
+        """Return the parameters of the filter; raise BadInput if one is neither set nor in the log."""
         asked = list(self.topics.values())
         return tuple(
             given_or_stated(self.parameters, asked, name) for name in self.description.parameters
@@ -122,16 +123,16 @@ class FoundFilter:
         )
 
     def started(self, given: Mapping[str, Ragged], runs: int) -> tuple[Static, Prior | None]:
-        """Return the static messages and the priors in `given` for this number of runs."""
+        """Return the static messages and the priors of all runs from `given`."""
         prior = gaussians(given[self.prior]) if self.prior else None
         return static_of(self.description, self.topics, given, runs), prior
 
     def events(
         self, block: Block, start_ns: Integers, next_output: Integers
     ) -> tuple[FilterEvents, Integers]:
-        """Convert a block to events, including those of `every_s`, and count the latter.
+        """Convert a block to events, including additional estimates at multiples of `every_s`.
 
-        Returns the events, and the numbers of the next events of `every_s` (runs,).
+        Returns the events, and the multiple of `every_s` at the next additional estimate (runs,).
         """
         events = events_of(self.description, self.topics, block)
         every_s = self.parameters.every_s
@@ -143,7 +144,7 @@ class FoundFilter:
 def bind_all(
     label: str, description: Description, topics: Mapping[str, Topic], parameters: Any
 ) -> list[FoundFilter]:
-    """Bind a filter to everything in a log that it can estimate."""
+    """Bind a filter under every prefix of a log that has its topics."""
     found = []
     for prefix, read in description.bindings(topics):
         name = label + prefix
@@ -156,10 +157,10 @@ def bind_all(
 def _named(
     label: str, what: str, name: str, prefix: str, schema: Schema, topics: Mapping[str, Topic]
 ) -> str:
-    """Return the topic that a description names as its prior or truth; "" if the log has none.
+    """Return the topic of the prior or truth that a description names; "" if the log has none.
 
-    Raises BadInput if the log has another such topic next to those that the filter reads, because the
-    name is then wrong.
+    Raises BadInput if the log has another such topic under the prefix of the filter's topics, because
+    the name is then probably wrong.
     """
     topic = resolved(name, prefix)
     if not name or topic in topics:
@@ -183,7 +184,7 @@ def _named(
 
 
 class _Running(NamedTuple):
-    """State that filters in this process carry from block to block; `owner` destroys them."""
+    """State of filters in this process between blocks; `owner` destroys the filters."""
 
     filters: Filters
     static: Static
@@ -193,7 +194,7 @@ class _Running(NamedTuple):
 
 
 class _Owner:
-    """Owner of filters, which destroys them when it is garbage-collected."""
+    """Owner that destroys filters when it is garbage-collected."""
 
     def __init__(self, library: Library, handles: Integers) -> None:
         weakref.finalize(self, library.destroy_all, handles.tolist())
@@ -243,11 +244,11 @@ def _first_ns(block: Block) -> Integers:
     return np.where(np.diff(offsets) > 0, times_ns[offsets[:-1]], 0)
 
 
-# --- in processes of their own ----------------------------------------------------------------------
+# --- in separate processes -------------------------------------------------------------------------
 
 
 class _Waiting(NamedTuple):
-    """Messages that have come so far."""
+    """Messages that have arrived so far."""
 
     static: Static
     prior: Prior | None
@@ -262,7 +263,7 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
     Args:
         found: the filter.
         follow_runs: function that processes runs with their filters.
-        window_ns: how late out-of-sequence messages may be, if messages are passed in order of arrival;
+        window_ns: largest delay of out-of-sequence messages if messages are passed in order of arrival;
             IN_ORDER if they are passed in order of their stamps.
     """
     description, numbers = found.description, found.numbers
@@ -332,7 +333,7 @@ class _OfLibraries(Estimator[Any]):
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
         """Return the estimator of the library named in `settings` of `label`."""
-        # absolute, because processes have folders of their own
+        # absolute, because processes have their own working folders
         file = _file(Path(what_runs(label, "lib", settings)).absolute())
         in_process = settings.get("in_process", False) is True
         description = _description(file, in_process)
@@ -360,7 +361,7 @@ class _OfLibraries(Estimator[Any]):
 
 
 def _going_back(found: FoundFilter, follow_runs: FollowRuns, window_ns: int) -> Recursive:
-    """Bind a filter to messages in order of arrival; raise BadInput if `every_s` is set."""
+    """Bind a filter for messages in order of arrival; raise BadInput if `every_s` is set."""
     if found.parameters.every_s is not None:
         raise BadInput(
             f"estimator {found.name}: --late rewind gives no estimates between messages (every_s, "

@@ -1,4 +1,4 @@
-"""Conversion of messages to rows of numbers for foreign filters, and of their results to streams."""
+"""Conversion of messages to rows of numbers for foreign filters, and of filter results to streams."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -89,7 +89,7 @@ def static_of_run(static: Static, run: int) -> Static:
 
 
 def events_of(description: Description, found: Mapping[str, Topic], block: Block) -> FilterEvents:
-    """Convert a block's messages to events, with sources as indices of the description's topics."""
+    """Convert the messages of a block to events with indices of the topics in the description."""
     numbers = {
         found[each.topic].name: number
         for number, each in enumerate(description.topics)
@@ -125,7 +125,7 @@ def streams_of(
     followed: Followed,
     failures: Mapping[int, Failure],
 ) -> list[Ragged]:
-    """Make the output streams of filters' results."""
+    """Make output streams from the results of filters."""
     topic, (issued_ns, estimates, offsets, innovations, recorded) = f"/estimates/{name}", followed
     state = state_stream(
         f"{topic}/{description.output}",

@@ -1,8 +1,8 @@
-"""Names of foreign programs, `lib:PATH` and `exec:COMMAND`, and where they may be given.
+"""Names of foreign programs, `lib:PATH` and `exec:COMMAND`, and rules on which of them may run.
 
-A program runs only if a person names it: in a command, a Python call, or the experiment file that is
-given. The text then becomes `Allowed`. A name read from goldens, results, settings files or logs is
-plain text, and the program does not run; writing and reading a file never preserves the mark.
+A program runs only if a person names it: in a command, in a Python call, or in the experiment file of a
+command. The text is then marked as `Allowed`. A name that was read from goldens, results, settings files
+or logs is plain text, and the program does not run; the mark is never saved in a file.
 """
 
 import re
@@ -14,7 +14,7 @@ from typing import Any
 
 from fuselog.recorders.errors import BadInput
 
-KINDS = {"lib": "path", "exec": "command"}  # with the setting that names the program
+KINDS = {"lib": "path", "exec": "command"}  # with the setting for the path or command of the program
 _INTERPRETER = re.compile(
     r"(python|pypy|ruby|perl|node|julia|java|Rscript|octave|bash|sh)[\d.]*(\.exe)?"
 )
@@ -27,7 +27,7 @@ class Allowed(str):
 
 
 def shorthand(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the label and the settings for which an estimator's name is an abbreviation.
+    """Expand the abbreviated name of an estimator to its label and settings.
 
     >>> shorthand("lib:./filters/libmine.so")
     ('libmine', {'kind': 'lib', 'path': './filters/libmine.so'})
@@ -45,7 +45,7 @@ def shorthand(name: str) -> tuple[str, dict[str, Any]]:
 
 
 def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the abbreviated name of an estimator, and the settings that it does not contain.
+    """Return the abbreviated name of an estimator, and the settings that are not part of it.
 
     >>> name_of("mine", {"kind": "lib", "path": "./mine.so", "speed": 2.0})
     ('lib:./mine.so', {'speed': 2.0})
@@ -64,7 +64,7 @@ def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any
 
 
 def _label(kind: str, rest: str) -> str:
-    """Return the stem of a library or program, or of a script if an interpreter comes first."""
+    """Return the stem of a library or program, or of a script that follows an interpreter."""
     words = [rest]
     if kind == "exec":
         words = split_command(rest)
@@ -87,7 +87,7 @@ def split_command(command: str) -> list[str]:
 
 
 def allowed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Mark the programs in settings of one estimator, or of several by label, as stated by a person.
+    """Mark the programs in the settings of one estimator, or of several by label, as allowed.
 
     >>> isinstance(allowed({"mine": {"kind": "lib", "path": "mine.so"}})["mine"]["path"], Allowed)
     True
@@ -103,7 +103,7 @@ def allowed(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def allowed_in(settings: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Mark the programs in settings of an experiment's file; library paths are relative to `folder`."""
+    """Mark the programs in settings of an experiment file; library paths are relative to `folder`."""
     found = allowed(settings)
     for own in found.values():
         if isinstance(own, dict) and own.get("kind") == "lib" and isinstance(own.get("path"), str):
@@ -121,12 +121,12 @@ def allow_programs_of_files(may: bool) -> None:
 
 
 def of_file(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings read from a file; their programs may run only if the command allows it."""
+    """Mark the programs in settings from a file as allowed, if the command allows programs of files."""
     return allowed(settings) if _FILES_MAY.get() else dict(settings)
 
 
 def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove the program that was also named from settings, such as those of `fuselog tune`."""
+    """Remove a program from settings, such as those of `fuselog tune`, if it was also named directly."""
     return {
         name: value
         for name, value in settings.items()
@@ -135,7 +135,7 @@ def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict
 
 
 def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
-    """Raise BadInput if settings by label that were read from a file name a program."""
+    """Raise BadInput if settings from a file, by label, name a program."""
     for label, own in tables.items():
         for entry in KINDS.values() if isinstance(own, Mapping) else ():
             if entry in own and not isinstance(own[entry], Allowed):
@@ -161,7 +161,7 @@ def what_runs(label: str, kind: str, settings: Mapping[str, Any]) -> str:
 
 
 def program_files(settings: Mapping[str, Mapping[str, Any]]) -> list[Path]:
-    """Return the files in settings by label: libraries, and words of commands that are files."""
+    """Return the files in settings by label: libraries, and words of commands that are file names."""
     found = []
     for label, own in settings.items():
         kind = own.get("kind", label)

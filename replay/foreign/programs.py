@@ -1,4 +1,4 @@
-"""Estimators made from programs: those that stream, and those that read a log and write estimates."""
+"""Estimators made from programs that answer messages, or that read a log and write estimates."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ from fuselog.replay.foreign.processes.tasks import RunGiven
 _PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 LOG, TABLES, OUT = "log", "csv", "out"
 ESTIMATE = "/estimates/"
-LIMITS = ("time_limit_s", "memory_limit_mb")  # these also apply while a program starts
+LIMITS = ("time_limit_s", "memory_limit_mb")  # these limits also apply while a program starts
 
 
 class StreamParameters(ForeignParameters):
@@ -51,8 +51,8 @@ class ProgramParameters(StreamParameters):
     """Settings of a program that reads a log and writes estimates.
 
     Attributes:
-        time_limit_s: a run fails if the program takes longer for it.
-        truth: topic of the truth; by default the only one of the log.
+        time_limit_s: limit of the time for one run; a run that exceeds it fails.
+        truth: topic of the truth; by default, the only truth in the log.
     """
 
     time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 600.0
@@ -64,7 +64,7 @@ class _OfPrograms(Estimator[Any]):
     """Estimator that makes the estimator of the command named in settings."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
-        """Return the estimator of the command in `settings` of `label`; with {out} it reads a log."""
+        """Return the estimator of the command in `settings` of `label`; with {out}, it reads a log."""
         words = tuple(split_command(what_runs(label, "exec", settings)))
         if any("{" + OUT + "}" in word for word in words):
             return _of_files(label, words)
@@ -114,7 +114,7 @@ def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
 
 
 def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return sizes and modification times of the files in a command, part of its cache key."""
+    """Return sizes and modification times of the files in a command, for the key of its cache."""
     found = []
     for word in words:
         with suppress(OSError, ValueError):
@@ -191,7 +191,7 @@ def _is_map(topic: Topic) -> bool:
 
 
 def _truth(label: str, topics: Mapping[str, Topic], named: str) -> Topic | None:
-    """Return the truth of the estimates; raise BadInput if there are several."""
+    """Return the truth of the estimates; raise BadInput if it is ambiguous."""
     truths = {
         name: topic
         for name, topic in topics.items()

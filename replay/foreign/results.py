@@ -1,6 +1,6 @@
-"""Memory layout of filters' results, in this process or in a file that another process fills.
+"""Memory layout of the results of filters, in this process or in a file that another process fills.
 
-If the other process crashes, what it had written is still there.
+If the other process crashes, the results that it has written are still available.
 """
 
 import math
@@ -17,7 +17,7 @@ from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class Sizes(NamedTuple):
-    """Numbers of components: of the state n, of its tangent space t, of the innovations m."""
+    """Numbers of components: n of the state, t of its tangent space, and m of the innovations."""
 
     n: int
     t: int
@@ -28,8 +28,8 @@ class Results(NamedTuple):
     """Results of filters, filled in place.
 
     Attributes:
-        progress: (runs,) index of the message in work, visible to another process.
-        issued_ns: for every estimate, the arrival time of the message that triggered it; its stamp if
+        progress: (runs,) index of the current message, visible to another process.
+        issued_ns: for every estimate, the arrival time of the message that triggered it, or its stamp if
             messages are processed in order of their stamps.
         estimates, innovations: the rows of run r begin at the r-th offset.
     """
@@ -43,7 +43,7 @@ class Results(NamedTuple):
 def results(
     due: Integers, recorded: Integers, sizes: Sizes, memory: Callable[[int], np.ndarray] = np.zeros
 ) -> Results:
-    """Lay out results: run r has the rows from due[r] and recorded[r] up to those of the next run.
+    """Allocate results; the rows of run r begin at due[r] and recorded[r].
 
     Args:
         due: (runs + 1,) offsets of the estimates.
@@ -73,7 +73,7 @@ def results(
 
 
 def begun(made: Results, due: Integers, recorded: Integers) -> Results:
-    """Set the ends of all runs to their beginnings and all values to NaN, and return the results.
+    """Clear the results: set the end of each run to its first row, and all values to NaN.
 
     Args:
         made: results of all runs, changed in place.
@@ -98,10 +98,10 @@ def in_file(path: Path) -> Callable[[int], np.ndarray]:
 
 
 def fill_squares(innovations: InnovationRows) -> int:
-    """Fill NIS and log-likelihood of one run's innovations, up to the first with an invalid covariance.
+    """Fill NIS and log-likelihood of one run's innovations, up to the first invalid covariance.
 
-    Returns the row whose covariance is not positive definite, at which the innovations then end;
-    otherwise -1.
+    If a covariance is not positive definite, the innovations end before it, and its row is returned;
+    otherwise, -1 is returned.
     """
     end = int(innovations.end[0])
     present = ~np.isnan(innovations.difference[:end])

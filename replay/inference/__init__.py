@@ -1,4 +1,4 @@
-"""Models (how states move and are measured) and the methods that estimate the state of any model.
+"""Models of motions and sensors, and methods that estimate the state of any model.
 
-Begin with `model.model`, then `estimators`, which joins a model and a method, and `run`.
+Begin with `model.model`; then read `estimators`, which combines a model and a method, and `run`.
 """

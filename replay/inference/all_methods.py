@@ -1,4 +1,4 @@
-"""All methods by name, and functions that make estimators of them, for one model or for any model.
+"""All methods by name, and functions that make estimators from them, for one model or any model.
 
 A method is registered by its entry in METHODS, and by an entry point that names this module and the
 method, as `fuselog.replay.inference.all_methods:ekf`.
@@ -32,8 +32,8 @@ def modelled(model: Model, method: str) -> AnyEstimator:
     """Make the estimator that applies one method to one model.
 
     Args:
-        model: how the state moves and what sensors measure of it.
-        method: the method's name, as `fuselog models NAME` lists it, such as "ukf", "lrkf:s2kf-50" or
+        model: the model of motions and sensors.
+        method: name of the method, as listed by `fuselog models NAME`, such as "ukf", "lrkf:s2kf-50" or
             "imm:ekf".
 
     Returns:

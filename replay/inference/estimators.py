@@ -1,4 +1,4 @@
-"""Estimators made of a model and a method, and their binding to the topics of a log."""
+"""Estimators made from a model and a method, and their binding to the topics of a log."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -72,7 +72,7 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, AnyArgument] | None = None
 ) -> type[CombinedParameters]:
-    """Create a parameter type that inherits the fields and meanings of its bases."""
+    """Create a parameter type that inherits the fields and descriptions of its bases."""
     made: type[CombinedParameters] = create_model(name, __base__=bases, **(fields or {}))
     return made
 
@@ -100,7 +100,7 @@ def modelled_by(
     Args:
         model: the model whose state is estimated.
         method: the method.
-        name: name of the method, with its variant, for the summary, the label and errors.
+        name: name of the method, with its variant, for the summary, the label and error messages.
         settings: defaults that the method's variant sets, by parameter name.
 
     Raises BadInput if the method does not accept the settings, or if the model lacks something that the
@@ -126,18 +126,18 @@ def modelled_by(
 
 
 def model_of(estimator: AnyEstimator) -> Model | None:
-    """Return the model that `modelled_by` made an estimator of; None for other estimators."""
+    """Return the model of an estimator that `modelled_by` made; None for other estimators."""
     made = estimator.bind
     return made.keywords["model"] if isinstance(made, partial) and made.func is bind_model else None
 
 
 def of_any_model(method: Method) -> AnyEstimator:
-    """Make the estimator that applies one method to whichever registered model fits a log."""
+    """Make the estimator that applies one method to the registered model that fits a log."""
     return _OfAnyModel(method)
 
 
 class _OfAnyModel(AnyEstimator):
-    """An estimator whose requirements and parameters are collected from all models on demand."""
+    """Estimator that collects its requirements and parameters from all models on demand."""
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
@@ -179,7 +179,7 @@ class _OfAnyModel(AnyEstimator):
 def registered_models() -> dict[str, Model]:
     """Return the registered models by name, without those that fail to load.
 
-    Naming such a model raises the error.
+    If such a model is named, its error is raised.
     """
     found = {}
     for name in available("models"):
@@ -190,9 +190,9 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """Collect the parameters of all models, all unset, with those of a method and the model's name.
+    """Make the parameters of all models (unset), of a method, and for the name of the model.
 
-    The requirements of a model on its parameters are checked once it is known which model fits the log.
+    The values are checked against a model's requirements once the model that fits the log is known.
     """
     fields: dict[str, AnyArgument] = {"model": (str | None, Field(None, description=_MODEL))}
     models_of: dict[str, dict[str, list[str]]] = {}
@@ -215,14 +215,13 @@ _MODEL = "name of the model to estimate; by default, the registered model that f
 
 
 def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
-    """Describe a parameter, model by model if its meaning differs between models."""
+    """Describe a parameter; if its meaning differs between models, describe it model by model."""
     if len(meanings_of) == 1:
         return next(iter(meanings_of))
     return " ".join(f"{', '.join(models)}: {meaning}" for meaning, models in meanings_of.items())
 
 
-# Topics found for each model in the last few logs, since a log is often bound again with other
-# parameters.
+# Topics found for each model in the last few logs; logs are often bound again with other parameters.
 _FOUND = Findings()
 
 
@@ -266,7 +265,8 @@ def _bind_fitting(
     chooses = elsewhere(models, topics, renamed)
     if chooses:
         raise BadInput(f"estimator {label}: {chooses}")
-    for exactly in (False, True):  # first by all components of the prior, then by exactly these
+    # prefer models whose prior has all components, then models whose prior has only these
+    for exactly in (False, True):
         if len(fitting) > 1:
             named_alike = [
                 name
@@ -302,7 +302,7 @@ def bind_model(
     model: Model,
     method: Method,
 ) -> list[Bound]:
-    """Return one bound estimator for every object in the log that this model describes."""
+    """Return a bound estimator for every object in the log that this model describes."""
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -397,7 +397,7 @@ def _check_topics(
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """Make the estimator that reprocesses out-of-sequence messages; BadInput if the filter cannot."""
+    """Make the estimator that reprocesses out-of-sequence messages; raise BadInput if it cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
@@ -408,7 +408,7 @@ def _reprocessing(
 
 
 def _together(bound: Recursive, filtering: Filter, settings: Floats) -> Recursive:
-    """Make the estimator whose runs each use their own settings (runs, 1 + sensors, fields)."""
+    """Make an estimator that uses separate settings (runs, 1 + sensors, fields) for each run."""
     each = replace(filtering, each_run=settings)
     return replace(bound, start=each.start, run=each.run, finish=each.finish)
 
@@ -416,7 +416,7 @@ def _together(bound: Recursive, filtering: Filter, settings: Floats) -> Recursiv
 def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Method:
     """Return the variant of a method that the parameters select; prefix its BadInput with `where`.
 
-    BadInput that begins with `where`, if there is none.
+    Raises BadInput, with a message that begins with `where`, if there is no such variant.
     """
     try:
         return method.made_for(parameters) if method.made_for else method

@@ -1,4 +1,4 @@
-"""Formulas of a model's functions and their derivatives, written with the names of its components."""
+"""Formulas of the functions of a model and their derivatives, with the names of its components."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -13,8 +13,8 @@ from fuselog.replay.tracing.formulas import formulas_of
 from fuselog.replay.tracing.functions import Argument, Shape, TracedFunction
 
 Names = Sequence[str]
-# The names of each argument's entries, by argument: the names of a tuple's entries or of an array's
-# rows and columns. Numbers and parameters need no names.
+# Names of the entries of each argument: entries of a tuple, or rows and columns of an array. Numbers and
+# parameters need no names.
 Given = Mapping[str, Names | tuple[Names, ...] | None]
 DIFFERENTIATED = ("state", "control", "noise")
 
@@ -23,9 +23,9 @@ def formulas(model: str | Model) -> str:
     """Return the functions of a model and their derivatives as readable text.
 
     The components after a step of the motion are called next_...; an expression that a function uses
-    more than once gets a line of its own (v1 and so on). Derivatives that are not listed are zero.
-    Derivatives are taken with respect to the stored components, also for orientations; the methods
-    convert them to the tangent space.
+    more than once is on a line of its own (v1, v2, ...). Derivatives that are not listed are zero.
+    Derivatives are with respect to the stored components, even for orientations; the methods convert
+    them to the tangent space.
 
     Args:
         model: name of a registered model (see `models`), or a model.
@@ -131,7 +131,7 @@ def _topic(name: str) -> str:
 
 
 def _spread(axes: Names, block: int = 0) -> list[str]:
-    """Name the entries of a covariance: the first axes' lower triangle, then the other variances."""
+    """Name the entries of a covariance: the lower triangle of the first axes, then other variances."""
     block = block or len(axes)
     names = [
         f"variance of {axes[row]}" if row == column else f"covariance of {axes[row]} and {axes[column]}"
@@ -144,9 +144,9 @@ def _spread(axes: Names, block: int = 0) -> list[str]:
 def _lines(
     function: object, given: Given, returned: Names = (), by: Names = DIFFERENTIATED
 ) -> list[str]:
-    """Write the formulas of a traced function; fewer returned values than names are variances.
+    """Write the formulas of a traced function.
 
-    Where it returns less than is named, these are variances.
+    If the function returns fewer values than there are names, the values are variances.
     """
     if function is None:
         return []

@@ -1,11 +1,10 @@
 """Observability of the state at the start of a window, from the measurements of the window.
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, propagated back by
-the derivatives Phi of the motion along one trajectory, the smoothed one. After scaling, D W D with the
-prior's standard deviations D, an eigenvalue of one contains as much information as the prior. Along an
-estimated trajectory, unobservable directions collect a little spurious information; therefore
-eigenvalues below ten are reported as weaker than the prior. F and H are those of the extended Kalman
-filter.
+the derivatives Phi of the motion along the smoothed trajectory. After scaling to D W D with the standard
+deviations D of the prior, an eigenvalue of 1 is as much information as the prior. Along an estimated
+trajectory, unobservable directions collect a little spurious information; therefore, eigenvalues below
+10 are reported as weaker than the prior. F and H are those of the extended Kalman filter.
 
 Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
 """
@@ -78,7 +77,7 @@ class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
 
     Attributes:
         window_s: length of a window; by default, the whole run.
-        scales: standard deviations to use in place of the prior's, by component, in its unit.
+        scales: standard deviations to use instead of those of the prior, by component, in its unit.
     """
 
     window_s: PositiveFloat | None = None
@@ -86,7 +85,7 @@ class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
 
 
 class Gramian(NamedTuple):
-    """The propagated Phi and W (runs, t, t), and the number of messages in W (runs,)."""
+    """Propagated Phi and W (runs, t, t), and numbers of messages in W (runs,)."""
 
     transition: Floats
     information: Floats
@@ -94,7 +93,7 @@ class Gramian(NamedTuple):
 
 
 class LinearizationTrajectory(NamedTuple):
-    """States along the trajectory (nodes, n), each event's node, and memory for one tangent vector."""
+    """States along the trajectory (nodes, n), nodes of events, and memory for a tangent vector."""
 
     mean: Floats
     node: Integers
@@ -102,12 +101,12 @@ class LinearizationTrajectory(NamedTuple):
 
 
 def gramian_steps(bound_model: BoundModel) -> Steps:
-    """Make the steps that accumulate the Gramian along the trajectory, the only set of `memory`."""
+    """Make the steps that accumulate the Gramian along the trajectory, which is the set of `memory`."""
     motion = _carried_by_motion(bound_model)
     sensors = tuple(_added_by_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
 
     def estimate(run: int, belief: Gramian, found: EstimateRows, row: int, _: Workspace) -> None:
-        """Store the Gramian, with the number of its messages as the mean, and reset it."""
+        """Store the Gramian (with the number of its messages as the mean), and reset it."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
         belief.messages[run] = 0
@@ -189,7 +188,7 @@ def _summing(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
 
 
 class Observability(IteratedSmoother):
-    """A smoother that computes the Gramians of each run's windows along its smoothed trajectory."""
+    """Smoother that also computes the Gramian of each window of a run along its smoothed trajectory."""
 
     def finish(self, state: FilterState) -> list[Ragged]:
         """Return one message per window, stamped at the end of the window."""
@@ -241,7 +240,7 @@ class Observability(IteratedSmoother):
         return scales
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
-        """Return the window of every node; what remains after the last whole window is part of it."""
+        """Return the window of every node; the last window includes the rest of the run."""
         run = run_of_rows(way.offsets)
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:
@@ -290,7 +289,7 @@ class Observability(IteratedSmoother):
 
 
 class Spectrum(NamedTuple):
-    """Eigenvalues of a scaled Gramian, ascending (t,), its rank, and the weakest direction (t,)."""
+    """Ascending eigenvalues (t,) of a scaled Gramian, its rank, and the weakest direction (t,)."""
 
     eigenvalues: Floats
     rank: int
@@ -298,11 +297,10 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(information: Floats, scales: Floats) -> Spectrum:
-    """Compute the rank and the eigenvalues of D W D, and its weakest direction.
+    """Compute the rank, the eigenvalues and the weakest direction of D W D.
 
     The direction is D e for the eigenvector e of the smallest eigenvalue, in state units, of length one.
-    A component whose scale is zero is known exactly; it is left out, and its eigenvalue counts as
-    infinite.
+    A component with a scale of zero is known exactly; it is left out, and its eigenvalue is infinite.
 
     Args:
         information: W (t, t), of the state at the start of a window.

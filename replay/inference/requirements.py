@@ -1,4 +1,4 @@
-"""Descriptions of what a model requires of a log, for lists and for errors about missing topics."""
+"""Descriptions of the requirements of models on logs, for lists and for errors about missing topics."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from fuselog.replay.inference.model.model import (
     Model,
 )
 
-# Advice for a log that no registered model fits; see docs/your-model.md.
+# Advice if no registered model fits a log; see docs/your-model.md.
 OWN_MODEL = (
     'use a model of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model '
     "in the documentation"
@@ -18,7 +18,7 @@ OWN_MODEL = (
 
 
 def requirements_of(model: Model) -> str:
-    """Describe what a model requires of a log, or may use if it can start without a prior."""
+    """Describe the topics that a model requires, or may use if it can start without a prior."""
     words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
     if model.start is None or model.control is None or not model.needs_sensor:
         return "; ".join(words)
@@ -28,7 +28,7 @@ def requirements_of(model: Model) -> str:
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
-    """Describe which of the models comes nearest to fitting a log, and what the log lacks."""
+    """Describe the model that is closest to fitting a log, and the topics that the log lacks."""
     tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
@@ -41,9 +41,9 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
-    """Explain that the log's prior is of a model whose control topic has another name; otherwise empty.
+    """Explain that the prior matches a model whose control has another name in this log; "" otherwise.
 
-    An example is a log with several inertial units, one of which has to be chosen.
+    An example is a log with several inertial units, from which the user must choose one.
     """
     for name, model in models.items():
         control = model.control
@@ -77,7 +77,7 @@ def _fit(parts: Sequence["Requirement"]) -> int:
 
 
 class Requirement(NamedTuple):
-    """Something that a model needs, and whether a log contains it."""
+    """Requirement of a model, and whether a log satisfies it."""
 
     words: str
     is_here: bool
@@ -118,6 +118,6 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
 
 
 def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
-    """Test whether a prior names all components of a model's state, and no others if `exactly`."""
+    """Test whether a prior names all components of a model's state, and no others with `exactly`."""
     named = set(prior.metadata.get("components", "").split(","))
     return named == set(model.state) if exactly else named >= set(model.state)

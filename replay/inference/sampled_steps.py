@@ -1,6 +1,6 @@
 """Traces of functions at weighted samples as graphs; see `fuselog.replay.inference.kalman.regression`.
 
-The loops over samples and over iterations of a mean are not traced: a graph computes one sample or one
+Loops over samples, and over iterations of a mean, are not traced: a graph computes one sample or one
 iteration.
 """
 
@@ -29,24 +29,26 @@ SETTLING = (3,)  # index of the argument of `SampledFunction.recentre` that diff
 
 
 class SampledFunction(NamedTuple):
-    """A function of a state, its noise and other arguments at weighted samples, with v values.
+    """Function of a state, noise and other arguments at weighted samples, with v values.
 
-    Each graph takes the arguments of the step, (mean, covariance, ...), and those named below.
+    The arguments of each graph are those of the step, (mean, covariance, ...), and those listed below.
 
     Attributes:
         points, weights: samples (L, t + noises) of N(0, I), and their weights (L,).
-        variances: gives `variance` (noises), the variances of the noise.
-        centre: gives `centre`, the values of the function at the mean without noise.
-        value: takes (..., away, centre) and gives `value` (v), the tangent vector from the centre to the
-            function's value at one sample. `away` (t + noises) is a tangent vector from the mean,
-            followed by the noise.
-        move: takes (mean, covariance, shift, centre) and gives `centre`, moved by the shift (v).
-        recentre: takes (mean, covariance, shift, value) and gives `value` seen from the moved centre,
-            and `again`, whether another iteration may be necessary. None if all values are linear.
+        variances: returns `variance` (noises), the variances of the noise.
+        centre: returns `centre`, the values of the function at the mean without noise.
+        value: has the arguments (..., away, centre) and returns `value` (v), the tangent vector from the
+            centre to the function's value at one sample. `away` (t + noises) is a tangent vector from
+            the mean, followed by the noise.
+        move: has the arguments (mean, covariance, shift, centre) and returns `centre`, moved by the
+            shift (v).
+        recentre: has the arguments (mean, covariance, shift, value) and returns `value` relative to the
+            moved centre, and `again`, whether another iteration may be necessary. None if all values are
+            linear.
         given: number of arguments of the step.
         turns: angles and rotations of the state, which limit the spread of the samples; see
             `wide_angles`.
-        unsuspected: standard deviation up to which the spread is not limited.
+        unsuspected: largest standard deviation at which the spread is not limited.
     """
 
     points: Floats
@@ -83,13 +85,13 @@ class SampledFunction(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """A function to be sampled, and its arguments.
+    """Function to sample, and its arguments.
 
     Attributes:
         what: name of the function, for errors.
         function: function of (state, noise, arguments).
-        variances: gives the variances of the noise, from the state and the arguments of the step.
-        arguments: gives the arguments of the function, from those of the step.
+        variances: returns the variances of the noise for the state and the arguments of the step.
+        arguments: returns the arguments of the function for those of the step.
         kinds, outputs: kinds of the components of the state, and of the function's values.
     """
 
@@ -171,7 +173,7 @@ def _by_block(
 
 @lru_cache(maxsize=8)
 def _difference(kind: str) -> TracedFunction:
-    """Trace the difference of two values separately, so that the branches of several do not multiply."""
+    """Trace the difference of two values separately, because branches of several would multiply."""
     width = WIDTHS[kind]
     subtract = boxminus((kind,) * width)
 
@@ -185,7 +187,7 @@ def _difference(kind: str) -> TracedFunction:
 
 @lru_cache(maxsize=8)
 def _recentred(kind: str) -> TracedFunction:
-    """Trace how a tangent vector changes with its centre, preceded by whether to repeat the shift."""
+    """Trace the change of a tangent vector with its centre; the first value is whether to repeat it."""
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 

@@ -1,6 +1,6 @@
-"""Traces of the parts of a filter's steps: functions that return arrays by name become graphs.
+"""Tracing of the parts of a filter's steps: functions that return arrays by name become graphs.
 
-The functions are called with traced numbers, so a graph contains their operations in the same order,
+The functions are called with traced numbers; a graph contains the same operations in the same order,
 without terms that are known to be zero.
 """
 
@@ -13,20 +13,21 @@ from fuselog.recorders.errors import BadInput
 from fuselog.replay.tracing.functions import Argument, trace
 from fuselog.replay.tracing.graph import Graph, Node
 
-# An array, a tuple or a number, whose entries are traced numbers.
+# An array or a tuple of traced numbers, or a traced number.
 TracedValue = Any  # type: ignore[explicit-any]
-# Returns traced values, often by name; its arguments depend on the step.
+# Function that returns traced values, often by name; its arguments depend on the step.
 StepFunction = Callable[..., TracedValue]  # type: ignore[explicit-any]
 
 _SPARSE = ("F", "H", "G", "N")
 
 
 class Step(NamedTuple):
-    """A step of a filter, or a part of one, as a graph.
+    """Step of a filter, or part of a step, as a graph.
 
     Attributes:
         graph: the graph.
-        outputs: its output nodes, by array name and index; F, H, G and N without zero entries.
+        outputs: its output nodes, by name of array and index; zero entries of F, H, G and N are left
+            out.
     """
 
     graph: Graph

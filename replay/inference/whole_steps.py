@@ -1,8 +1,8 @@
-"""Traces of a filter's complete steps: prediction, innovation of each sensor, and correction.
+"""Tracing of the complete steps of a filter: prediction, innovation of each sensor, correction.
 
-The functions that kernels are compiled from are called with traced numbers; see `step_graphs`. Products
-of covariances and Jacobians are not traced: loops compute them from the entries that the graphs return.
-The same applies to samples; see `sampled_steps`.
+The functions from which kernels are compiled are called with traced numbers; see `step_graphs`. Products
+of covariances and Jacobians are not traced: loops compute them from the outputs of the graphs. The same
+applies to samples; see `sampled_steps`.
 """
 
 from collections.abc import Callable
@@ -30,25 +30,26 @@ from fuselog.replay.tracing.functions import Argument, Shape, traced
 
 
 class WholeSteps(NamedTuple):
-    """The steps of a filter whose state has n components and a tangent space of t components.
+    """Steps of a filter whose state has n components and a tangent space of t components.
 
-    All steps take (mean, covariance, ...). The covariance added by a step is G diag(u) G' + N: a gain G
-    with the variances u of its columns, and N, (t, t) or (m, m).
+    The arguments of all steps are (mean, covariance, ...). The covariance added by a step is G diag(u)
+    G' + N: a gain G with the variances u of its columns, and N, (t, t) or (m, m).
 
     Attributes:
-        predict: takes (..., control, duration_s, parameters) and gives G, u, N, the mean and F (t, t);
-            only the first three if the motion is sampled.
-        innovate: one step for each sensor of m components; takes (..., data, parameters) and gives v
-            (m), G, u, N and H (m, t). If the sensor is sampled, it takes (..., data, parameters, centre)
-            and does not give H. If updates are iterated, it takes (..., data, parameters, step, slope)
-            and gives the innovation about the mean, linearised at the mean moved by the step.
-        direction: gives `a` (t), the direction along which the correction bends; None if it does not
-            bend.
-        correct: takes (..., step, slope) and gives the mean, and F if the correction also transforms the
-            covariance by F.
-        gap: takes the arguments of `predict` and gives N, added over a gap of the control; None if the
-            estimate ends at a gap.
-        sampled: for the motion and every sensor, the function that is sampled; None if it is linearised.
+        predict: has the arguments (..., control, duration_s, parameters) and returns G, u, N, the mean
+            and F (t, t); only the first three if the motion is sampled.
+        innovate: one step for each sensor of m components, with the arguments (..., data, parameters),
+            which returns v (m), G, u, N and H (m, t). If the sensor is sampled, the arguments are (...,
+            data, parameters, centre), and H is not returned. If updates are iterated, the arguments are
+            (..., data, parameters, step, slope), and the innovation about the mean is linearised at the
+            mean moved by the step.
+        direction: returns `a` (t), the direction of a correction along a curve; None if components are
+            corrected separately.
+        correct: has the arguments (..., step, slope) and returns the mean, and F if the correction also
+            transforms the covariance by F.
+        gap: has the arguments of `predict` and returns N, the noise added over a gap of the control;
+            None if the estimate ends at a gap.
+        sampled: the sampled function for the motion and for every sensor; None if it is linearised.
         is_iterated: whether updates are iterated.
     """
 
@@ -68,7 +69,7 @@ class WholeSteps(NamedTuple):
         return [each for each in found if each is not None]
 
     def of(self, part: int) -> list[Step]:
-        """List the graphs of the motion (0) or of a sensor (from 1 on)."""
+        """List the graphs of the motion (0) or of a sensor (1 or more)."""
         found = [self.predict, self.gap] if part == 0 else [self.innovate[part - 1]]
         sampled = self.sampled[part]
         found += [] if sampled is None else sampled.steps
@@ -140,7 +141,7 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 def _motion(
     model: Model, motion: Motion, memory: Callable[[], TracedValue], *, is_sampled: bool
 ) -> StepFunction:
-    """Make the step with the motion's derivatives, or only its added noise if the motion is sampled."""
+    """Make the step with the derivatives of the motion, or only its noise if the motion is sampled."""
     linearise = motion_derivative(model, motion, by_state=not is_sampled)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     t, add = model.tangent, adding_noise(model.tangent, motion.noise_block)

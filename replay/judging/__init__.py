@@ -1,4 +1,4 @@
-"""Judging of estimates by truth: errors, consistency, metrics; begin with `judge`.
+"""Evaluation of estimates against the truth: errors, consistency, metrics; begin with `judge`.
 
-Families register what they judge in addition, such as sets and tracks; see `kinds`.
+Families register judges for other outputs, such as sets and tracks; see `kinds`.
 """

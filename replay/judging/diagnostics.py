@@ -1,4 +1,4 @@
-"""Diagnostic messages of a replay: failures, skipped or assumed values, share of the span estimated."""
+"""Diagnostics of a replay: failures, skipped messages, assumed values, and spans without estimates."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,9 +21,10 @@ FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
 STARTED, COVERAGE = schemas.STARTED.full_name, schemas.COVERAGE.full_name
 # Last parts of the names of topics without estimates, which are not judged.
 LEAVES = ("failure", "skipped", "started", "coverage")
-# A smaller share of the span is reported; a run's first measurements are often before the prior.
+# A share of the span below this is reported; the first measurements of a run are often before the prior.
 LEAST_SHARE = 0.995
-# Above this standard deviation of an angle, a Gaussian is a poor model: 0.2 % is beyond half a turn.
+# If an angle has a larger standard deviation, a Gaussian is a poor model: 0.2 % of it is beyond half a
+# turn.
 WIDE_RAD = 1.0
 
 
@@ -52,7 +53,7 @@ class StreamDiagnostics:
 
 
 class Diagnostics:
-    """Diagnostics of the topics of a replay, which become sentences.
+    """Diagnostics of the topics of a replay, which are reported as sentences.
 
     Args:
         first_run: number of the first run in the whole ensemble.
@@ -92,7 +93,7 @@ class Diagnostics:
             self._topics.setdefault(topic, StreamDiagnostics()).merge(found)
 
     def failures(self, names: Mapping[int, str]) -> list[str]:
-        """Return a sentence for every run that an estimator did not process to the end, or not at all.
+        """Return a sentence for every run that an estimator did not process, or not to the end.
 
         Args:
             names: names of all runs, by number.
@@ -110,7 +111,7 @@ class Diagnostics:
         return [f"{names[run]}: {sentence}" for (_, run), sentence in sentences.items()]
 
     def notes(self) -> list[str]:
-        """Return sentences on assumptions, then on time spans without estimates and unused messages."""
+        """Return sentences about assumptions, time spans without estimates, and unused messages."""
         notes = []
         for topic, found in self._topics.items():
             for reason, count in found.started.items():
@@ -150,5 +151,5 @@ def _wide_angles(estimates: Stream) -> dict[str, int]:
 
 
 def name_of(topic: str) -> str:
-    """Return the estimator and the case of a topic, as used in sentences."""
+    """Return the estimator and the case of a topic, for use in sentences."""
     return " ".join(filter(None, split_topic(topic)))

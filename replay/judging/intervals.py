@@ -1,8 +1,8 @@
-"""95 % intervals of numbers, by the rule in docs/judge.md.
+"""95 % intervals of numbers, by the rules in docs/judge.md.
 
-The unit is the run: errors within a run are correlated, runs are independent. The interval of a mean is
-Student's t interval. That of a root mean square is a percentile bootstrap over runs, widened for few
-runs as Student's t is: Hesterberg, "What Teachers Should Know About the Bootstrap", The American
+The unit is the run: errors within a run are correlated; runs are independent. A mean has Student's t
+interval. A root mean square has a percentile bootstrap interval over runs, widened for few runs like
+Student's t interval: Hesterberg, "What Teachers Should Know About the Bootstrap", The American
 Statistician 69 (2015).
 """
 
@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-# Fewer runs say nothing about other runs.
+# With fewer runs, there is no information about other runs.
 FEWEST_RUNS = 5
 RESAMPLES = 2000
-# Over more runs the mean square is normal; resampling would only take more memory.
+# Over more runs, the mean square is normal; resampling would only need more memory.
 MANY_RUNS = 500
 LARGE = 1e100  # sums of squares of larger numbers may be infinite
 
@@ -27,7 +27,7 @@ class Interval(NamedTuple):
 
     Attributes:
         value: the number.
-        low, high: the ends; NaN if there is no interval, equal to the number if it is exact.
+        low, high: the ends; NaN if there is no interval, and equal to the number if it is exact.
         unit: unit of all three; may be empty.
         name: name of the number, if it is not clear from its context.
     """
@@ -67,7 +67,7 @@ class Interval(NamedTuple):
 
 
 def too_few(runs: int) -> str:
-    """Return why there is no interval over this number of runs."""
+    """Return the reason why there is no interval over this number of runs."""
     there = "is only 1" if runs == 1 else f"are only {runs}"
     return f"an interval needs at least {FEWEST_RUNS} runs, and there {there}"
 
@@ -77,8 +77,8 @@ def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
 
     Args:
         values: one value per run.
-        fewest: smallest number of runs for an interval. Only a study whose units cannot be multiplied,
-            such as the robots of a recording, uses another number than the default.
+        fewest: smallest number of runs for an interval. Only a study with a fixed number of units, such
+            as the robots in a recording, uses a different number than the default.
     """
     from scipy.special import stdtrit
 
@@ -117,7 +117,7 @@ def root_mean_square(values: ArrayLike) -> float:
 
 
 def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
-    """Divide numbers (n,) by a scale, which is one unless an estimator diverged, and return both."""
+    """Divide numbers (n,) by a scale, which is 1 unless an estimator diverged; return both."""
     largest = float(np.max(np.abs(values), initial=0.0))
     scale = largest if LARGE < largest < math.inf else 1.0
     return values / scale, scale

@@ -1,7 +1,7 @@
-"""Judge of the outputs of a replay, block by block as they come.
+"""Judge of the outputs of a replay, which processes them block by block.
 
-It keeps sums: of every metric, by step over the runs, and by time for each run. Memory therefore does
-not grow with the length of a log, except for two numbers per step of NEES.
+It stores sums: of every metric, by step over the runs, and by time for each run. Memory therefore does
+not grow with the length of a log, except for two numbers per step for the NEES.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,17 +53,17 @@ if TYPE_CHECKING:
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
-# The most steps in a table; beyond this, neighbouring steps share a row.
+# Largest number of steps in a table; with more, neighbouring steps share a row.
 STEPS = 1 << 17
-# The most bins of the sums over time of one run; a bin is a millisecond times a power of two.
+# Largest number of time bins of a run; the length of a bin is 1 ms times a power of two.
 TIME_BINS = 64
-# The most bins over all runs; very many runs have fewer bins each.
+# Largest number of bins over all runs; if there are very many runs, each has fewer bins.
 TIME_CELLS = 1 << 18
 TIME_BIN_NS = 1_000_000
 
 
 class Judged(NamedTuple):
-    """Judged results of a block: errors of estimates, innovations, and what families judge."""
+    """Judged results of a block: errors of estimates, innovations, and results of families."""
 
     errors: list[Errors]
     innovations: list[Innovations]
@@ -81,7 +81,8 @@ class Judge:
         burn_in_s: errors up to this time in s after the epoch are left out.
         on_errors: called with the errors of every block.
 
-    `innovations` has the sums of innovations by topic, `conditioning` that of covariances by topic.
+    `innovations` has the sums of innovations by topic, and `conditioning` the conditioning of
+    covariances.
     """
 
     def __init__(
@@ -238,15 +239,15 @@ class Judge:
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Return the 95 % intervals of NEES and NIS metrics of consistent estimators, by key."""
+        """Return the 95 % intervals of the NEES and NIS of consistent estimators, by key."""
         return self.intervals(0.95)
 
     def intervals(self, probability: float) -> dict[str, tuple[float, float]]:
-        """Compute the intervals of NEES and NIS metrics of consistent estimators, by key.
+        """Compute the intervals of the NEES and NIS of consistent estimators, by key.
 
-        The errors of a run's steps are correlated, so NEES has the interval of one step's mean over the
-        runs; innovations are not, so NIS has the interval of the mean of all of them. The intervals
-        contain the metrics with `probability`.
+        Errors of the steps of a run are correlated, so the NEES has the interval of the mean of a single
+        step over the runs; innovations are uncorrelated, so the NIS has the interval of the mean of all
+        innovations. The intervals contain the metrics with `probability`.
         """
         found: dict[str, tuple[float, float]] = {}
         for key, (size, runs, aim) in self._sizes().items():
@@ -255,7 +256,7 @@ class Judge:
         return {key: found[key] for key in self.metrics if key in found}
 
     def _sizes(self) -> dict[str, tuple[int, int, int]]:
-        """Return number of components, number of runs and expected value of NEES and NIS, by key."""
+        """Return the degrees of freedom, number of values and expected value of NEES and NIS, by key."""
         found: dict[str, tuple[int, int, int]] = {}
         for quantities in self._quantities.values():
             errors, cells = quantities.errors, quantities.by_time.filled()[0]
@@ -271,7 +272,7 @@ class Judge:
         return found
 
     def squares(self, estimator: str, quantity: str, case: str) -> Squares:
-        """Return the NEES or NIS of an `estimator` and `case` that decides whether it is overconfident.
+        """Return the NEES or NIS by which an `estimator` and `case` is judged as overconfident or not.
 
         `quantity` is the name of the metric.
         """
@@ -284,7 +285,7 @@ class Judge:
 
     @property
     def constants(self) -> dict[tuple[str, str], Constant]:
-        """Return the constant errors by estimator and case, see `ConstantSums`."""
+        """Return the constant errors by estimator and case; see `ConstantSums`."""
         found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
         return {what: each for what, each in found.items() if each is not None}
 
@@ -302,12 +303,12 @@ class Judge:
 
     @property
     def has_numbers(self) -> bool:
-        """Test whether there are numbers besides those on failures, skipped messages and coverage."""
+        """Test whether there are metrics other than failures, skipped messages and coverage."""
         return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in LEAVES))
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """Return doubts about truths by topic, from the first run that has one."""
+        """Return doubts about truths by topic, from the first run with a doubt."""
         found = dict(self._doubts)
         for truths in self._truths:
             found = truths.doubts | found
@@ -315,12 +316,12 @@ class Judge:
 
     @property
     def components_without_truth(self) -> list[str]:
-        """Return a sentence for every estimate that cannot be judged, or only in part."""
+        """Return a sentence for every estimate that cannot be judged or is judged only in part."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
     def worst(self) -> dict[str, Moment]:
-        """Return by estimator the moment of its largest NEES, or without NEES of its largest error."""
+        """Return, by estimator, the moment of the largest NEES or, without NEES, the largest error."""
         found: dict[str, list[Moment]] = {}
         for moment in self._moments.found:
             found.setdefault(moment.estimator, []).append(moment)
@@ -333,12 +334,12 @@ class Judge:
 
     @property
     def failures(self) -> list[str]:
-        """Return a sentence for every run that an estimator did not process to the end or not at all."""
+        """Return a sentence for every run that an estimator did not process, or not to the end."""
         return self._diagnostics.failures(self._names)
 
     @property
     def notes_of_coverage(self) -> list[str]:
-        """Return sentences on assumptions, time spans without estimates, unused messages and bounds."""
+        """Return sentences about assumptions, spans without estimates, unused messages and bounds."""
         averaged = "averaged along the true trajectories, because"
         return [*self._diagnostics.notes(), *self._notes] + [
             f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
@@ -348,7 +349,7 @@ class Judge:
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
-        """Return a table by topic of estimates with truth, a row per step: see `tables.step_table`."""
+        """Return tables by topic of estimates with truth, one row per step; see `tables.step_table`."""
         from fuselog.replay.judging.tables import step_table
 
         return {
@@ -358,7 +359,7 @@ class Judge:
 
     @property
     def runs_table(self) -> "pd.DataFrame":
-        """Return a table with a row per estimator, case and run: see `tables.table_of_runs`."""
+        """Return a table with a row per estimator, case and run; see `tables.table_of_runs`."""
         from fuselog.replay.judging.tables import table_of_runs
 
         return table_of_runs(self._quantities.values(), self.innovations)
@@ -372,21 +373,21 @@ class Judge:
 
     @property
     def modes(self) -> "pd.DataFrame":
-        """Return mode probabilities: a row per estimator, case, time span and mode; see `MeansOfAll`."""
+        """Return mode probabilities, a row per estimator, case, time span and mode; see `MeansOfAll`."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.modes())
 
     @property
     def effective(self) -> "pd.DataFrame":
-        """Return the effective share of particles: a row per estimator, case and time span."""
+        """Return the effective share of particles, a row per estimator, case and time span."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.effective())
 
     @property
     def late(self) -> "pd.DataFrame":
-        """Return out-of-sequence messages: a row per estimator, case, treatment and time span."""
+        """Return out-of-sequence messages, a row per estimator, case, treatment and time span."""
         from fuselog.replay.judging.tables import joined
 
         return joined(self._means.late())

@@ -1,7 +1,7 @@
-"""Interface for families that judge outputs of their own kind, such as tracks, besides estimates.
+"""Interface for families that judge other outputs than estimates, such as tracks.
 
-The class is registered as an entry point `fuselog.judges`. Metrics that judge the type of its results
-compute numbers from them.
+A judge is registered as an entry point `fuselog.judges`. Metrics for the type of its results compute
+numbers from them.
 """
 
 from abc import ABC, abstractmethod
@@ -34,8 +34,8 @@ class KindJudge(ABC):
 
     Attributes:
         runs: the judged runs.
-        unjudged: by topic, why the truths cannot judge it; empty if they can.
-        notes: sentences on these truths.
+        unjudged: by topic, the reason why it cannot be judged; empty if it can.
+        notes: sentences about the truths.
     """
 
     def __init__(self, runs: JudgedRuns) -> None:

@@ -1,6 +1,6 @@
-"""Tables of judged results: rows per step, per run and time span, or per estimate.
+"""Tables of judged results, with rows per step, per run and time span, or per estimate.
 
-They are made from the judge's sums on request, so that printing only metrics does not import pandas.
+They are made from the sums of the judge on request, so that printing metrics does not import pandas.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
 
 def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
-    """Make one row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
+    """Make a row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
     If there are more than `judge.STEPS` steps, a row covers several, and `step` is the first of them.
     If `bounds` has a bound over the ensemble, its values are used instead of those along the
@@ -52,7 +52,7 @@ def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataF
 
 
 def time_table(quantities: Quantities) -> pd.DataFrame:
-    """Make one row per run and time span."""
+    """Make a table with one row per run and time span."""
     errors, by_time = quantities.errors, quantities.by_time
     cells, count, sums = by_time.filled()
     columns: dict[str, object] = {
@@ -68,7 +68,7 @@ def time_table(quantities: Quantities) -> pd.DataFrame:
 def table_of_runs(
     quantities: Iterable[Quantities], innovations: Mapping[str, InnovationSums]
 ) -> pd.DataFrame:
-    """Make one row per estimator, case and run.
+    """Make a table with one row per estimator, case and run.
 
     Columns are the number of estimates, the RMSE of each quantity and the mean NEES. If there are
     innovations, NIS per component, the share rejected by a gate and the log-likelihood of accepted
@@ -84,7 +84,7 @@ def table_of_runs(
 
 
 def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
-    """Make one row per run that has innovations."""
+    """Make a table with one row per run that has innovations."""
     estimator, case = split_topic(topic)
     run, of = sums.by_run()
     with np.errstate(invalid="ignore"):
@@ -97,7 +97,7 @@ def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
 
 
 def run_table(quantities: Quantities) -> pd.DataFrame:
-    """Make one row per run."""
+    """Make a table with one row per run."""
     errors = quantities.errors
     cells, count, sums = quantities.by_time.filled()
     runs, place = np.unique(cells[:, 0], return_inverse=True)
@@ -113,7 +113,7 @@ def run_table(quantities: Quantities) -> pd.DataFrame:
 
 
 def error_table(errors: Errors) -> pd.DataFrame:
-    """Make one row per run and step: error and sigma of every component, NEES."""
+    """Make a row per run and step, with error and sigma of every component and the NEES."""
     sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
     columns: dict[str, object] = {
         "estimator": errors.estimator,

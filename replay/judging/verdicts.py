@@ -1,6 +1,6 @@
 """Verdicts in the output of commands, in reports and in result.json: one enum for each question.
 
-Only `Squares.verdict` decides whether an estimator is overconfident; all other code asks it.
+Only `Squares.verdict` decides whether an estimator is overconfident; all other code uses its result.
 """
 
 import math
@@ -10,15 +10,15 @@ from enum import StrEnum
 
 from fuselog.replay.judging.intervals import Interval
 
-# A mean of squares may be off by this fraction: less has no practical importance, even if significant.
+# A mean of squares may deviate by this fraction; less is practically unimportant, even if significant.
 MATERIAL = 0.1
-FAR = 1.25  # times larger than claimed: such errors are off by more than a few percent
-# Squared errors above this multiple, 10,000 standard deviations, mean divergence, not wrong covariances.
+FAR = 1.25  # factor on claimed errors, above which a covariance is far from correct
+# Squared errors above this multiple (10,000 standard deviations) are divergence, not wrong covariances.
 DIVERGED = 1e8
 
 
 class Consistency(StrEnum):
-    """Verdict on whether errors are as large as an estimator's covariances say."""
+    """Verdict on whether errors agree with the covariances of an estimator."""
 
     CONSISTENT = "consistent"
     OVERCONFIDENT = "overconfident"
@@ -103,7 +103,7 @@ class Squares:
 
     @property
     def is_far(self) -> bool:
-        """Test whether errors exceed the claimed ones so far that the covariance cannot be relied on."""
+        """Test whether errors exceed the claimed errors so much that the covariance is unreliable."""
         return self.factor > FAR
 
     @property
@@ -113,6 +113,6 @@ class Squares:
 
 
 def decisive(squares: Sequence[Squares]) -> Squares | None:
-    """Return the squares that decide the verdict: the first inconsistent ones, or else the first."""
+    """Return the squares that decide the verdict: the first inconsistent ones, otherwise the first."""
     off = (each for each in squares if each.verdict != Consistency.CONSISTENT)
     return next(off, squares[0] if squares else None)

@@ -1,4 +1,4 @@
-"""Joint filters of several cooperative vehicles, with unordered fixes.
+"""Joint filters of several cooperative vehicles whose fixes are unordered.
 
 Begin with `streams`.
 """

@@ -1,7 +1,7 @@
-"""Association of detections with vehicles: the best map, or all maps of an unordered scan with weights.
+"""Association of the detections of an unordered scan with vehicles: the best map, or all maps.
 
-A map assigns every vehicle its own detection or none; unassigned detections are false. The weights are
-those of a scan with detection probability p_D and Poisson clutter of uniform density.
+A map assigns each vehicle at most one detection of its own; unassigned detections are false. Maps have
+weights, for a detection probability p_D and Poisson clutter of uniform density.
 """
 
 from typing import NamedTuple
@@ -12,10 +12,10 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Integers
 
 MISSED = -1
-# Detections outside this gate are not tried for a vehicle, and less probable maps are dropped.
+# Detections outside this gate are not assigned to a vehicle, and less probable maps are dropped.
 GATE_PROBABILITY = 1.0 - 1e-12
 LEAST_WEIGHT = 1e-9
-# Smallest clutter and miss probability: they apply if a scan is not complete although it should be.
+# Smallest clutter and miss probability, used if a scan is incomplete although it should be complete.
 LEAST_CLUTTER_PER_M2 = 1e-12
 LEAST_MISSED = 1e-9
 
@@ -29,7 +29,7 @@ class Scanning(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Test whether a scan contains every vehicle once and nothing else."""
+        """Test whether a scan contains each vehicle exactly once and nothing else."""
         return self.detection_probability == 1.0 and self.clutter_per_m2 == 0.0
 
     @property
@@ -41,9 +41,10 @@ class Scanning(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """Maps of all runs, sorted by run: each vehicle's detection (h, vehicles), or MISSED.
+    """Maps of all runs, sorted by run: the detection of each vehicle (h, vehicles), or MISSED.
 
-    `log_weight` (h,) is the weight from the scan's properties, without the likelihood of the positions.
+    `log_weight` (h,) is the log weight due to the properties of the scan, without the likelihood of
+    positions.
     """
 
     run: Integers
@@ -56,7 +57,7 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
     Args:
         predicted: (runs, vehicles, axes).
-        covariance: of a detection about its vehicle's prediction, (runs, vehicles, axes, axes).
+        covariance: (runs, vehicles, axes, axes), of a detection about the prediction of its vehicle.
         detections: (runs, detections, axes), padded with NaN.
     """
     axes = predicted.shape[-1]
@@ -69,7 +70,7 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
 
 def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """Return the most probable map of every run for independent vehicles (Hungarian method).
+    """Find the most probable map of every run for independent vehicles (Hungarian method).
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
@@ -100,9 +101,9 @@ def _assigned(gain: Floats) -> Integers:
 
 
 def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """Return all maps of every run inside the gates, except those with negligible weight.
+    """List all maps of every run inside the gates, except those with negligible weight.
 
-    If a scan is complete and without clutter, no vehicle is missed unless no detection is left for it.
+    If scans are complete and without clutter, a vehicle is missed only if no detection is left for it.
 
     Args:
         log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
@@ -146,9 +147,9 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
 
 
 def log_permanents(logs: Floats) -> Floats:
-    """Compute log permanents of exp(logs), (...,) from (..., n, n): sums over permutations.
+    """Compute log permanents (...,) of matrices exp(logs) (..., n, n): sums over permutations.
 
-    Dynamic programming over subsets of columns takes n 2^(n-1) products of positive numbers. If a
+    Dynamic programming over subsets of columns needs n 2^(n-1) products of positive numbers. If a
     permanent underflows, the result is its greatest term.
     """
     n = logs.shape[-1]

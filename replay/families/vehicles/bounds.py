@@ -1,7 +1,7 @@
-"""Total error of vehicles: exact for the Kalman filter, bounds for methods that use more information.
+"""Total error of vehicles: exact for the Kalman filter, bounded for methods with more information.
 
 All axes of all vehicles are equal and uncoupled, so one axis is sufficient. The filter assumes random
-accelerations; the truth has them (stochastic) or has none (deterministic).
+accelerations; the truth has random accelerations (stochastic) or none (deterministic).
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ SETTLED = 2000
 
 
 class Axis(NamedTuple):
-    """Squared position errors of one axis: by the filter's covariance, and for a truth without noise.
+    """Squared position errors of one axis: from the filter's covariance, and for a truth without noise.
 
     `gain` (2,) is the last gain, of position and velocity.
     """
@@ -33,7 +33,7 @@ def follow_axis(
     step_s: float = 1.0,
     prior_variance: tuple[float, float] = (2.5, 1.0),
 ) -> Axis:
-    """Filter one axis with fixes of this variance: predict, then update, `steps` times."""
+    """Filter one axis with fixes of a given variance for a number of steps."""
     position, cross, velocity = noise_moments(acceleration_sigma_mps2, step_s)
     noise = np.array([[position, cross], [cross, velocity]])
     transition = np.array([[1.0, step_s], [0.0, 1.0]])
@@ -51,10 +51,10 @@ def follow_axis(
 
 
 class Bounds(NamedTuple):
-    """Total errors in m of steady-state filters, by the use of the infrastructure sensor.
+    """Total errors of steady-state filters, in m, for each use of the infrastructure sensor.
 
-    Each combination of positions that the sensor measures has the error of all fixes; the other
-    combinations have the error of a vehicle's own fixes.
+    Combinations of positions that the sensor measures have the error of a filter with fixes and sensor;
+    other combinations have the error of a filter with fixes only.
     """
 
     topology: float
@@ -65,7 +65,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """Compute the smallest total errors; the topology measures 1 combination, a free pose all but 3."""
+    """Compute the smallest total errors; a topology measures 1 combination, a free pose all but 3."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

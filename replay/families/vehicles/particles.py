@@ -1,10 +1,10 @@
 """Particle filters of cooperative vehicles with unordered fixes.
 
 Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric
-measurement equation filter", 2016 (a bootstrap filter on sums of powers, whose exact likelihood is a
+measurement equation filter", 2016 (a bootstrap filter with sums of powers, whose exact likelihood is a
 permanent for each axis); Doucet, de Freitas, Murphy, Russell, "Rao-Blackwellised particle filtering for
-dynamic Bayesian networks", UAI 2000 (here, associations are sampled and vehicles filtered). A method is
-named `KIND-PARTICLES` or `KIND-PARTICLES-topology`, as in `vehicle-particles:axes-1000-topology`.
+dynamic Bayesian networks", UAI 2000 (here, associations are sampled and vehicles filtered). The name of
+a method is `KIND-PARTICLES` or `KIND-PARTICLES-topology`, as in `vehicle-particles:axes-1000-topology`.
 """
 
 import copy
@@ -64,7 +64,7 @@ _choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):
-    """The method and its random numbers, which depend on `seed` and on the run's first fixes.
+    """Method and random numbers, which depend on `seed` and on the first fixes of the run.
 
     Attributes:
         method: kind of the particles (set, axes or associations) and their number, as in
@@ -79,9 +79,9 @@ class ParticlesParameters(Parameters):
 class Cloud(NamedTuple):
     """The particles of all runs.
 
-    Each particle is a Gaussian of all vehicles (runs * particles, n). For a bootstrap filter, it has
-    only a mean, and the covariances are empty. Log weights are (runs, particles). A run's generator is
-    made when its first fixes arrive.
+    Each particle is a Gaussian of all vehicles (runs * particles, n). In a bootstrap filter, a particle
+    has only a mean, and the covariances are empty. Log weights are (runs, particles). A run's generator
+    is made when its first fixes arrive.
     """
 
     carried: VehiclesState
@@ -91,7 +91,7 @@ class Cloud(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A particle method: its kind, see `KINDS`, and its settings."""
+    """Particle method: its kind, see `KINDS`, and its settings."""
 
     kind: str
     particles: int
@@ -180,7 +180,7 @@ def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: in
 def _generator(
     method: Method, cloud: Cloud, frames: Frames, run: int, number: int
 ) -> np.random.Generator:
-    """Return a run's own generator; if it is new, make it from the first fixes and sample the states."""
+    """Return the generator of a run; if new, make it from the first fixes and sample the states."""
     found = cloud.generators[run]
     if found is None:
         seen = frames.network[run, number]
@@ -196,7 +196,7 @@ def _generator(
 
 
 def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generator) -> Floats:
-    """Return states after a turn, each with its own random acceleration."""
+    """Predict states by coordinated turns, each with its own random acceleration."""
     motion = setup.motion
     states = joint.mean.reshape(-1, motion.vehicles, STATES)
     moved = np.stack(turn(np.moveaxis(states, -1, 0), motion.turn_rate_radps, duration_s), axis=-1)
@@ -207,7 +207,7 @@ def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generat
 
 
 def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) -> Floats:
-    """Compute the log likelihood (particles,) of unordered fixes by a permanent, or one per axis."""
+    """Compute the log likelihood (particles,) of unordered fixes by one permanent, or one per axis."""
     places = positions(setup.motion, mean)
     squared = (seen - places[:, :, None]) ** 2 / setup.network.variance_m2
     if method.kind == "set":
@@ -238,7 +238,7 @@ def _drawn(setup: Setup, joint: Joint, seen: Floats, rng: np.random.Generator) -
 
 
 def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tuple[Joint, Floats]:
-    """Update particles with a full scan's topology; also return its log likelihood (particles,)."""
+    """Update particles with the topology of a full scan; also return its log likelihood (particles,)."""
     variance_m2 = setup.infrastructure.variance_m2
     if method.kind == "associations":
         measured = topology_measurement(setup.motion, joint, seen[None], variance_m2)

@@ -1,8 +1,8 @@
-"""Registration of an infrastructure sensor: its pose from unordered detections and vehicle estimates.
+"""Registration of an infrastructure sensor from unordered detections and vehicle estimates.
 
 Positions are complex numbers here: a rotation is a factor of length one, and the best rotation between
-centred points is the phase of their inner product (Procrustes in the plane). All permutations are tried
-to assign detections to vehicles.
+centred points is the phase of their inner product (Procrustes in the plane). All assignments of
+detections to vehicles are tried.
 """
 
 from functools import lru_cache
@@ -17,16 +17,16 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Booleans, Floats, Integers
 
 MOST_VEHICLES = 8
-# If the residual is less probable than this, a detection is not of a vehicle.
+# If the residual is less probable than this, one of the detections is not a vehicle.
 IMPROBABLE = 1e-4
-# The best permutation must fit better than the next by this number of squared sigmas.
+# The best permutation must fit better than the second best by this number of squared sigmas.
 LEAST_LEAD = 30.0
 # Smallest spread of the vehicles, in sigmas of a position, that determines a heading.
 LEAST_SPREAD = 5.0
 
 
 class Registration(NamedTuple):
-    """Sensor poses (runs, 3), the detection of every vehicle, and whether both are reliable."""
+    """Sensor poses (runs, 3), the detection of every vehicle, and flags of reliable results."""
 
     pose: Floats
     detection: Integers
@@ -34,9 +34,9 @@ class Registration(NamedTuple):
 
 
 def register(places: Floats, detections: Floats, variance_m2: Floats | float) -> Registration:
-    """Find the pose that best aligns full scans, in any order, with positions.
+    """Find the poses that best align full scans, in any order, with positions.
 
-    The result is not clear if the best fit is poor (a detection is not of a vehicle), if another order
+    The result is unreliable if the best fit is poor (a detection is not a vehicle), if another order
     fits nearly as well, or if the vehicles are too close together. Raises BadInput if there are too many
     vehicles.
 
@@ -83,14 +83,14 @@ def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
 
 
 def _middle(places: Floats) -> Floats:
-    """Return means (runs, 1, 2) of positions (runs, vehicles, 2) without NaN; zero if all are NaN."""
+    """Compute means (runs, 1, 2) of positions (runs, vehicles, 2) without NaN; zero if all are NaN."""
     there = np.isfinite(places)
     count = np.maximum(there.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.where(there, places, 0.0).sum(axis=1, keepdims=True) / count)
 
 
 def fitted_pose(places: Floats, detections: Floats) -> Floats:
-    """Find the poses that best align detections with positions in the same order.
+    """Find the poses that best align detections with positions, both in the same order.
 
     Pairs with a NaN are ignored.
 

@@ -1,8 +1,8 @@
-"""Filters of cooperative vehicles on a log's streams: methods, the topics they use, and their outputs.
+"""Filters of cooperative vehicles for replay: methods, their topics and their outputs.
 
-A method is named `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how the fixes are
-associated, and how the infrastructure sensor is used. A frame contains everything with the same stamp in
-a run. The filter processes frame after frame, for all runs in parallel.
+The name of a method is `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: the use of the
+fixes, and the use of the infrastructure sensor. A frame contains all messages of a run with the same
+stamp. The filter processes frame after frame, for all runs in parallel.
 """
 
 import copy
@@ -53,15 +53,15 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method and its assumptions.
+    """Method and assumptions of the filter.
 
     Attributes:
-        method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: how fixes are used (known,
-            hungarian, set, axes, powers, unscented-powers, products or complex), and how the roadside
-            sensor is used (topology, registration or static).
+        method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: the use of fixes (known, hungarian,
+            set, axes, powers, unscented-powers, products or complex), and that of the roadside sensor
+            (topology, registration or static).
         registration_scan: number of the first scan from which the sensor's pose may be estimated.
-        sigma_fix_m: standard deviation of each component of a fix that does not state its covariance;
-            if not set, such a fix is not used.
+        sigma_fix_m: standard deviation of each component of a fix without a stated covariance; if it is
+            not set, fixes without a covariance are not used.
     """
 
     method: str = "hungarian"
@@ -70,9 +70,9 @@ class VehiclesParameters(Parameters):
 
 
 class VehiclesState(NamedTuple):
-    """The joint state between blocks, first axis runs.
+    """Joint state between blocks; the first axis is the run.
 
-    `scans` counts the infrastructure sensor's scans; `registered` marks runs in which its pose was
+    `scans` counts the scans of the infrastructure sensor; `registered` marks runs in which its pose was
     found.
     """
 
@@ -105,10 +105,9 @@ class Frames(NamedTuple):
 
 
 class VehiclesResults(NamedTuple):
-    """Means (runs, frames, n), covariances after every frame, and maps if the method uses single ones.
+    """Means (runs, frames, n) and covariances after every frame, and maps if the method uses one map.
 
-    `associated` has arrays (runs, frames, vehicles, ...), with NaN innovations if nothing was
-    associated.
+    `associated` has arrays (runs, frames, vehicles, ...); innovations are NaN if nothing was associated.
     """
 
     mean: Floats
@@ -174,13 +173,13 @@ def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
 
 
 def motion_of(topics: Mapping[str, Topic], numbers: Sequence[int]) -> Motion:
-    """Read the vehicles' motion parameters from their priors' channels."""
+    """Read the motion parameters of the vehicles from the channels of their priors."""
     priors = [topics[f"/vehicle{number}/prior"] for number in numbers]
     return Motion(*(np.array([stated([prior], name) for prior in priors]) for name in Motion._fields))
 
 
 def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
-    """Read a sensor's properties from its scan channel; use defaults if the log has no such topic."""
+    """Read the properties of a sensor from its scan channel; use defaults if the topic is missing."""
     if topic not in topics:
         return Scanning(1.0, 1.0, 0.0)
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
@@ -191,7 +190,7 @@ def _start(given: Given[Any]) -> tuple[Setup, VehiclesState]:
 
 
 def start(setup: Setup, given: Given[Any]) -> VehiclesState:
-    """Return the initial state from every run's priors."""
+    """Make the initial state from the priors of every run."""
     runs = given.runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
     for vehicle, prior in enumerate(given):
@@ -233,7 +232,7 @@ def frames_of(setup: Setup, block: Block) -> Frames:
     skipped = np.zeros((*shape, vehicles), bool)
 
     def place(topic: str) -> tuple[Integers, Integers, Integers]:
-        """Return runs, frames and rows of a topic's messages."""
+        """Return runs, frames and rows of the messages of a topic."""
         chosen = np.flatnonzero(events.topic == names.get(topic, -1))
         first = sum(len(ragged) for ragged in list(block.streams.values())[: names.get(topic, 0)])
         return run_of[chosen], frame_of[chosen], events.source[chosen] - first
@@ -322,7 +321,7 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Yield every vehicle's estimates, the pose's if estimated, and failures.
+    """Yield the estimates of every vehicle, those of the pose if it is estimated, and failures.
 
     Args:
         setup: the bound method.
@@ -344,7 +343,7 @@ def outputs_of(
         return Ragged(stream, np.concatenate([[0], np.cumsum(rows.sum(axis=1))]))
 
     def innovations(vehicle: int) -> Ragged:
-        """Return a vehicle's innovations; the target is the number of the detection in its scan."""
+        """Return the innovations of a vehicle; the target is the number of the detection in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
         is_associated = detection != MISSED
         squared = np.einsum(

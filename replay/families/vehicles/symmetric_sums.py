@@ -1,11 +1,11 @@
-"""Pseudo-measurements from symmetric functions of noisy numbers: sums of powers, sums of products.
+"""Pseudo-measurements from symmetric functions of noisy numbers: sums of powers or products.
 
 Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992; Leven
 and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement
 equations", IEEE TAC 2009. Numbers m = p + v have independent noise with variance sigma^2. A covariance R
-is never formed, only a factor W with R = W W^H: the entries of W span ten decades and more, and those of
-R twice as many. Complex numbers x + iy, whose parts have the same sigma, preserve which x belongs to
-which y.
+is never computed, only a factor W with R = W W^H, because the entries of W span ten decades or more and
+those of R twice as many. Complex numbers x + iy, whose parts have the same sigma, preserve the pairs of
+x and y.
 """
 
 from itertools import combinations
@@ -21,7 +21,7 @@ Numbers = NDArray  # real or complex
 
 
 class Pseudo(NamedTuple):
-    """A pseudo-measurement at p: expectation (..., n), Jacobian by p, and a factor W of its noise.
+    """Pseudo-measurement at p: expectation (..., n), Jacobian by p, and a factor W of its noise.
 
     The Jacobian is (..., n, n) and W is (..., n, terms).
     """
@@ -48,7 +48,7 @@ def power_sums(m: Numbers, sigma: float) -> Numbers:
 
 
 def raw_power_sums(m: Numbers) -> Numbers:
-    """Compute the paper's (8): plain sums of powers, which are biased for noisy real numbers."""
+    """Compute plain sums of powers, (8) of the paper, which are biased for noisy real numbers."""
     return np.sum(m[..., None, :] ** np.arange(1, m.shape[-1] + 1)[:, None], axis=-1)
 
 
@@ -71,7 +71,7 @@ def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
 
 
 def product_sums(m: Numbers) -> Numbers:
-    """Compute the paper's (7): the unbiased elementary symmetric functions e_1 ... e_n of (..., n)."""
+    """Compute the unbiased elementary symmetric functions e_1 ... e_n (..., n), (7) of the paper."""
     return _elementary(m)[..., 1:]
 
 
@@ -88,7 +88,7 @@ def _elementary(m: Numbers) -> Numbers:
 def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
     """Compute expected sums of products of p (..., n): W[a, T] = sigma^|T| e_{a - |T|}(p without T).
 
-    T runs over the 2^n - 1 non-empty subsets of the numbers.
+    The columns T are the 2^n - 1 non-empty subsets of the numbers.
     """
     n = p.shape[-1]
     columns = []
@@ -99,7 +99,7 @@ def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
             column[..., size - 1 :] = sigma**size * rest
             columns.append(column)
     factor = np.stack(columns, axis=-1)
-    # divided by sigma, the column of each single number is the derivative by that number
+    # the column of a single number, divided by sigma, is the derivative with respect to this number
     jacobian = factor[..., :n] / sigma if sigma else product_sums_at(p, 1.0).jacobian
     return Pseudo(product_sums(p), jacobian, factor)
 

@@ -1,9 +1,9 @@
 """Timeline of vehicles: a map, a close-up, and errors and GOSPA over time.
 
-Errors are about a metre on trajectories of hundreds of metres, so everything is also drawn in a close-up
-about each vehicle's true position, side by side. Detections of the infrastructure sensor are in its own
-frame; the map shows them transformed by the sensor's true pose, and by the estimated pose if an
-estimator finds it.
+Errors are about 1 m on trajectories of hundreds of metres, so everything is also drawn in close-ups
+around the true positions of the vehicles, side by side. Detections of the infrastructure sensor are in
+its own frame; the map shows them transformed by the true pose of the sensor, and by the estimated pose
+if an estimator finds it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -66,7 +66,8 @@ SENSOR = f"{ROOT}/sensor"
 FIX: Colour = (150, 150, 90)
 SEEN: Colour = (190, 110, 60)
 LINK = (255, 255, 255, 255)
-# Distance between close-ups, and largest distance from a vehicle that is drawn in its close-up.
+# Distance between close-ups, and largest distance from a vehicle at which points are drawn in its
+# close-up.
 CELL_M, SHOWN_M = 8.0, 3.8
 
 
@@ -82,7 +83,7 @@ class Vehicles(NamedTuple):
         return self.places.shape[1]
 
     def rows(self, time_ns: Times) -> NDArray[np.int64]:
-        """Return the steps of stamps; the next step if a stamp is between two."""
+        """Return the step of each stamp; if a stamp is between two steps, return the later one."""
         return np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
 
 
@@ -94,7 +95,7 @@ class Points(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw the map above the close-up, next to GOSPA, errors in a tab, and NEES."""
+    """Draw the map above the close-ups, next to GOSPA, errors (in a tab) and NEES."""
     turn_up(canvas)
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}
@@ -173,7 +174,7 @@ def _truths(scene: Scene) -> Vehicles:
 
 
 def _tracks(scene: Scene, name: str, vehicles: Vehicles) -> Floats:
-    """Return an estimator's positions (steps, vehicles, 2) at the truth's stamps, NaN if missing."""
+    """Return an estimator's positions (steps, vehicles, 2) at stamps of the truth, NaN if missing."""
     topics = [f"/estimates/{name}/vehicle{n + 1}/state" for n in range(vehicles.number)]
     found = [scene.outputs[topic] for topic in topics if topic in scene.outputs]
     found = [stream for stream in found if set(PLANE) <= set(stream.components)]
@@ -191,7 +192,7 @@ def _points(scene: Scene, topic: str) -> Points:
 
 
 def _registered(scene: Scene) -> list[tuple[str, Points]]:
-    """Return the infrastructure sensor's detections, placed by each estimator's pose of the sensor."""
+    """Transform the detections of the infrastructure sensor by each estimated pose of the sensor."""
     raw = _points(scene, "/infrastructure/detection")
     found = []
     for name, stream in scene.outputs_of("infrastructure", schemas.GAUSSIAN_ESTIMATE):
@@ -206,7 +207,7 @@ def _registered(scene: Scene) -> list[tuple[str, Points]]:
 
 
 def _poses(scene: Scene) -> list[Floats]:
-    """Return the sensor's true poses (n, 3), x, y in m, heading in rad; an empty list if unknown."""
+    """Return the true poses (n, 3) of the sensor, in m and rad; an empty list if they are unknown."""
     return [
         truth["state"]
         for truth in scene.truths_of("infrastructure")
@@ -294,7 +295,7 @@ def _draw_close(
     tracks: dict[str, Floats],
     unnamed: Sequence[tuple[str, Points]],
 ) -> None:
-    """Draw everything relative to each vehicle's true position, the vehicles side by side."""
+    """Draw everything relative to the true positions of the vehicles, side by side."""
     corners = CELL_M * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
     centres = np.stack([CELL_M * np.arange(vehicles.number), np.zeros(vehicles.number)], axis=1)
     frames = rr.LineStrips2D(
@@ -314,7 +315,7 @@ def _draw_close(
     canvas.fix(f"{CLOSE}/truth", truth)
 
     def near(points: Points) -> Points:
-        """Return points in the cells of all vehicles that they are near."""
+        """Return points in the cell of every vehicle to which they are near."""
         apart = points.places[:, None] - vehicles.places[vehicles.rows(points.time_ns)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2, initial=0.0) < SHOWN_M)
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])
@@ -383,7 +384,7 @@ def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
 def _draw_errors(
     canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot GOSPA, which ignores labels, and the joint error of all vehicles with their labels."""
+    """Plot GOSPA, which ignores labels, and the joint error of all labelled vehicles."""
     for name, places in tracks.items():
         known = np.isfinite(places).all(axis=(1, 2))
         there, truths = places[known], vehicles.places[known]

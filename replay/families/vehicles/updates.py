@@ -60,7 +60,7 @@ SENSOR = {
 
 
 class Setup(NamedTuple):
-    """Settings of a bound method; `numbers` are those of the vehicles in the names of their topics."""
+    """Settings of a bound method; `numbers` are the vehicle numbers in the names of topics."""
 
     name: str
     numbers: tuple[int, ...]
@@ -79,7 +79,7 @@ class Setup(NamedTuple):
 
     @property
     def uses_sums(self) -> bool:
-        """Test whether unordered fixes become symmetric sums; otherwise they are associated."""
+        """Test whether the method uses symmetric sums of unordered fixes instead of associating them."""
         return self.fixes not in ("known", "hungarian", "set", "axes")
 
     @property
@@ -89,7 +89,7 @@ class Setup(NamedTuple):
 
 
 def split_method(method: str) -> tuple[str, str]:
-    """Split a method into the parts for fixes and for the infrastructure sensor, "" if unused."""
+    """Split a method into its parts for fixes and for the infrastructure sensor ("" if unused)."""
     fixes, _, sensor = method.rpartition("-")
     return (fixes, sensor) if fixes and sensor in SENSOR else (method, "")
 
@@ -110,7 +110,7 @@ def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
 
 
 def where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """Return the joint states, changed in the chosen runs.
+    """Apply a change to the joint states of the chosen runs.
 
     Args:
         chosen: (runs,), which runs to change.
@@ -139,7 +139,7 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
 
 
 class Associated(NamedTuple):
-    """One map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
+    """Detections (runs, vehicles) of one map, or MISSED, with innovations (..., 2) and covariances."""
 
     detection: Integers
     innovation: Floats
@@ -174,8 +174,8 @@ def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint
 def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
     """Update with symmetric sums of full scans; scans with missing or extra fixes are ignored.
 
-    The sums are taken of numbers minus their expected mean: such sums are linear combinations of the
-    original sums and lose fewer digits.
+    The expected mean is subtracted from the numbers first: the resulting sums are linear combinations of
+    the original sums and lose fewer digits.
 
     Args:
         setup: the bound method.
@@ -213,7 +213,7 @@ def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
 
 
 def _root(covariance: Floats) -> Floats:
-    """Return factors X with X X' = covariance, also if rounding has made it slightly indefinite."""
+    """Compute factors X with X X' = covariance, even if rounding has made it slightly indefinite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), np.float64)
     except np.linalg.LinAlgError:
@@ -222,7 +222,7 @@ def _root(covariance: Floats) -> Floats:
 
 
 def blocks_of(matrices: Floats, vehicles: int) -> Floats:
-    """Return the diagonal blocks of matrices.
+    """Return the diagonal blocks of the matrices.
 
     Args:
         matrices: (runs, vehicles a, vehicles a).
@@ -238,7 +238,7 @@ def blocks_of(matrices: Floats, vehicles: int) -> Floats:
 
 
 def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
-    """Return detections minus predictions, (h, vehicles * axes), by vehicle; NaN if missed.
+    """Compute detections minus predictions (h, vehicles * axes), by vehicle; NaN if missed.
 
     Args:
         maps: h hypotheses.
@@ -253,7 +253,7 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
 
 
 def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Update with the topology of scans; ignore incomplete scans and scans of a single point.
+    """Update with the topology of scans, but ignore incomplete scans and scans of a single point.
 
     Args:
         setup: the bound method.
@@ -273,7 +273,7 @@ def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
 def update_by_pose(
     setup: Setup, joint: Joint, seen: Floats, registered: Booleans, may_start: Booleans
 ) -> tuple[Joint, Booleans]:
-    """Update with detections from the sensor's pose, which is estimated too.
+    """Update with detections of the infrastructure sensor, whose pose is also estimated.
 
     The pose is estimated from the vehicles' estimates if it is not yet known, or if it is assumed to
     change between scans.

@@ -1,11 +1,11 @@
-"""Tracking of one vehicle by its own fixes: the paper's reference with known association.
+"""Tracking of one vehicle by its own fixes, the reference with known association in the paper.
 
 Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, section 4.1. Each vehicle has its own estimate.
 
-The modes of a vehicle that turns and stops, for an interacting multiple model, are not in the paper. The
-vehicle drives as in the paper, manoeuvres with larger accelerations, or stands; between driving and
-standing it brakes or starts, which is a manoeuvre.
+The modes for an interacting multiple model of a vehicle that turns and stops are not in the paper. The
+vehicle drives as in the paper, manoeuvres with larger accelerations, or stands still; between driving
+and standing, it brakes or starts, which is a manoeuvre.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):
-    """The motion of the vehicle, and the rates of transitions between its modes.
+    """Motion of the vehicle, and rates of transitions between its modes.
 
     Attributes:
         turn_rate_radps: constant turn rate of the vehicle.
@@ -49,7 +49,7 @@ class VehicleParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Move the vehicle by a coordinated turn."""
+    """Predict the vehicle by a coordinated turn."""
     return turn(state, parameters.turn_rate_radps, duration_s)
 
 
@@ -60,7 +60,7 @@ def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> C
 
 
 def manoeuvring_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return noise as from `acceleration_noise`, for the larger accelerations of a manoeuvre."""
+    """Return the noise of `acceleration_noise` for the larger accelerations of a manoeuvre."""
     place, mixed, velocity = noise_moments(parameters.manoeuvring_sigma_mps2, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
@@ -94,7 +94,7 @@ def position(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix that does not state them."""
+    """Return the variances of a fix whose message states none."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 

@@ -19,7 +19,7 @@ from fuselog.replay.families.vehicles.association import Hypotheses
 
 STATES = 4  # components of a vehicle's state
 POSE = 3  # components of the sensor's pose
-# Chi-square gate, one degree of freedom: a less probable topology includes other things than vehicles.
+# Chi-square gate with one degree of freedom; a less probable topology is not of vehicles only.
 TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
 
 
@@ -35,7 +35,7 @@ class Joint(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The vehicles' motion: turn rates and standard deviations of the acceleration, (vehicles,) each."""
+    """Motion of the vehicles: turn rates (vehicles,), and standard deviations of the acceleration."""
 
     turn_rate_radps: Floats
     acceleration_sigma_mps2: Floats
@@ -47,7 +47,7 @@ class Motion(NamedTuple):
 
 
 def positions(motion: Motion, mean: Floats) -> Floats:
-    """Return the vehicles' positions (runs, vehicles, 2).
+    """Return the positions (runs, vehicles, 2) of the vehicles.
 
     Args:
         motion: the vehicles' motion, for their number.
@@ -66,7 +66,7 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
-    """Predict the joint state by `duration_s`: coordinated turns and white accelerations."""
+    """Predict the joint state by `duration_s`, with coordinated turns and white accelerations."""
     states = joint.mean.shape[1]
     transition, noise = np.eye(states), np.zeros((states, states))
     for vehicle in range(motion.vehicles):
@@ -83,8 +83,8 @@ def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
 class Gain(NamedTuple):
     """Effect of a linear measurement on a covariance; S is the innovation covariance.
 
-    `inverse` is S^-1 (runs, m, m), `log_determinant` (runs,) that of S, `gain` is (runs, n, m), and
-    `covariance` is the covariance after the update.
+    `inverse` (runs, m, m) is S^-1, `log_determinant` (runs,) is the log determinant of S, `gain` (runs,
+    n, m) is the Kalman gain, and `covariance` is the covariance after the update.
     """
 
     inverse: Floats
@@ -131,10 +131,10 @@ def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joi
 
 
 class Weighed(NamedTuple):
-    """Hypotheses with scores (log weight and log likelihood), and innovations, zero if missed.
+    """Hypotheses with scores (log weight plus log likelihood) and innovations (zero if missed).
 
-    `group` (h,) is the row of the gains for each hypothesis: hypotheses of a run that miss the same
-    vehicles have the same row. `group_run` is the run of each row.
+    `group` (h,) is the row of the gains for each hypothesis: hypotheses of a run share a row if they
+    miss the same vehicles. `group_run` is the run of each row.
     """
 
     score: Floats
@@ -151,7 +151,7 @@ def weigh(
 
     Args:
         joint: joint states before the measurement.
-        rows: selects the measured components of all vehicles from the state, (m, n).
+        rows: (m, n), matrix that selects the measured components of all vehicles from the state.
         innovations: innovations of every hypothesis, (h, m), NaN for a vehicle that was not detected.
         noise: the variance of every measured component, (m,).
         hypotheses: hypotheses sorted by run, at least one for every run.
@@ -172,7 +172,7 @@ def weigh(
 def collapse(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Joint:
-    """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
+    """Compute the Gaussian with the moments of the mixture over all associations of an unordered set.
 
     The weights are exact: for a complete set, the weights of all maps are the terms of a permanent. The
     result is therefore the one to which an exact symmetric measurement equation filter collapses.
@@ -194,7 +194,7 @@ def collapse(
 
 
 def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
-    """Find the distinct rows of a pattern with a sorted first column, and the index of each row."""
+    """Find the distinct rows of a pattern whose first column is sorted, and the index of each row."""
     if len(pattern) == 0 or pattern[:, 1:].all():
         runs, group = np.unique(pattern[:, 0], return_inverse=True)
         return np.concatenate([runs[:, None], np.ones_like(pattern[: len(runs), 1:])], axis=1), group
@@ -212,7 +212,7 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
 
 
 def normalised(score: Floats, run: Integers) -> Floats:
-    """Return exp(score), scaled to a sum of one in each run.
+    """Compute exp(score), scaled to a sum of one in each run.
 
     Args:
         score, run: (h,); `run` is sorted.
@@ -229,12 +229,12 @@ def spread_of(places: Floats) -> Floats:
 
 
 def topology(places: Floats) -> Floats:
-    """Compute (18), the sum of squared distances of all pairs, (...,), from (..., vehicles, 2)."""
+    """Compute the sum (...,) of squared distances of all pairs of positions (..., vehicles, 2), (18)."""
     return places.shape[-2] * spread_of(places)
 
 
 def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats]:
-    """Compute mean and variance (...,) of what noise adds to the measured topology.
+    """Compute mean and variance (...,) of the error that noise adds to the measured topology.
 
     Args:
         places: (..., vehicles, 2), in m.
@@ -247,9 +247,9 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
 
 
 class Scalar(NamedTuple):
-    """A linearized scalar measurement: Jacobian (runs, 1, n), innovations (runs,), their variances.
+    """Linearized scalar measurement: Jacobian (runs, 1, n), innovations (runs,) and their variances.
 
-    `noise` (runs,) is the measurement's part of the variance.
+    `noise` (runs,) is the part of the variance due to the measurement.
     """
 
     rows: Floats
@@ -261,8 +261,8 @@ class Scalar(NamedTuple):
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
     """Linearize the topology of scans, which does not depend on their frame and order.
 
-    The innovation is NaN if it is too improbable: then a vehicle was missed and something else was
-    detected.
+    The innovation is NaN if it is too improbable, because a vehicle was then missed and something else
+    was detected.
 
     Args:
         motion, joint: motion and joint states of the vehicles in all runs.
@@ -312,10 +312,10 @@ def sight_of(motion: Motion, joint: Joint) -> Sight:
 def update_by_shape(
     motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
 ) -> Joint:
-    """Update with a sensor's detections from a pose without prior information.
+    """Update with detections of a sensor whose pose has no prior information.
 
-    The update of the vehicles uses only the part of the detections that no change of the pose affects;
-    the pose then follows from the vehicles.
+    The update of the vehicles uses only the part of the detections that does not depend on the pose; the
+    pose is then computed from the vehicles.
 
     Args:
         motion, joint: motion and joint states of the vehicles in all runs.

@@ -1,4 +1,4 @@
-"""Estimates that a program wrote: MCAP, TUM, or CSV with covariances, recognised by content."""
+"""Reading of the estimates that a program wrote: MCAP, TUM, or CSV with covariances."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,7 +51,7 @@ def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Str
 
 
 def _of_log(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
-    """Read estimates and innovations from a log; a topic keeps the part of its name after its label."""
+    """Read estimates and innovations from a log; in topic names, only the label is replaced."""
     log = open_log(path)
     chosen = [name for name, topic in log.topics.items() if topic.schema_name in KEPT]
     if not any(log.topics[name].schema_name == KEPT[0] for name in chosen):
@@ -74,8 +74,8 @@ def _of_log(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
 def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
     """Read estimates from a table.
 
-    Columns: `time_ns` (or `time_s`), one for each component, and `cov_A_B` for covariances of
-    components A and B of the tangent space, in either order; missing ones are zero.
+    The columns are `time_ns` (or `time_s`), one for each component, and `cov_A_B` for the covariance of
+    components A and B of the tangent space, in either order; missing covariances are zero.
     """
     try:
         table = pd.read_csv(path, skipinitialspace=True)
@@ -122,7 +122,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
 
 
 def _components(names: list[str], truth: Topic | None) -> Components:
-    """Return components with their kinds in the truth; linear without a truth."""
+    """Return components with their kinds in the truth, or all linear without a truth."""
     if truth is None:
         return dict.fromkeys(names, "linear")
     stated = stated_components(truth.metadata, {}, f"topic {truth.name}")

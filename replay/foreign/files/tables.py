@@ -9,7 +9,7 @@ from fuselog.recorders.log import Stream
 
 
 def write_tables(folder: Path, streams: Sequence[Stream]) -> None:
-    """Write each topic to its file, such as `robot1-odometry.csv`: `time_ns`, then the fields.
+    """Write each topic to a file such as `robot1-odometry.csv`, with `time_ns` and all fields.
 
     A vector has a column for each number, `position_m_0` and so on. The metadata of the channel is in
     `robot1-odometry.json`.

@@ -1,4 +1,4 @@
-"""Filters behind `fuselog_filter.h`: loading of their library, and calls by address.
+"""Filters with the functions of `fuselog_filter.h`: loading of libraries, and calls by address.
 
 Begin with `following`.
 """

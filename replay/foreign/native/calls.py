@@ -1,4 +1,4 @@
-"""Calls of C functions by address from kernels, without Python between a message and the filter."""
+"""Calls of C functions by address from kernels, without any Python code between messages."""
 
 import ctypes
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ _C: dict[str, Any] = {
 
 
 class Call:
-    """C function that is called by address: `call(address, *arguments)`, in a kernel as in Python.
+    """C function that is called by address, in a kernel or in Python: `call(address, *arguments)`.
 
-    A pointer is an array or an address; a function that returns nothing gives 0.
+    A pointer is an array or an address; the result is 0 for a function without a return value.
     """
 
     def __init__(self, name: str, *kinds: str, returns: str = "i32") -> None:
@@ -61,7 +61,7 @@ class Call:
 
 
 def _passed(emitter: Emitter, value: Any, kind: str) -> str:
-    """Convert an argument to the form that C takes."""
+    """Convert an argument to the C type of a parameter."""
     if isinstance(value, Array):
         if kind != "pointer" or value.dtype != "<f8":
             raise TypeError("a pointer argument of a C function must be an array of real numbers")

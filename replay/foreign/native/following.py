@@ -1,4 +1,4 @@
-"""Processing of messages by the filters of a library: one loop that calls its functions by address."""
+"""Processing of messages by the filters of a library, in one loop with calls by address."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -29,9 +29,9 @@ from fuselog.replay.inference.run.recursion import (
     filled,
 )
 
-# Codes of failures that any filter can have; a status s of the filter's own has the code OWN + s.
+# Codes of failures that any filter can have; a filter's own status s has the code OWN + s.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8
-NOBODY = -1  # the caller if no message wants an estimate
+NOBODY = -1  # the caller if no estimate is requested
 FAILURES = {
     0: "a variance of the filter's covariance is negative",
     1: "the filter's estimate or covariance is not finite",
@@ -51,7 +51,7 @@ class Filters(NamedTuple):
         begun: (runs,) 0 before the start, then 1.
         failure: (runs,) ALL_WELL, or a code; see `reason_of_code`.
         mean, covariance: (runs, n), (runs, t, t) the priors.
-        has_prior: (runs,) 0 if the filter starts by itself.
+        has_prior: (runs,) 0 if the filter starts without a prior.
     """
 
     handle: Integers
@@ -84,7 +84,7 @@ class Given(NamedTuple):
 def follow(
     run: int, given: Given, carried: Filters, made: Results, work: tuple[Innovation, Innovation]
 ) -> None:
-    """Pass one run's messages to its filter in order and store its results, until the run fails."""
+    """Pass the messages of one run to its filter in order and store the results, until the run fails."""
     events = given.events
     for event in range(events.offsets[run], events.offsets[run + 1]):
         caller = event if events.wants_estimate[event] else NOBODY
@@ -102,7 +102,7 @@ def advance(
 ) -> None:
     """Pass a message to a filter that has not failed, and store its innovation.
 
-    `caller` is the message that wants the estimate after it, `NOBODY` if none does.
+    `caller` is the message after which an estimate is requested, or `NOBODY`.
     """
     if carried.failure[run] == ALL_WELL:
         addresses, static, events = given
@@ -123,14 +123,14 @@ def advance(
 
 
 def outcome(status: int) -> int:
-    """Convert the return value of a filter's function to WELL or a code of what failed."""
+    """Convert the return value of a filter's function to WELL or the code of a failure."""
     if status < REJECTED:
         return -10 - UNDEFINED
     return max(status, WELL)
 
 
 def begin(run: int, addresses: Addresses, static: Static, time_ns: int, carried: Filters) -> int:
-    """Pass static messages to the filter and start it; return WELL or a code of what failed."""
+    """Pass static messages to the filter and start it; return WELL or the code of a failure."""
     handle = carried.handle[run]
     for row in range(static.offsets[run], static.offsets[run + 1]):
         status = TAKE(addresses.take, handle, static.source[row], static.time_ns[row], static.data[row])
@@ -154,7 +154,7 @@ def take(
     innovations: InnovationRows,
     work: tuple[Innovation, Innovation],
 ) -> int:
-    """Pass a message to the filter and store its innovation; return WELL or a code of what failed."""
+    """Pass a message to the filter and store its innovation; return WELL or the code of a failure."""
     handle, time_ns = carried.handle[run], events.time_ns[event]
     if events.source[event] < 0:
         return outcome(PREDICT(addresses.predict, handle, time_ns))
@@ -192,7 +192,7 @@ def take(
 
 
 def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made: Results) -> int:
-    """Store the filter's estimate; return WELL or a code of what failed."""
+    """Store the filter's estimate; return WELL or the code of a failure."""
     estimates, events = made.estimates, given.events
     row, state = estimates.end[run], given.addresses.state
     status = STATE(state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
@@ -224,7 +224,7 @@ def reason_of_code(code: int, description: Description) -> str:
 
 
 class Followed(NamedTuple):
-    """Results of filters: estimates, when they were issued, innovations, and the offsets of the runs."""
+    """Results of filters: estimates with their times of issue, innovations, and offsets of the runs."""
 
     issued_ns: Integers
     estimates: EstimateRows
@@ -250,19 +250,19 @@ def follow_all(
     carried: Filters,
     made: Results,
 ) -> None:
-    """Pass the messages of all runs to their filters, which change, and fill the results."""
+    """Pass the messages of all runs to their filters (in place), and fill the results."""
     given = Given(addresses_of(library, description), static, events)
     _loop()(len(carried.handle), given, carried, made, scratch=work_of(description))
 
 
 def addresses_of(library: Library, description: Description) -> Addresses:
-    """Return the functions of a library to call; without innovations if its description has none."""
+    """Return the addresses of the functions of a library; 0 for innovations if it describes none."""
     addresses = library.addresses
     return addresses if description.innovation else addresses._replace(innovation=0)
 
 
 def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
-    """Cut results to the rows that were filled.
+    """Trim results to the filled rows.
 
     Args:
         made: results of all runs.
@@ -273,7 +273,7 @@ def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
 
 
 def copies_of(library: Library, filters: Filters) -> Filters:
-    """Copy filters; one that cannot be copied has failed."""
+    """Copy filters; mark a filter that cannot be copied as failed."""
     handles = np.array([library.copy(handle) for handle in filters.handle.tolist()], np.int64)
     found = copied(filters)._replace(handle=handles)
     found.failure[(handles == 0) & (found.failure == ALL_WELL)] = NOT_COPIED
@@ -281,7 +281,7 @@ def copies_of(library: Library, filters: Filters) -> Filters:
 
 
 def work_of(description: Description) -> Callable[[], tuple[Innovation, Innovation]]:
-    """Return a function that allocates the kernels' work space."""
+    """Return a function that allocates work space of kernels."""
     return partial(_work, max(len(description.innovation), 1))
 
 

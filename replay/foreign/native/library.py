@@ -1,6 +1,7 @@
-"""Shared libraries of `fuselog_filter.h`.
+"""Shared libraries with the functions of `fuselog_filter.h`.
 
-This module imports very little, so that a process that only reads a library's description starts fast.
+This module imports very little, so that a process that only reads the description of a library starts
+fast.
 """
 
 import ctypes
@@ -40,7 +41,7 @@ class Library:
     """
 
     def __init__(self, path: Path) -> None:
-        """Load a library; raise BadInput if the file is not one, or has another version."""
+        """Load a library; raise BadInput if the file is not a library, or has another version."""
         self.path = path
         if not path.is_file():
             raise BadInput(f"{path}: no such file; give the path of a shared library")
@@ -85,16 +86,16 @@ class Library:
         return function
 
     def create(self, parameters: Iterable[float], seed: int) -> int:
-        """Make a filter and return its address; 0 if that fails."""
-        values = (*parameters, 0.0)  # never empty, so that the array has an address
+        """Make a filter and return its address, or 0 if that fails."""
+        values = (*parameters, 0.0)  # never empty, because an empty array has no address
         return self._create((ctypes.c_double * len(values))(*values), seed) or 0
 
     def copy(self, handle: int) -> int:
-        """Copy a filter and return its address; 0 if that fails, or if there is no filter."""
+        """Copy a filter and return its address, or 0 if that fails or if there is no filter."""
         return (self._copy(handle) or 0) if handle else 0
 
     def destroy(self, handle: int) -> None:
-        """Destroy a filter, if the address is not 0."""
+        """Destroy a filter, unless the address is 0."""
         if handle:
             self._destroy(handle)
 

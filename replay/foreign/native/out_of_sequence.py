@@ -1,10 +1,10 @@
 """Reprocessing of out-of-sequence messages by the filters of a library.
 
-Messages are passed as they arrive, and every run has two filters. The settled one has processed, in
-order, the messages before which no others can come any more; the newest one has processed all that have
-arrived. When a message is late, the newest filter becomes a copy of the settled one and processes the
-messages in the window again. Estimates are those of the newest filter, innovations those of the settled
-one, so both equal those of processing in order.
+Messages are passed as they arrive, and every run has two filters. The settled filter has processed, in
+order, the messages that no other message can precede any more; the newest filter has processed all
+messages that have arrived. When a message is late, the newest filter is replaced by a copy of the
+settled one and processes the messages in the window again. Estimates are those of the newest filter and
+innovations those of the settled one, so both equal the results of processing in order.
 """
 
 from bisect import bisect
@@ -41,13 +41,13 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 
 @varying(1)
 class Arrived(NamedTuple):
-    """Messages that have arrived, in order, and how late a message may be.
+    """Messages that have arrived, in order, and the largest delay of a message.
 
     Attributes:
-        order: (n,) the messages that have arrived, sorted by stamp and position in the file; those of
-            run r begin where its events begin.
-        estimating: (n,) 1 for messages whose stamps have estimates.
-        window_ns: (1,).
+        order: (n,) the messages that have arrived, sorted by stamp and position in the file; the
+            messages of run r begin at the first event of the run.
+        estimating: (n,) 1 for messages with estimates at their stamps.
+        window_ns: (1,) the largest delay.
     """
 
     order: Integers
@@ -64,7 +64,7 @@ def follow_as_arrived(
     made: Results,
     work: tuple[Innovation, Innovation],
 ) -> None:
-    """Pass one run's messages to its filters as they arrive, until the run fails; see the module."""
+    """Pass the messages of one run to its filters as they arrive, until the run fails."""
     events, order = given.events, arrived.order
     begin, end = events.offsets[run], events.offsets[run + 1]
     taken = begin
@@ -91,7 +91,7 @@ def follow_as_arrived(
 
 
 def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int:
-    """Insert a message in the order by stamp and position in the file, and return its row.
+    """Insert a message in the order of stamps and positions in the file, and return its row.
 
     Args:
         begin: first row of its run.
@@ -121,7 +121,7 @@ def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
 
 
 def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
-    """Find the last row of the newest stamp that has estimates; row `last` is the newest."""
+    """Find the last row of the newest stamp with estimates; row `last` is the newest."""
     row, order = last, arrived.order
     while row > 0 and arrived.estimating[order[row]] == 0:
         row -= 1
@@ -160,7 +160,7 @@ def follow_all_as_arrived(
 
 
 def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
-    """List the out-of-sequence messages in blocks, and how many earlier arrivals each reprocessed."""
+    """List the out-of-sequence messages in blocks, each with its number of reprocessed messages."""
     newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
     made = []
     for events in blocks:

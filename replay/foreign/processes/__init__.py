@@ -1,4 +1,4 @@
-"""Processes for filters: started, watched, ended if necessary, and replaced.
+"""Processes for filters, which are started, watched, ended if necessary, and replaced.
 
-Begin with `isolation`; `streaming` has the programs that answer messages.
+Begin with `isolation`; `streaming` is for programs that answer messages.
 """

@@ -36,7 +36,7 @@ STARTS_S = 60.0  # time for a process to start, since it imports and compiles
 
 
 class Ended(Exception):
-    """Reason why a process ended, or was ended, before it was done."""
+    """Reason why a process ended, or was ended, before it had finished its task."""
 
 
 class Limits(NamedTuple):
@@ -52,7 +52,7 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Watch on a working process: its progress and its memory."""
+    """Monitor of the progress and the memory of a working process."""
 
     def __init__(self, process: psutil.Process, limits: Limits) -> None:
         self._process, self._limits = process, limits
@@ -60,7 +60,7 @@ class Watch:
         self._since = time.monotonic()
 
     def look(self, progress: object, allowed_s: float | None = None) -> None:
-        """Check the process; raise Ended if it exceeds a limit. `progress` differs if it advanced."""
+        """Raise Ended if the process exceeds a limit; a new value of `progress` shows an advance."""
         now, limit_s = time.monotonic(), allowed_s or self._limits.time_s
         if progress != self._seen:
             self._seen, self._since = progress, now
@@ -91,14 +91,14 @@ def end(process: "subprocess.Popen[bytes]") -> None:
                 with suppress(OSError):
                     stream.close()
 
-    # a process that it started may hold its output open; this is not waited for
+    # a process that it started may keep its output open; do not wait for this
     closing = threading.Thread(target=close, daemon=True)
     closing.start()
     closing.join(LOOKS_S)
 
 
 def how_ended(code: int) -> str:
-    """Describe how a process with this exit code ended."""
+    """Describe the end of a process by its exit code."""
     if code < 0:
         with suppress(ValueError):
             return f"crashed ({signal.Signals(-code).name})"
@@ -123,7 +123,7 @@ class Worker:
         self._answers.put(b"")
 
     def end(self) -> None:
-        """End the process, whatever it is doing."""
+        """End the process, even if it is working."""
         self.is_over = True
         end(self._process)
 
@@ -138,7 +138,7 @@ class Worker:
         return self._process.returncode
 
     def ask(self, task: dict[str, Any], limits: Limits, progress: Callable[[], int] = lambda: 0) -> Any:
-        """Have a task done; raise Ended if the process ends first, and BadInput if it refuses it."""
+        """Run a task; raise Ended if the process ends first, and BadInput if it rejects the task."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(task).encode() + b"\n")
@@ -162,7 +162,7 @@ class Worker:
 
 
 def state_of(library: str) -> list[int]:
-    """Return modification time and size of a library; a process that has loaded an older one ends."""
+    """Return the modification time and size of a library, by which processes detect a new version."""
     try:
         state = Path(library).stat()
     except OSError:
@@ -171,7 +171,7 @@ def state_of(library: str) -> list[int]:
 
 
 class Ran(NamedTuple):
-    """Results of one run's filter, and why the run failed, if it did."""
+    """Results of the filter of one run, and the reason if the run failed."""
 
     followed: Followed
     failure: Failure | None
@@ -180,7 +180,7 @@ class Ran(NamedTuple):
 def follow_apart(
     worker: Worker, library: str, given: RunGiven, description: Description, limits: Limits
 ) -> Ran | None:
-    """Process one run with its filter in a process; results before a crash are kept.
+    """Process one run with its filter in another process; results before a crash are kept.
 
     Return None if the process had already ended because it was idle.
     """
@@ -217,7 +217,7 @@ def follow_here(library: Library, given: RunGiven, description: Description) -> 
 
 
 def failure_at(event: int, given: RunGiven, description: Description, why: str) -> Failure:
-    """Return a failure at a message, with the message in its reason."""
+    """Make the failure of a run at a message, whose reason names the message."""
     events = given.events
     if not 0 <= event < len(events.time_ns):
         first_ns = int(events.time_ns[0]) if len(events.time_ns) else 0
@@ -228,9 +228,9 @@ def failure_at(event: int, given: RunGiven, description: Description, why: str) 
 
 
 class Workers:
-    """Processes that work on a set of runs; those that survive are kept for later.
+    """Processes that work on a set of runs; surviving processes are reused later.
 
-    A process without work for some time ends by itself, see `worker`.
+    A process ends by itself if it has no work for some time, see `worker`.
     """
 
     def __init__(self) -> None:
@@ -252,7 +252,7 @@ class Workers:
                 _KEPT.put(worker)
 
     def end(self) -> None:
-        """End the processes that still work, and provide no more."""
+        """End the processes that are still working, and provide no new ones."""
         self._is_over = True
         for worker in list(self._working):
             worker.end()
@@ -282,7 +282,7 @@ def _end_kept() -> None:
 def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with filters in as many parallel processes as there are cores; None stays None."""
+    """Process runs with filters in parallel, in one process per core; None stays None."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
     workers = Workers()
 
@@ -301,7 +301,7 @@ def follow_runs_apart(
 def in_threads(
     work: Callable[[Given], Found], items: Sequence[Given], count: int, stop: Callable[[], None]
 ) -> list[Found]:
-    """Work on all items in threads, and return the results; `stop` ends what the threads wait for."""
+    """Process all items in threads and return the results; `stop` ends the processes they wait for."""
     with ThreadPoolExecutor(count) as threads:
         try:
             return [each.result() for each in [threads.submit(work, item) for item in items]]

@@ -1,7 +1,7 @@
-"""Guard process that ends the programs that we started if we are killed and they do not notice it.
+"""Guard process that ends the programs started by this process if this process is killed.
 
-It waits for the end of its standard input, which only we hold open, so that it ends however we end.
-Then it kills the processes that were reported to it.
+The guard waits for the end of its standard input, which only this process keeps open, so the guard
+always notices the end of this process. It then kills the processes that were reported to it.
 """
 
 import atexit
@@ -33,15 +33,15 @@ def kill_family(process: psutil.Process) -> None:
 
 
 class _Guard:
-    """Process that outlives ours for a moment; each of our processes has one."""
+    """Guard process, which outlives its parent for a moment; each process of fuselog has one."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._of: int | None = None  # a forked process does not have its own yet
+        self._of: int | None = None  # a forked process does not have its own guard yet
         self._process: subprocess.Popen[bytes] | None = None
 
     def tell(self, pid: int) -> None:
-        """Register a program to be ended when we end; one that has already ended is ignored."""
+        """Register a program to end with this process; a program that has already ended is ignored."""
         with suppress(psutil.Error):
             line = f"{pid} {psutil.Process(pid).create_time()}\n"
             with self._lock:
@@ -57,7 +57,7 @@ class _Guard:
                     self._process.stdin.flush()
 
     def end(self) -> None:
-        """End the guard when we end normally; the registered programs have ended."""
+        """End the guard at a normal exit, when the registered programs have ended."""
         with self._lock:
             if self._process is not None and self._of == os.getpid():
                 with suppress(OSError):
@@ -70,7 +70,7 @@ atexit.register(GUARD.end)
 
 
 def main() -> None:
-    """Read process IDs and creation times, and kill those still running at the end of the input."""
+    """Read process IDs and creation times; at the end of the input, kill processes still running."""
     noted = [line.split() for line in sys.stdin]
     for pid, created in noted:
         with suppress(psutil.Error):

@@ -12,7 +12,7 @@ from fuselog.recorders.processes import users_environment
 from fuselog.replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
 from fuselog.replay.foreign.processes.orphans import GUARD
 
-TAIL_BYTES = 300  # kept of a program's standard error
+TAIL_BYTES = 300  # number of bytes kept of a program's standard error
 
 
 class Program:
@@ -44,18 +44,18 @@ class Program:
                 self.tail = (self.tail + piece)[-TAIL_BYTES:]
 
     def how_ended(self) -> str:
-        """Describe how it ended, with the last line of its standard error."""
+        """Describe the end of the program, with the last line of its standard error."""
         code = self.process.wait()
         self._reader.join(1.0)
         lines = self.tail.decode(errors="replace").strip().splitlines()
         return how_ended(code) + (f": {printable(lines[-1])}" if lines and code else "")
 
     def end(self) -> None:
-        """End it and all processes that it started."""
+        """End the program and all processes that it started."""
         end(self.process)
 
     def wait(self, limits: Limits) -> None:
-        """Wait until it has ended; raise Ended if it fails. Its output is discarded."""
+        """Wait for the end of the program and discard its output; raise Ended if it fails."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         threading.Thread(target=self._drop, daemon=True).start()

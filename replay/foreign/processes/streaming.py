@@ -1,7 +1,7 @@
-"""Protocol for a filter in a program that reads messages from standard input and writes answers.
+"""Protocol for programs that read messages from standard input and write answers.
 
-Each frame has a length of 4 bytes and that many bytes: a letter for its kind, and little-endian
-numbers. The program begins with its description, and answers every frame except the first, in order:
+Each frame is a length (4 bytes) and that many bytes: a letter for the kind of frame, and little-endian
+numbers. The program first sends its description; it then answers every frame except the first, in order:
 
     D  program: the description, JSON, with the version of this protocol
     C  create: seed u64, parameters f64 each
@@ -11,8 +11,9 @@ numbers. The program begins with its description, and answers every frame except
     R  program: number u32 of the frame that it answers, status i32, flags u8; mean and covariance with
        flag 1; innovation and its covariance with flag 2, and 4 if a gate rejected the measurement
 
-A status above zero is an index in the description's failures, counted from one; a negative status and
-other flags are errors. The end of standard input is the end; an answer without a frame is an error.
+A status above zero is an index, from one, in the failures of the description; a negative status and
+other flags are errors. The program ends at the end of its standard input; an answer without a frame is
+an error.
 """
 
 import queue
@@ -59,7 +60,7 @@ ESTIMATE, INNOVATION, REJECTED = 1, 2, 4  # flags
 
 
 class _Frame(NamedTuple):
-    """Frame from the program, or the reason why there are no more."""
+    """Frame from the program, or the reason why there are no more frames."""
 
     body: bytes
     fault: str = ""
@@ -76,7 +77,7 @@ class Stream(Program):
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        """Split the program's output into frames as it comes.
+        """Split the output of the program into frames as it arrives.
 
         It reads from the file object and not from the file descriptor, which may belong to another
         program after `end` has closed the file.
@@ -112,7 +113,7 @@ class Stream(Program):
         threading.Thread(target=work, daemon=True).start()
 
     def next(self, letter: bytes, allowed_s: float | None = None) -> bytes:
-        """Return the body of the next frame, which must have this letter; raise Ended without one."""
+        """Return the body of the next frame of this kind; raise Ended if there is no such frame."""
         while True:
             try:
                 frame = self._frames.get(timeout=LOOKS_S)
@@ -129,7 +130,7 @@ class Stream(Program):
             return frame.body[1:]
 
     def check_end(self) -> None:
-        """Raise Ended if the program sends more than it was asked for before it ends."""
+        """Raise Ended if the program sends more answers than there were frames."""
         with suppress(queue.Empty):
             frame = self._frames.get(timeout=ENDS_S)
             if frame.body or frame.fault:
@@ -137,7 +138,7 @@ class Stream(Program):
 
 
 def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Description:
-    """Ask a program for its description; raise BadInput without one, or if its protocol differs."""
+    """Ask a program for its description; raise BadInput if it is missing or its protocol differs."""
     stream = Stream(words, limits)
     try:
         found = read_description(stream.next(b"D"), where)
@@ -230,10 +231,10 @@ class _Failed(Exception):
 def _reply(
     body: bytes, due: int, description: Description
 ) -> tuple[np.ndarray | None, tuple[np.ndarray, bool] | None]:
-    """Read the reply to a frame: mean and covariance, innovation and covariance, whether it was used.
+    """Read the reply to a frame: mean and covariance; innovation, covariance and acceptance.
 
-    Raises Ended if the reply is to another frame or has a wrong length, _Failed if it says that the
-    filter failed.
+    Raises Ended if the reply is to another frame or has a wrong length, and _Failed if it reports a
+    failure of the filter.
     """
     n, t, m = sizes_of(description)
     number, status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (due, 0, 0xFF)
@@ -264,7 +265,7 @@ def _note(
     state: np.ndarray | None,
     innovation: tuple[np.ndarray, bool] | None,
 ) -> None:
-    """Store a filter's results for a message."""
+    """Store the results of a filter for a message."""
     events, time_ns = given.events, given.events.time_ns[event]
     if state is not None and events.wants_estimate[event]:
         row, estimates = made.estimates.end[0], made.estimates
@@ -287,7 +288,7 @@ def _note(
 def follow_runs_streaming(
     words: Sequence[str], runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with programs, as many in parallel as there are cores; None stays None."""
+    """Process runs with programs in parallel, one per core; None stays None."""
     started: list[Program] = []
 
     def one(given: RunGiven | None) -> Ran | None:

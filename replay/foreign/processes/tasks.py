@@ -1,4 +1,4 @@
-"""Tasks for worker processes: the input of a run and its results in files, for both processes."""
+"""Tasks for worker processes, with the input of a run and its results in files."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,21 +23,21 @@ from fuselog.replay.foreign.results import Results, Sizes, begun, in_file, resul
 from fuselog.replay.inference.run.recursion import FilterEvents
 from fuselog.replay.inference.run.timing import select_events
 
-LOADING = -1  # progress of a process that has not begun
-IN_ORDER = -1  # window of a run whose messages come in order of their stamps
+LOADING = -1  # progress of a process that has not started its task
+IN_ORDER = -1  # window of a run whose messages are in order of their stamps
 
 
 class RunGiven(NamedTuple):
     """Input of a filter for one run.
 
     Attributes:
-        static: messages that it gets before the start.
-        events: its messages.
+        static: messages for the filter before its start.
+        events: all other messages.
         prior: stamp, mean (n,) and covariance (t, t); None if the log has none.
-        parameters: in the order of the description.
+        parameters: values in the order of the description.
         seed: seed of random numbers.
-        window_ns: largest delay of messages that come in order of arrival; IN_ORDER if they are in
-            order of stamps.
+        window_ns: largest delay of messages in order of arrival; IN_ORDER if they are in order of
+            stamps.
     """
 
     static: Static
@@ -61,7 +61,7 @@ class RunGiven(NamedTuple):
 
     @classmethod
     def load(cls, path: Path) -> "RunGiven":
-        """Read what `save` wrote."""
+        """Read the input from a file that `save` wrote."""
         with np.load(path, allow_pickle=False) as given:
             return cls(
                 Static(*(given[f"static_{name}"] for name in Static._fields)),
@@ -84,14 +84,14 @@ def sizes_of(description: Description) -> Sizes:
 
 
 def mapped(folder: Path, due: np.ndarray, recorded: np.ndarray, description: Description) -> Results:
-    """Map the results of a task, which both processes see."""
+    """Map the results of a task to memory that both processes share."""
     return results(due, recorded, sizes_of(description), in_file(folder / "results"))
 
 
 def follow_given(
     library: Library, given: RunGiven, description: Description, made: Results
 ) -> tuple[int, int] | None:
-    """Process a run with a filter and fill the results; return what failed and when, or None."""
+    """Process a run with a filter and fill the results; return code and stamp of a failure, or None."""
     prior = None
     if given.prior is not None:
         time_ns, mean, covariance = given.prior
@@ -110,7 +110,7 @@ def follow_given(
 
 
 def follow_task(library: Library, folder: Path) -> dict[str, Any]:
-    """Process the run in a folder with the library's filter; return how it ended."""
+    """Process the run in a folder with a filter of the library; report its outcome."""
     description = read_description(library.description, str(library.path))
     given = RunGiven.load(folder / "given.npz")
     due, recorded = offsets_of(description, given.events)

@@ -1,7 +1,7 @@
-"""Worker process for a library's filters, so that a crash of theirs ends only this process.
+"""Worker process for the filters of a library; a crash of a filter ends only this process.
 
-`isolation` starts it; it gets tasks as lines of JSON, and ends when its standard input does. The
-library finds nothing to read on standard input, and its output is discarded.
+`isolation` starts the process, which reads tasks as lines of JSON and ends at the end of its standard
+input. The library cannot read this standard input, and its output is discarded.
 """
 
 import json
@@ -14,7 +14,7 @@ from typing import Any
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.foreign.native.library import Library
 
-IDLE_S = 5.0  # time without work after which it ends
+IDLE_S = 5.0  # time without work after which the process ends
 IDLE = 86  # exit code in this case
 
 
@@ -30,7 +30,7 @@ def main() -> None:
         def listen() -> None:
             for line in given:
                 tasks.put(line)
-            os._exit(0)  # the process that started this one has ended or needs it no longer
+            os._exit(0)  # the parent process has ended or no longer needs this one
 
         threading.Thread(target=listen, daemon=True).start()
         while True:
@@ -65,7 +65,7 @@ def _describe(task: dict[str, Any]) -> dict[str, Any]:
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
     """Process one run with its filter; see `isolation.follow_apart`."""
-    # imported here, because describing a library needs neither NumPy nor the compiler
+    # imported here, because reading a description needs neither NumPy nor the compiler
     from fuselog.replay.foreign.processes.tasks import follow_task
 
     return follow_task(_library(task), Path(task["folder"]))

@@ -1,6 +1,6 @@
-"""Steps of extended and sampling filters, composed of parts for one form of covariances.
+"""Steps of extended and sampling filters, composed of parts for one storage form of covariances.
 
-A filter stores a mean and some form of its covariance; see `Form`. Plain filters store the covariance
+A filter stores a mean and its covariance in some form; see `Form`. Plain filters store the covariance
 itself; the parts for square-root filters are in `fuselog.replay.inference.kalman.square_root`.
 """
 
@@ -25,7 +25,7 @@ from fuselog.replay.inference.model.bound_model import BoundModel
 
 
 class Parts(NamedTuple):
-    """Parts of the filters of one form; each part makes a function for a bound model.
+    """Parts of the filters of one storage form; each part makes a function for a bound model.
 
     Attributes:
         form: the form in which covariances are stored.

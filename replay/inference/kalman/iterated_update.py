@@ -32,19 +32,19 @@ from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.corrections import correcting, relinearising, sloping
 
 ITERATIONS = 50
-SETTLED = 1e-12  # largest component of the last step
+SETTLED = 1e-12  # largest component of the last step at convergence
 
 
 def iterated_update(bound_model: BoundModel, number: int) -> Update:
-    """Make the update that relinearises at every iterate: Gauss-Newton on the posterior.
+    """Make the update that relinearises at every iterate (Gauss-Newton on the posterior).
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds, the Jacobian is H at x (+) d times the right
-    Jacobian at d. The gate and the weight of the measurement are determined at the prediction;
-    innovation and likelihood are those of the last iterate.
+    Jacobian at d. The gate and the weight of the measurement are computed at the prediction, innovation
+    and likelihood at the last iterate.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)

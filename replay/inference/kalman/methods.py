@@ -1,7 +1,8 @@
-"""Methods, and the Kalman filters among them: `ekf`, `iekf`, `ukf`, `lrkf`, `analytic`, `sqrt`.
+"""Definition of methods, and the methods that are Kalman filters, such as `ekf` and `ukf`.
 
-Each method makes the steps of a filter for one model. `ekf` and `iekf` need only the model's functions;
-`ukf` and `lrkf:SAMPLING` sample them; `analytic` uses the exact moments if the model provides them.
+Each method makes the steps of a filter for one model. `ekf` and `iekf` need only the functions of the
+model; `ukf` and `lrkf:SAMPLING` sample them; `analytic` uses exact moments if the model provides them;
+`sqrt` stores factors of covariances.
 """
 
 from collections.abc import Callable, Mapping
@@ -45,7 +46,7 @@ from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.sampling import parse_sampling
 from fuselog.replay.inference.sampling.names import Sampling, Unscented
 
-# Makes a `fuselog.replay.inference.run.filtering.Filter`, which this module cannot import.
+# Function that makes a `fuselog.replay.inference.run.filtering.Filter`, which this module cannot import.
 MakeFilter = Callable[..., Any]  # type: ignore[explicit-any]
 
 
@@ -57,16 +58,16 @@ class MethodParameters(Parameters):  # type: ignore[explicit-any]
     """Options of every method.
 
     Attributes:
-        every_s: interval of additional estimates, besides those at the sensors' stamps.
+        every_s: interval of estimates in addition to those at the stamps of the sensors.
         mode: name of the motion to use, if the model has several.
         estimate: names of parameters to add to the state; each starts from its value.
         estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
         estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
         estimate_time_s: time constant of its return to its value (Gauss-Markov process), in s, by name.
-        topics: topics to use for those that the model asks for, such as {pose = "/amcl_pose/pose"}. An
-            empty name leaves a sensor out; several names, separated by commas or in a list, are all
-            used.
-        of_topics: parameters of single topics that replace the general ones, by topic, as set by --set
+        topics: topics to use instead of those that the model names, such as {pose = "/amcl_pose/pose"}.
+            An empty name leaves a sensor out; of several names, separated by commas or in a list, all
+            are used.
+        of_topics: by topic, parameters that replace the general ones for this topic, as set by --set
             /gps2/fix.lever_x_m=0.4.
     """
 
@@ -116,17 +117,17 @@ class SquareRootParameters(UnscentedParameters):  # type: ignore[explicit-any]
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way to estimate the state of any model.
+    """Method that estimates the state of any model.
 
     Attributes:
         summary: description in one line.
         parameters: type of its parameters.
-        steps: makes the filter's steps for a bound model.
-        sampling: makes the samples, for methods that use them.
-        lacks: describes what a model lacks for the method; empty if it lacks nothing.
+        steps: function that makes the filter's steps for a bound model.
+        sampling: function that makes the samples, for methods that use samples.
+        lacks: function that describes what a model lacks for the method; "" if it lacks nothing.
         variant: parameter that the rest of a name such as `lrkf:s2kf-50` sets.
-        made_for: returns the method that the parameters select, if there are several; raises BadInput if
-            they name none of them.
+        made_for: function that returns the method that the parameters select, if there are several; it
+            raises BadInput if they name an unknown one.
         filtering: class that runs through a log, if it is not
             `fuselog.replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it uses all modes of a model instead of one motion.
@@ -209,7 +210,7 @@ def _exact_sensor(bound_model: BoundModel, number: int) -> Innovate:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """Name a sensor whose linearised components are dependent at every state, including their noise.
+    """Name a sensor whose linearised components, including noise, are dependent at every state.
 
     The innovation covariance is then singular, as for a coordinate and its square.
     """

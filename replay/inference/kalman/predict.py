@@ -1,4 +1,4 @@
-"""Prediction of a Gaussian through a model's motion by its Jacobian, and noise of the motion."""
+"""Prediction of a Gaussian by the Jacobian of a model's motion, with the noise of the motion."""
 
 from typing import Protocol
 
@@ -32,7 +32,7 @@ class LineariseMotion(Protocol):
 
 
 class AddMotionNoise(Protocol):
-    """Function that adds a motion's noise from a state (n,) over a duration to a covariance (t, t)."""
+    """Function that adds the noise of a motion over a duration to a covariance (t, t)."""
 
     def __call__(
         self,
@@ -76,7 +76,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Linear
     """Make the function that moves a state and computes the requested derivatives.
 
     Args:
-        model: model, for the kinds of its state and control.
+        model: model, which has the kinds of state and control.
         motion: motion whose `move` is differentiated.
         by_state: whether F, the derivative by the state, is requested.
 
@@ -108,7 +108,7 @@ def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
     """Make the function that adds the noise of a motion, of any kind, to a covariance.
 
     Args:
-        model: model, for the sizes of its tangent space and control.
+        model: model, which has the sizes of tangent space and control.
         motion: the motion.
 
     Returns:

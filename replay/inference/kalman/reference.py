@@ -1,8 +1,8 @@
-"""The extended Kalman filter in two short functions that compute the same as the compiled filters.
+"""Extended Kalman filter in two short functions, with the same results as the compiled filters.
 
 Begin here to read how a filter works. `fuselog.replay.inference.kalman.predict` and
-`fuselog.replay.inference.kalman.update` compute the same without making arrays, also for states with
-angles and rotations and for measurements that lack components; a test compares both.
+`fuselog.replay.inference.kalman.update` compute the same without allocating arrays, and also support
+states with angles and rotations and measurements with missing components; a test compares both.
 """
 
 from collections.abc import Callable
@@ -19,12 +19,12 @@ def predict(
     F: Callable[[Floats], Floats],
     Q: Floats,
 ) -> tuple[Floats, Floats]:
-    """Predict a Gaussian through a motion: x becomes f(x), and P becomes F P F' + Q.
+    """Predict a Gaussian by a motion: x becomes f(x), and P becomes F P F' + Q.
 
     Args:
         mean: the mean x (n,).
         covariance: the covariance P (n, n).
-        f: the motion, which takes a state and returns the next one, both (n,).
+        f: the motion: function of a state (n,) that returns the next state (n,).
         F: the motion's Jacobian (n, n) at a state.
         Q: the covariance (n, n) of the motion's noise.
 
@@ -51,7 +51,7 @@ def update(
         mean: the mean x (n,).
         covariance: the covariance P (n, n).
         measurement: the measurement y (m,).
-        h: measurement function: takes a state and returns the expected measurement, (m,).
+        h: the measurement function: function of a state (n,) that returns the expected measurement (m,).
         H: its Jacobian (m, n) at a state.
         R: the covariance (m, m) of the measurement's noise.
 

@@ -1,8 +1,8 @@
 """Propagation of a Gaussian through a function by statistical linear regression at weighted samples.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
-(24) prints y_{k,i} where the noise sample is meant. On manifolds, samples are the mean plus tangent
-vectors, and means are intrinsic: the weighted differences from them sum to zero. If an angle is very
+(24) misprints the noise sample as y_{k,i}. On manifolds, samples are the mean plus tangent vectors, and
+means are intrinsic: the weighted differences of samples from their mean sum to zero. If an angle is very
 uncertain, samples are drawn closer to the mean; see `fuselog.replay.inference.kalman.wide_angles`.
 """
 
@@ -53,11 +53,12 @@ MEANS = 30  # maximum number of iterations of an intrinsic mean
 
 @varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
-    """Samples of N(0, I), and the arrays of a regression at them; N = t + noises.
+    """Samples of N(0, I), and the arrays of a regression at these samples; N = t + noises.
 
     Attributes:
         points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
-        unsuspected: standard deviation up to which angles need no special treatment; see `narrowing`.
+        unsuspected: largest standard deviation of angles that need no special treatment; see
+            `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) tangent vectors from the mean to the samples.
         point, noise: (n,) one sample, and (noises,) the variances of the noise.
@@ -107,7 +108,7 @@ def sample_memory(
 
 
 class Sampled(Protocol):
-    """Function to be sampled, of a state (n,), its noise (noises,) and all other `arguments`."""
+    """Function to sample; it depends on a state (n,), noise (noises,) and other `arguments`."""
 
     def __call__(
         self, state: Numbers, noise: Numbers, arguments: tuple[AnyArgument, ...], /
@@ -115,7 +116,7 @@ class Sampled(Protocol):
 
 
 class Sample(Protocol):
-    """Function that evaluates another at samples about a mean (n,) and returns their weights (L,).
+    """Function that evaluates a function at samples about a mean (n,) and returns the weights (L,).
 
     See `sampling`.
     """
@@ -132,7 +133,7 @@ class Sample(Protocol):
 
 
 class Regress(Protocol):
-    """Function that propagates a mean (n,) and a covariance (t, t) through another; see `regression`."""
+    """Function that propagates a mean (n,) and covariance (t, t) by a function; see `regression`."""
 
     def __call__(
         self,
@@ -173,10 +174,10 @@ def sampling(
 
     Returns:
         `sample(mean, arguments, variances, sample_index, memory)`, which uses sample set `sample_index`
-        and returns its weights (L,). It requires the state's factor in the leading block of
-        `memory.factor`. It fills `memory.offsets`, `memory.centre` with the intrinsic mean of the
-        values, and `memory.values`; the tangent vectors from the mean are `memory.values` minus
-        `memory.shift`. `variances` is the tuple of the noise's variances.
+        and returns its weights (L,). The leading block of `memory.factor` must be the factor of the
+        state. The function fills `memory.offsets`, `memory.centre` (the intrinsic mean of the values)
+        and `memory.values`; the tangent vectors from the mean are `memory.values` minus `memory.shift`.
+        `variances` is the tuple of the noise variances.
     """
     t, components = tangent_size(kinds), len(kinds)
     size = t + noises
@@ -277,10 +278,10 @@ def regression(
 
 @lru_cache(maxsize=64)
 def settling(kinds: tuple[str, ...]) -> Settle:
-    """Make `settle(weights, values, centre, shift)`, which moves a centre to the values' intrinsic mean.
+    """Make `settle(weights, values, centre, shift)`, which moves a centre to the mean of the values.
 
-    The values (L, v) are tangent vectors from the centre. Afterwards, those from the mean are `values`
-    minus `shift` (v,).
+    The values (L, v) are tangent vectors from the centre, and the mean is intrinsic. Afterwards, the
+    tangent vectors from the mean are `values` minus `shift` (v,).
     """
     v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
     add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
@@ -300,18 +301,19 @@ def settling(kinds: tuple[str, ...]) -> Settle:
 
 
 def no_variances(*_: object) -> Numbers:
-    """Return no variances, for functions without noise."""
+    """Return an empty tuple of variances, for functions without noise."""
     return ()
 
 
 def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
-    Noise of the control enters through the derivative at the mean, noise of the motion through samples.
+    The noise of the control is propagated by the derivative at the mean, the noise of the motion by
+    samples.
 
     Args:
         bound_model: the bound model.
-        number: index of the samples in the workspace.
+        number: index of the samples in `work.samples`.
     """
     model, motion = bound_model.model, bound_model.motion
     entering = motion.noise if motion.noises else None
@@ -362,8 +364,8 @@ def sampled_sensor(bound_model: BoundModel, number: int, samples: int) -> Innova
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
-        samples: index of its samples in the workspace.
+        number: index of the sensor.
+        samples: index of its samples in `work.samples`.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]
     kinds = tuple(sensor.measured.values())

@@ -1,4 +1,4 @@
-"""Parts of extended and unscented square-root filters, which store factors of covariances.
+"""Parts of square-root filters (extended or unscented), which store factors of covariances.
 
 Let X be the columns of the state's factor or its weighted samples, Y their images under a function, and
 N a factor of the noise. One factorisation then computes a prediction or an update:
@@ -63,7 +63,7 @@ Given = tuple[AnyArgument, ...]  # the arguments of a motion or a sensor after t
 
 
 class Spread(Protocol):
-    """Function that fills Y and X for a factor (t, t) at a state (n,); see the module."""
+    """Function that fills Y and X for a factor (t, t) at a state (n,); see the module docstring."""
 
     def __call__(
         self, state: Numbers, factor: Floats, given: Given, index: int, work: Workspace, into: Into, /
@@ -79,7 +79,7 @@ class VariancesOf(Protocol):
 def _linear(linearise: Linearise, slopes: str) -> Spread:
     """Make `spread(state, factor, given, index, work, into)`, which fills Y and X for a factor.
 
-    It uses the derivative that `linearise(state, *given, work)` writes to the workspace's `slopes`.
+    It uses the derivative that `linearise(state, *given, work)` writes to `slopes` in the workspace.
     """
 
     def spread(
@@ -99,7 +99,7 @@ def _linear(linearise: Linearise, slopes: str) -> Spread:
 
 
 def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int, samples: int) -> Spread:
-    """Make the function that fills Y and X at samples, and the workspace's `mean_of` with their mean."""
+    """Make the function that fills Y and X at samples, and their mean in `mean_of` of the workspace."""
     fill = filling(size)
 
     def spread(
@@ -120,7 +120,7 @@ def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int,
 
 
 def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> bool:
-    """Fill N for a noise, which is overwritten, and compute the factor; return False on failure."""
+    """Fill N for a noise (which is overwritten) and compute the factor; return False on failure."""
     first = len(weights) - len(noise)
     weights[first:] = 1.0
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
@@ -180,7 +180,7 @@ def _gap_motion(bound_model: BoundModel) -> Predict:
 
 
 def _sampled_motion(bound_model: BoundModel, samples: int) -> Predict:
-    """Make the sampled prediction; noise of the control enters through the derivative at the mean."""
+    """Make the sampled prediction; control noise is propagated by the derivative at the mean."""
     model, motion = bound_model.model, bound_model.motion
     linearise: Linearise = nothing
     if motion.control_noise:
@@ -209,7 +209,7 @@ def _updating(
 ) -> Update:
     """Make the update by sensor `number`; see `fuselog.replay.inference.kalman.update.kalman_update`.
 
-    A missing component is replaced by independent noise whose value is as predicted.
+    A missing component is replaced by independent noise whose value equals the prediction.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]
     t, m, read_reference = model.tangent, len(sensor.measured), message_layout(sensor).reference

@@ -1,4 +1,4 @@
-"""Steps of a recursive filter, which methods make for one model, and their working memory.
+"""Steps of a recursive filter for one model, which methods make, and their working memory.
 
 A method propagates a Gaussian through motion and sensors by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by exact moments that the
@@ -31,9 +31,9 @@ FAILURES = (
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # in addition to ALL_WELL, -1
 
-# A method's belief in all runs, the working memory of a core, the estimates that it fills, and its
-# samples, such as `Gaussian`, `Workspace`, `recursion.EstimateRows` and `SampleMemory`. Their types are
-# the method's own; the loop over events only passes them on.
+# The belief of a method in all runs, the working memory of a core, the estimates, and the samples, such
+# as `Gaussian`, `Workspace`, `recursion.EstimateRows` and `SampleMemory`. Each method defines these
+# types; the loop over events only passes them on.
 Belief = Any  # type: ignore[explicit-any]
 CoreMemory = Any  # type: ignore[explicit-any]
 EstimatesToFill = Any  # type: ignore[explicit-any]
@@ -41,7 +41,7 @@ Samples = Any  # type: ignore[explicit-any]
 
 
 class Gaussian(NamedTuple):
-    """A Gaussian for every run: means (runs, n) and covariances (runs, t, t).
+    """Gaussian of every run: means (runs, n) and covariances (runs, t, t).
 
     The covariances are stored in the filter's form; see `Steps.form`.
     """
@@ -51,13 +51,14 @@ class Gaussian(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """Inputs of a prediction besides the belief.
+    """Inputs of a prediction in addition to the belief.
 
     Attributes:
         control: (controls,) control; NaN in a gap.
         duration_s: duration of the step.
         parameters: parameters of the motion.
-        event: index of the event at its end, which also selects the set of random samples.
+        event: index of the event at the end of the interval, which also selects the set of random
+            samples.
     """
 
     control: Floats
@@ -67,7 +68,7 @@ class Interval(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Inputs of an update besides the belief.
+    """Inputs of an update in addition to the belief.
 
     Attributes:
         data: numbers of the message; see `update.message_layout`.
@@ -87,7 +88,7 @@ MakeMemory = Callable[[tuple[Samples, ...]], CoreMemory]
 
 
 class PredictRun(Protocol):
-    """Function that moves a run's belief in place over an interval; returns whether it succeeded."""
+    """Function that predicts the belief of a run over an interval, in place; it returns the success."""
 
     def __call__(self, run: int, belief: Belief, interval: Interval, memory: CoreMemory, /) -> bool: ...
 
@@ -118,7 +119,7 @@ class EstimateRun(Protocol):
 
 
 class Predict(Protocol):
-    """Function that moves a mean (n,) and a covariance (t, t) in place over an interval.
+    """Function that predicts a mean (n,) and covariance (t, t) over an interval, in place.
 
     It returns whether it succeeded.
     """
@@ -131,8 +132,8 @@ class Predict(Protocol):
 class Innovate(Protocol):
     """Function that fills a sensor's innovation in the workspace.
 
-    The mean (n,) and the covariance (t, t) stay unchanged. It returns whether the covariance was
-    positive definite.
+    The function does not change the mean (n,) or the covariance (t, t). It returns whether the
+    covariance was positive definite.
     """
 
     def __call__(
@@ -141,7 +142,7 @@ class Innovate(Protocol):
 
 
 class Update(Protocol):
-    """Function that updates a mean (n,) and a covariance (t, t) in place and returns as `UpdateRun`."""
+    """Function that updates a mean (n,) and covariance (t, t) in place; results as of `UpdateRun`."""
 
     def __call__(
         self,
@@ -164,7 +165,7 @@ class Steps(NamedTuple):
             NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: mean, covariance, and
             further results of the method.
-        sampled: dimensions of the sampled functions, that of the motion first.
+        sampled: dimensions of the sampled functions, with the motion first.
         resumes_after_gap: whether the filter continues after a gap of the control; `predict` is then
             called with NaN as the control.
         form: form of the covariances in beliefs; estimates contain the covariances themselves.
@@ -180,10 +181,11 @@ class Steps(NamedTuple):
 
 
 class InnovationRecord(NamedTuple):
-    """The innovation of one update: one row of the results.
+    """Innovation of one update: one row of the results.
 
     Attributes:
-        difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
+        difference, covariance: (slots,), (slots, slots) the innovation and its covariance; a sensor
+            fills its own slots.
         numbers: (3,) NIS, log-likelihood, and 1 if the gate accepted the measurement.
     """
 
@@ -198,14 +200,14 @@ class Workspace(NamedTuple):
     Attributes:
         state: (n,) moved state.
         transition: (t, t) derivative by the state.
-        product: (t, t) after a prediction, the covariance of the moved state with the one before.
-        rest: (t, t) what `factors` also needs to reverse a prediction.
+        product: (t, t) after a prediction, the covariance between the new and the old state.
+        rest: (t, t) further values that `factors` needs to reverse a prediction.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,) Jacobian and mean of a measurement.
-        step, turned, slope: (t,) correction of the state, an auxiliary vector, and the slope along which
-        the correction bends.
-        innovations: one for each sensor.
+        step, turned, slope: (t,) correction of the state, an auxiliary vector, and the slope of a
+            correction along a curve.
+        innovations: one innovation for each sensor.
         samples: memory of `fuselog.replay.inference.kalman.regression` for each of `sampled`, motion
             first.
     """
@@ -231,8 +233,8 @@ def workspace(bound_model: BoundModel, samples: tuple[Samples, ...] = ()) -> Wor
     """Allocate the workspace of a bound model.
 
     Args:
-        bound_model: the bound model, with n components of the state, t of the tangent space, and at most
-            m of a sensor.
+        bound_model: the bound model, with n state components, t tangent components, and at most m
+            components of a sensor.
         samples: memories of `regression`, motion first, one for each of `Steps.sampled`.
     """
     model, t = bound_model.model, bound_model.model.tangent
@@ -271,8 +273,8 @@ def gaussian_filter(
 
     Args:
         bound_model: the bound model.
-        predict: `predict(mean, covariance, interval, work)` moves one run's mean (n,) and covariance (t,
-            t) in place and returns whether it succeeded.
+        predict: `predict(mean, covariance, interval, work)` predicts the mean (n,) and covariance (t, t)
+            of one run in place and returns whether it succeeded.
         updates: for every sensor, `update(mean, covariance, measurement, work, record)`; see
             `kalman_update`.
         memory: (sets) -> the workspace; `workspace(bound_model)` by default.
@@ -321,7 +323,7 @@ def _predicting_gap(predict_gap: Predict, predict_driven: Predict) -> Predict:
 
 
 def keeping(bound_model: BoundModel) -> Predict:
-    """Make the prediction in a gap of the control, which keeps the mean and adds the gap noise."""
+    """Make the prediction in a gap of the control; it keeps the mean and adds the gap noise."""
     model, gap_noise = bound_model.model, bound_model.motion.gap_noise
     assert gap_noise is not None
     read_state, add = tuple_of(model.size), adding_noise(model.tangent)

@@ -37,7 +37,7 @@ from fuselog.replay.inference.model.model import Model, Sensor
 
 
 class MessageLayout(NamedTuple):
-    """Layout of a sensor's message in an event's data: measurement, reference, and its own noise."""
+    """Layout of a sensor's message in the data of an event: measurement, reference, and stated noise."""
 
     width: int
     measured: ReadTuple
@@ -46,7 +46,7 @@ class MessageLayout(NamedTuple):
 
 
 class Subtract(Protocol):
-    """Function that fills the measurement (the start of the data) minus the prediction, (m,)."""
+    """Function that fills measurement minus prediction (m,); the measurement is first in the data."""
 
     def __call__(self, data: Floats, predicted: Floats, difference: Floats, /) -> None: ...
 
@@ -82,13 +82,13 @@ class WhitenResidual(Protocol):
 
 
 class WriteInnovation(Protocol):
-    """Function that writes a sensor's innovation to its components' slots in the record."""
+    """Function that writes the innovation of a sensor to the slots of its components in the record."""
 
     def __call__(self, innovation: Innovation, record: InnovationRecord, /) -> None: ...
 
 
 def message_layout(sensor: Sensor) -> MessageLayout:
-    """Return the layout of a sensor's message; its noise is the rows of a lower triangle."""
+    """Return the layout of a sensor's message; the noise is stored as rows of a lower triangle."""
     m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return MessageLayout(
@@ -99,7 +99,7 @@ def message_layout(sensor: Sensor) -> MessageLayout:
 def residual_of(sensor: Sensor) -> Subtract:
     """Make `subtract(data, predicted, difference)`: measurement minus prediction, (m,).
 
-    Differences of angles are at most half a turn.
+    Differences of angles are wrapped to at most half a turn.
     """
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
 
@@ -139,12 +139,12 @@ def sensor_noise(sensor: Sensor) -> MeasurementNoise:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
-    """Make `linearise(state, reference, parameters, work)`, which fills the measurement's derivatives.
+    """Make `linearise(state, reference, parameters, work)`, which computes the derivatives of a sensor.
 
     It fills `predicted` (m,), `rows` (m, t) and `noise_gain` in the workspace.
 
     Args:
-        model: model, for the kinds of its state.
+        model: model, which has the kinds of the state.
         sensor: the sensor, with m measured components.
     """
     if sensor.jacobian is not None:
@@ -163,11 +163,11 @@ def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
 
 
 def linear_sensor(bound_model: BoundModel, number: int) -> Innovate:
-    """Make the computation of the innovation by the derivative at the mean.
+    """Make the function that computes the innovation by the derivative at the mean.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
 
     Returns:
         `innovate(mean, covariance, measurement, work)`, which fills the sensor's innovation in
@@ -286,22 +286,22 @@ def is_unmeasured(data: Floats, components: int) -> bool:
 def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> Update:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
-    The gain K is not computed explicitly. With S = L L' and W = C L^-T, K v is W L^-1 v, see
-    `gaussian.kalman_step`, and K S K' is W W', see `gaussian.downdate`.
+    The gain K is not computed explicitly. With S = L L' and W = C L^-T, K v = W L^-1 v (see
+    `gaussian.kalman_step`) and K S K' = W W' (see `gaussian.downdate`).
 
-    Missing components are removed from v, S and C, as are those for which the model predicts NaN; the
+    Missing components, and those for which the model predicts NaN, are removed from v, S and C; the
     log-likelihood is that of the remaining components. It is zero if the gate rejects the measurement or
     if no component remains. Accepted measurements may still be down-weighted; see `inflation`.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
         innovate: `innovate(mean, covariance, measurement, work)` fills the innovation v (m,), S (m, m),
             C (t, m) of the sensor and returns whether the covariance was positive definite.
 
     Returns:
-        `update(mean, covariance, measurement, work, record)`, which works in place on a mean (n,) and a
-        covariance (t, t). It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
+        `update(mean, covariance, measurement, work, record)`, which updates a mean (n,) and a covariance
+        (t, t) in place. It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
     model, m, write_innovation = (
         bound_model.model,
@@ -354,7 +354,7 @@ def write_numbers(
 ) -> None:
     """Write the NIS, the log-likelihood (zero if rejected), and whether the measurement is accepted.
 
-    The NIS uses the predicted covariance; the likelihood uses one that is `factor` times larger.
+    The NIS uses the predicted covariance; the likelihood uses `factor` times this covariance.
     """
     record.numbers[0] = squared
     record.numbers[1] = 0.0

@@ -1,4 +1,4 @@
-"""Treatment of very uncertain angles in sampling: samples stay within half a turn.
+"""Treatment of very uncertain angles in sampling, which keeps samples within half a turn.
 
 An angle with standard deviation s has samples at a + r s. Samples beyond half a turn wrap around, and
 their difference from the mean is no longer r s: for s = 3 rad, the three-dimensional unscented set with
@@ -6,7 +6,7 @@ r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measureme
 0.63 rad. Two rules prevent this:
 
 - **A smaller spread.** A function f is regressed at the samples m + c (x - m) of N(m, c^2 P), with the
-  largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for what f adds.
+largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for changes by f.
   With y = f(m + c (x - m)) - f(m) the regression (Steinbring and Hanebeck 2014, (19)-(24)) gives
 
       E[(x - m) y'] / c = P A',     E[(y - E y)(y - E y)'] / c^2 = A P A' + V / c^2,
@@ -19,10 +19,10 @@ r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measureme
   that of the narrowed samples: on a circle it is bounded, unlike the second-order term of the scaled
   transformation.
 
-- **No wider than uniform.** An angle without any information has the standard deviation pi / 3^1/2 =
-  1.81 rad (Mardia and Jupp, Directional Statistics, 2000, section 3.5), and no belief about an angle is
-  wider. A motion limits wider angles, and each axis of a rotation, to this value by scaling the rows of
-  the covariance's factor.
+- **No wider than uniform.** A completely unknown angle has the standard deviation pi / 3^1/2 = 1.81 rad
+(Mardia and Jupp, Directional Statistics, 2000, section 3.5); no distribution of an angle should be
+wider. A motion limits wider angles, and each axis of a rotation, to this value by scaling the rows of
+the covariance's factor.
 
 A Gaussian is a poor description of an angle beyond 1 rad: at 1 rad, 0.2 % of its probability is beyond
 half a turn, and at 1.81 rad, where its mean is meaningless, 8 %. Samples are bit-identical to the
@@ -38,7 +38,7 @@ import numpy as np
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
 
-WIDE_RAD = 1.0  # standard deviation up to which samples within half a turn are not changed
+WIDE_RAD = 1.0  # largest standard deviation at which samples within half a turn are not changed
 UNIFORM_RAD = np.pi / np.sqrt(3.0)
 QUARTER_RAD = 0.5 * np.pi
 
@@ -56,7 +56,7 @@ def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
 
 
 def unsuspected_rad(points: Floats) -> float:
-    """Return the largest standard deviation at which angles at points (..., L, N) stay as they are."""
+    """Return the largest standard deviation at which angles at points (..., L, N) are not changed."""
     radius = np.sqrt(np.max(np.sum(points**2, axis=-1), initial=1.0))
     return float(min(WIDE_RAD, np.pi / radius))
 
@@ -85,12 +85,12 @@ class Regressed(Protocol):
 def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
     """Make `narrow(factor, points, unsuspected)`, which returns c and scales the factor (N, N) by it.
 
-    See the module. With `bounded`, angles that are wider than uniform become uniform first.
+    See the module docstring. With `bounded`, angles wider than uniform are first limited to uniform.
 
     Args:
         kinds: kinds of the state's components.
         size: size N of the factor.
-        bounded: whether angles are limited to uniform ones, as for motions.
+        bounded: whether wider angles are limited to uniform ones, as for motions.
     """
     turns = turning(kinds)
 
@@ -103,7 +103,7 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
         return squared
 
     def bound(factor: Floats, row: int, times: float) -> float:
-        """Return the standard deviation of one component, after bounding it."""
+        """Limit the standard deviation of one component, and return it."""
         wide: float = times * np.sqrt(squared_length(factor, row, 1))
         if bounded and wide > UNIFORM_RAD:
             for k in range(row + 1):

@@ -1,4 +1,4 @@
-"""Linear algebra with small matrices in place, and operations on states on their manifold.
+"""In-place linear algebra with small matrices, and operations on states on a manifold.
 
 Begin with `gaussian`.
 """

@@ -1,8 +1,8 @@
-"""Forms in which a filter can store covariances: the contract of beliefs between methods.
+"""Forms in which a filter can store covariances; methods access beliefs by these forms.
 
 A belief is a mean (n,) and a matrix (t, t) that represents its covariance P: P itself (`COVARIANCES`),
 or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). The steps of a
-filter predict and update it; other code, such as an IMM or a smoother, only uses its `Form`.
+filter predict and update this matrix; other code, such as an IMM or a smoother, only uses its `Form`.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from fuselog.replay.inference.linear_algebra.manifold import Turning
 
 
 class Propagate(Protocol):
-    """Function that replaces the matrix of P (t, t) by that of F P F', with working memory `product`."""
+    """Function that replaces the matrix of P (t, t) by that of F P F'; `product` is working memory."""
 
     def __call__(self, matrix: Floats, transition: Floats, product: Floats, /) -> None: ...
 
@@ -40,7 +40,7 @@ class Mix(Protocol):
 
 
 class Predicted(Protocol):
-    """Arrays that a prediction leaves in the workspace; see `kalman.steps.Workspace`."""
+    """Arrays that a prediction fills in the workspace; see `kalman.steps.Workspace`."""
 
     @property
     def product(self) -> Floats: ...
@@ -64,7 +64,7 @@ class Form(NamedTuple):
 
     Attributes:
         start: (covariances (..., t, t)) -> matrices that represent them.
-        to_covariance: (matrix) replaces it by P.
+        to_covariance: (matrix) replaces the matrix by P.
         times: (matrix, vector, product) fills the product (t,) with P v.
         propagate: (matrix, transition, product) replaces P by F P F'; product (t, t) is working memory.
         turn: (turning, vector, matrix) transforms P by `turning`, from `manifold.by_right_jacobian`,
@@ -72,7 +72,7 @@ class Form(NamedTuple):
         mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of matrices (M, t, t)
             with the means `away` (M, t) and the mean `shift` (t,) of the mixture.
         retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. From the
-            matrices before and after a prediction and what it left in the workspace, it fills `turned`
+            matrices before and after a prediction and its values in the workspace, it fills `turned`
             with G', and `before` with P - G D'; see `fuselog.replay.inference.smoothing.backward_pass`.
     """
 

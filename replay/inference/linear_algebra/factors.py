@@ -14,7 +14,7 @@ from fuselog.replay.inference.linear_algebra.covariances import Form, Predicted
 from fuselog.replay.inference.linear_algebra.gaussian import multiply
 from fuselog.replay.inference.linear_algebra.manifold import Turning
 
-ROUNDING = 1e-15  # relative to a variance, per component that determines it
+ROUNDING = 1e-15  # relative to a variance, per component on which it depends
 NOTHING_LEFT = 1e-28  # relative square of a row that depends on others, because of rounding
 
 
@@ -94,7 +94,7 @@ def fill_root(rows: Floats, covariance: Floats) -> bool:
 
 
 def retriangulate(rows: Floats, factor: Floats) -> None:
-    """Compute the lower factor of A A' from A (t, t), which may be the factor itself.
+    """Compute the lower factor of A A' from A (t, t); `factor` may be the same array.
 
     Args:
         rows: A (t, t).
@@ -106,7 +106,7 @@ def retriangulate(rows: Floats, factor: Floats) -> None:
 
 
 def _start(covariances: Floats) -> Floats:
-    """Factor covariances; NaN for those that are not positive definite, whose runs do not start."""
+    """Factor covariances; NaN if one is not positive definite, so that its run cannot start."""
     factors, whole = np.full_like(covariances, np.nan), is_positive_definite(covariances)
     factors[whole] = np.linalg.cholesky(covariances[whole])
     return factors

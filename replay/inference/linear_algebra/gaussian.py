@@ -1,7 +1,7 @@
 """Operations on Gaussians in place: Cholesky factors, innovations, the Kalman gain, covariances.
 
-Means are in the space of the state, covariances in its tangent space; covariances are symmetric by
-construction. Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
+Means are in the space of the state, covariances in its tangent space; covariances are exactly symmetric.
+Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
 """
 
 from typing import NamedTuple
@@ -116,8 +116,8 @@ def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
 def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
     """Solve A X = B in place by the Cholesky factor of A.
 
-    A zero pivot, up to rounding, is a component that A knows exactly: its row of X is zero, which is a
-    solution if B is in the range of A.
+    A zero pivot, up to rounding, is a component without variance: its row of X is set to zero, which is
+    a solution if B is in the range of A.
 
     Args:
         matrix: A (n, n), symmetric.
@@ -189,7 +189,7 @@ def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, flo
     """Replace v by L^-1 v, and return its square and log det L L'.
 
     Args:
-        factor: L, lower, of which the first `size` rows and columns are used.
+        factor: L, lower triangular; its first `size` rows and columns are used.
         difference: v (m,), changed in place.
         size: number of measured components.
     """
@@ -244,7 +244,7 @@ def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
 def scalar_update(
     mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
 ) -> None:
-    """Update by a scalar innovation v, in place: x + C v / s and P - C C' / s.
+    """Update by a scalar innovation v in place: x + C v / s and P - C C' / s.
 
     Args:
         mean, covariance: x (n,) in a flat space, P (n, n).
@@ -339,8 +339,9 @@ def predict_constant_velocity(
 ) -> None:
     """Predict positions and velocities at constant velocity, in place.
 
-    The position of axis a is at a * layout[0], and its velocity layout[1] further. The noise adds a
-    variance of the position, a covariance of both, and a variance of the velocity to each axis.
+    The index of the position of axis a is a * layout[0]; that of its velocity is layout[1] higher. The
+    noise adds a variance of the position, a covariance of both, and a variance of the velocity to each
+    axis.
 
     Args:
         mean: (n,).
@@ -386,7 +387,7 @@ def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covarian
 
     Args:
         mean, covariance: (n,), (t, t).
-        to_mean, to_covariance: overwritten, of the same sizes.
+        to_mean, to_covariance: arrays of the same sizes, overwritten.
     """
     to_mean[:] = mean
     to_covariance[:, :] = covariance

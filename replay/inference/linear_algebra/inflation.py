@@ -9,15 +9,16 @@ from fuselog.replay.inference.linear_algebra.gaussian import Innovation
 def inflation(squared: float, size: int, parameters: Settings) -> float:
     """Compute the factor by which the covariance of an innovation is inflated, from its NIS.
 
-    The added covariance counts as measurement noise, so that the update remains a Kalman update. The
-    factor is the largest of those of the given options, which are in
+    The added covariance is treated as measurement noise, so the update remains a Kalman update. The
+    factor is the largest of the factors of all given options, which are in
     `fuselog.replay.inference.model.parameters.ModelParameters`. Options that are not given are NaN;
-    without any, the factor is 1:
+    without any option, the factor is 1:
 
-    - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
-    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
-      Gustafsson, ICASSP 2013. At least 1: a small innovation does not reduce the noise;
-    - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
+    - `inflate_nis` = b: NIS / b if the NIS exceeds b, which reduces the NIS to b; - `student_freedom` =
+    f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
+      Gustafsson, ICASSP 2013. It is at least 1, so a small innovation does not reduce the noise;
+    - `switch_nis` = b: ((b + NIS) / 2 b)^2 if the NIS exceeds b; Agarwal et al., ICRA 2013, (15) with
+    s^-2.
 
     Args:
         squared: the NIS.

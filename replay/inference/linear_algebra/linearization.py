@@ -16,7 +16,7 @@ from fuselog.replay.tracing.functions import Derivative, TracedFunction
 from fuselog.replay.tracing.graph import Node
 from fuselog.replay.tracing.traced import Trace
 
-# Hamilton product of the units: e_i e_j = sign * e_k, with row k listing (i, j, sign).
+# Hamilton product of the units: e_i e_j = sign * e_k; row k lists (i, j, sign).
 _PRODUCT = (
     ((0, 0, 1), (1, 1, -1), (2, 2, -1), (3, 3, -1)),
     ((0, 1, 1), (1, 0, 1), (2, 3, 1), (3, 2, -1)),
@@ -25,16 +25,16 @@ _PRODUCT = (
 )
 
 
-# The inputs, the other arguments and the workspace; their number depends on the linearised function.
+# Inputs, other arguments and workspace; their number depends on the linearised function.
 Linearise = Callable[..., None]  # type: ignore[explicit-any]
 Place = tuple[str, int, int]  # an array of the workspace, row and column
 
 
 class Input(NamedTuple):
-    """An argument to differentiate by: its name, its kinds, and the destination of its Jacobian.
+    """Argument to differentiate by: its name, its kinds, and the destination of its Jacobian.
 
-    `into` is the name of an array of the workspace, empty if the derivative is not requested. An
-    argument that is `zero` is not passed: it is noise with mean zero.
+    `into` is the name of an array in the workspace; it is empty if the derivative is not requested. An
+    argument with `zero` is not passed, because it is noise with mean zero.
     """
 
     name: str
@@ -116,9 +116,9 @@ def derivative(
 
 
 def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], float | None] | None:
-    """Return the entries of a Jacobian that may be nonzero, by row and column, with constant values.
+    """Return the entries of a Jacobian that may be nonzero, by row and column, and constant values.
 
-    None if nothing is known, as for a Jacobian that is written by hand.
+    The result is None if the entries are unknown, as for a Jacobian that is written by hand.
     """
     known = linearise.__dict__.get("known")
     if known is None:
@@ -129,7 +129,7 @@ def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], floa
 def _seeded(
     trace: Trace, argument: int, kinds: Sequence[str], first: int
 ) -> dict[Node, dict[int, Node]]:
-    """Return the derivatives of an argument's components by its tangent space."""
+    """Return the derivatives of the components of an argument with respect to its tangent space."""
     graph = trace.graph
     x = [graph.input((argument, index)) for index in range(len(kinds))]
     one, found = graph.constant(1.0), {}
@@ -157,7 +157,7 @@ def _in_tangent_space(
     slopes: Sequence[Mapping[int, Node]],
     variable: int,
 ) -> Iterator[tuple[int, Node]]:
-    """Yield the derivatives of a function's results by one variable in the tangent space, by row."""
+    """Yield, by row, the derivatives of a function's results by one variable in the tangent space."""
     zero = trace.graph.constant(0.0)
     y = [trace.number(node) for node in returned]
     for kind, c, t, _ in manifold_blocks(kinds):

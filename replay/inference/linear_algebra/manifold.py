@@ -1,9 +1,9 @@
 """Operations on states on their manifold: boxplus, boxminus, and the right Jacobian.
 
-Kinds and tangent space are those of `fuselog.replay.engine.vectors.tangent`: a quaternion q (Hamilton,
-w x y z) plus a rotation vector d is q exp(d/2), and an axis (a unit complex number) plus an angle is its
-product with exp(i angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called
-boxplus and the difference of two states boxminus; Sola, arXiv 1711.02508.
+Kinds and tangent spaces are defined in `fuselog.replay.engine.vectors.tangent`: a quaternion q
+(Hamilton, w x y z) plus a rotation vector d is q exp(d/2), and an axis (a unit complex number) plus an
+angle is its product with exp(i angle). Hertzberg et al., Information Fusion 14, 2013, define boxplus,
+the addition of a step, and boxminus, the difference of two states; Sola, arXiv 1711.02508.
 """
 
 from collections.abc import Sequence
@@ -47,12 +47,12 @@ class Recentre(Protocol):
 
 
 def tangent_size(kinds: Sequence[str]) -> int:
-    """Return the number of tangent components of these components."""
+    """Return the number of tangent components for components of these kinds."""
     return sum(width for _, _, _, width in manifold_blocks(kinds))
 
 
 def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
-    """List all numbers, angles, axes and quaternions: kind, first component, first tangent one, size."""
+    """List kind, first component, first tangent component and size of every number, axis and so on."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
         kind = kinds[component]
@@ -117,8 +117,8 @@ def boxminus(kinds: tuple[str, ...]) -> Boxminus:
 def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Turning:
     """Make `reset(d, rows)`, which multiplies a rotation's rows (t, m) by its right Jacobian at d (t,).
 
-    Applied from both sides, it transforms a covariance from the old mean to the one moved by d: Jr P
-    Jr'. With `back`, it multiplies by the inverse, which transforms a covariance in the other direction.
+    Applied from both sides, it transforms a covariance from the old mean to the mean moved by d: Jr P
+    Jr'. With `back`, it multiplies by the inverse, for the opposite transformation.
     """
     factors_of = inverse_right_jacobian_factors if back else right_jacobian_factors
     turns = tuple(t for kind, _, t, _ in manifold_blocks(kinds) if kind == "quaternion")
@@ -152,7 +152,7 @@ def right_jacobian_factors(squared: float) -> tuple[float, float]:
 
 
 def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
-    """Compute the factors of the inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
+    """Compute the factors of the inverse, I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
     angle = np.sqrt(squared)
     if angle < 0.05:
         second = (1.0 + squared / 60.0 * (1.0 + squared / 42.0)) / 12.0
@@ -221,14 +221,14 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def from_vector(x: float, y: float, z: float) -> Quaternion:
     """Return the unit quaternion of a rotation vector."""
-    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)  # not zero, so that sine / half is 1 there
-    cosine, sine = np.cos(half), np.sin(half)  # of the same number: libm computes both together
+    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)  # positive, so sine / half is 1 at 0
+    cosine, sine = np.cos(half), np.sin(half)  # of the same number, because libm computes both together
     scale = 0.5 * sine / half
     return cosine, scale * x, scale * y, scale * z
 
 
 def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the shortest rotation vector of a unit quaternion, which is also that of its negative."""
+    """Return the shortest rotation vector of a unit quaternion or, equivalently, of its negative."""
     sign = -1.0 if w < 0.0 else 1.0
     length = np.sqrt(x * x + y * y + z * z)
     angle = np.arctan2(length, sign * w)

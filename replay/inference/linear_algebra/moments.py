@@ -1,7 +1,8 @@
-"""Weighted samples from a covariance's factor, and their means and covariances.
+"""Weighted samples from the factor of a covariance, and their means and covariances.
 
-All sums are kept in registers, since a compiler must assume that arrays overlap. A kernel reads a whole
-changing tuple at every mention of its name; therefore such tuples are iterated over, not indexed.
+All sums are kept in registers, because a compiler must assume that arrays overlap. If a tuple changes, a
+kernel reads all of it at every mention of its name; such tuples are therefore iterated over, not
+indexed.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Protocol
 from fuselog.replay.engine.arrays import Floats, Numbers
 from fuselog.replay.inference.linear_algebra.tuples import total
 
-REGISTERS = 32  # of a processor: further sums are kept in memory
+REGISTERS = 32  # number of a processor's registers; further sums are kept in memory
 
 
 class Offset(Protocol):
@@ -70,8 +71,8 @@ def offset_of(size: int) -> Offset:
 def moments_of(states: int, values: int) -> Moments:
     """Make `moments(weights, offsets, found, shift, spread, cross)`, which fills weighted covariances.
 
-    They are those of the values `found` (L, v) minus `shift` (v,) with each other, and with the offsets
-    (L, >= t).
+    These are the covariances of the values `found` (L, v) minus `shift` (v,) with each other and with
+    the offsets (L, >= t).
     """
     parts = tuple(_moments_of_some(states, chosen) for chosen in _in_parts(states, values))
 
@@ -85,7 +86,7 @@ def moments_of(states: int, values: int) -> Moments:
 
 
 def _in_parts(states: int, values: int) -> list[range]:
-    """Split the values into parts whose sums fit into the registers, or which are single values."""
+    """Split the values into parts whose sums fit into the registers; a part has at least one value."""
     parts = [range(0)]
     for i in range(values):
         own = range(parts[-1].start, i + 1)
@@ -95,7 +96,7 @@ def _in_parts(states: int, values: int) -> list[range]:
 
 
 def _moments_of_some(states: int, chosen: range) -> Moments:
-    """Make `moments` for some values, with each other and with those before, in one loop."""
+    """Make `moments` for some values, with each other and with earlier values, in one loop."""
     pairs = tuple((i, j) for i in chosen for j in range(i + 1))
     mixed = tuple((row, i) for row in range(states) for i in chosen)
     size, first = chosen.stop, chosen.start

@@ -1,7 +1,7 @@
-"""Linear algebra with a few components for users' own estimators: scalar loops, in place.
+"""Linear algebra with a few components for users' own estimators, as in-place scalar loops.
 
 The functions are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`)
-and make no arrays: working memory is allocated there once, before the loop over the messages.
+and allocate no arrays: `follow` allocates working memory once, before the loop over the messages.
 Covariances stay symmetric. A Kalman filter for x' = F x + w and z = H x + v is
 
     memory, product = update_memory(states, components), np.empty((states, states))
@@ -39,7 +39,7 @@ class UpdateMemory(NamedTuple):
 
 
 def update_memory(states: int, components: int) -> UpdateMemory:
-    """Allocate memory for updates of `states` components by at most `components` measured ones."""
+    """Allocate memory for updates of `states` states by at most `components` measured components."""
     return UpdateMemory(no_innovation(states, components), np.empty(states))
 
 
@@ -101,7 +101,7 @@ def update(
     memory: UpdateMemory,
     gate: float = float("inf"),
 ) -> float:
-    """Update in place: x + K v and P - K S K', with S = H P H' + R and K = P H' S^-1.
+    """Update in place to x + K v and P - K S K', with S = H P H' + R and K = P H' S^-1.
 
     Args:
         mean: x (n,).
@@ -110,7 +110,7 @@ def update(
         rows: H (m, n), the derivative of the measurement by the state.
         noise: R (m, m).
         memory: working memory from `update_memory`.
-        gate: largest NIS; nothing is updated if it is exceeded.
+        gate: largest NIS; if it is exceeded, nothing is updated.
 
     Returns:
         The NIS v' S^-1 v; NaN if S is not positive definite, in which case nothing is updated.

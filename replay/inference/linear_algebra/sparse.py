@@ -1,7 +1,7 @@
 """Propagation of covariances through matrices whose zeros and ones are known in advance.
 
-For each row of a matrix, a `Pattern` has the entries that may be nonzero: the column, and the entry
-itself if it is constant. Only products with zero are left out: sums keep their order.
+For each row of a matrix, a `Pattern` lists the entries that may be nonzero: the column, and the value if
+it is constant. Only products with zero are left out, so sums keep their order.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ class AddThrough(Protocol):
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
-    """Make the pattern of a matrix with `rows` rows from its entries by index (None if one varies)."""
+    """Make the pattern of a matrix with `rows` rows from its entries by index (None: not constant)."""
     if known is None:
         return None
     return tuple(
@@ -49,10 +49,11 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
 
 
 def propagating_covariance(pattern: Pattern | None) -> Propagate:
-    """Make `move(covariance, transition, product, turned)`: P (t, t) becomes F P F', the product F P.
+    """Make `move(covariance, transition, product, turned)`, which replaces P (t, t) by F P F'.
 
-    `turned` is working memory: all inner loops go along rows, so that the compiler can process several
-    columns together. Components that F does not change, such as a bias, need no sums.
+    `product` becomes F P, and `turned` is working memory. All inner loops are along rows, so that the
+    compiler can process several columns together. Components that F does not change, such as a bias,
+    need no sums.
     """
     if pattern is None:
 
@@ -94,7 +95,7 @@ def propagating_covariance(pattern: Pattern | None) -> Propagate:
 
 
 def measuring_covariance(pattern: Pattern | None) -> MeasureCovariance:
-    """Make `measure(covariance, rows, cross, spread)`: C = P H' and S = H C, with H in `rows`."""
+    """Make `measure(covariance, rows, cross, spread)`, which fills C = P H' and S = H C; H is `rows`."""
     if pattern is None:
         return measured_covariance
     rows_of = tuple(enumerate(pattern))
@@ -117,7 +118,7 @@ def measuring_covariance(pattern: Pattern | None) -> MeasureCovariance:
 
 
 def adding_through(pattern: Pattern | None) -> AddThrough:
-    """Make `add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
+    """Make `add(covariance, gain, variances)`, which replaces P by P + G diag(variances) G'."""
     if pattern is None:
         return add_through
     columns = [dict(entries) for entries in pattern]

@@ -1,7 +1,7 @@
-"""Conversion between the tuples of a model's functions and the arrays that kernels work in.
+"""Conversion between the tuples of a model's functions and the arrays of kernels.
 
-A kernel can only index a tuple by numbers that are known when it is compiled: loops over tuples go over
-a known range and are unrolled (`range_of`).
+A kernel can index a tuple only by numbers that are known at compile time: loops over tuples have a known
+range and are unrolled (`range_of`).
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
 
 @lru_cache(maxsize=256)
 def tuple_of(size: int, start: int = 0) -> ReadTuple:
-    """Make `read(array)`, which returns `size` entries of an array from `start` on, as a tuple."""
+    """Make `read(array)`, which returns `size` entries of an array, beginning at `start`, as a tuple."""
 
     def read(array: Floats | Numbers) -> Numbers:
         return tuple(array[start + index] for index in range(size))
@@ -65,10 +65,10 @@ def total(numbers: Sequence[float]) -> float:
 
 @lru_cache(maxsize=64)
 def adding_noise(size: int, block: int = 0) -> AddNoise:
-    """Make `add(covariance, noise)`, which adds variances, or a lower triangle, given as a tuple.
+    """Make `add(covariance, noise)`, which adds a tuple of variances or of a lower triangle.
 
-    The triangle is that of the first `block` components, by default of all, followed by variances of the
-    other components.
+    The triangle is that of the first `block` components (of all by default), followed by the variances
+    of the other components.
     """
     corner = block or size
     triangle = tuple((row, column) for row in range(corner) for column in range(row + 1))

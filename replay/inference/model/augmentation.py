@@ -1,11 +1,11 @@
 """Augmentation of a state by parameters, such as a sensor's bias, a scale factor or a time offset.
 
-This is a transformation of models: each parameter becomes a component of the state, which the model's
-functions read in place of the parameter. Derivatives, samples and smoothers then include it without
-special treatment, and methods see an ordinary model. The prior of the component has the parameter's
-value as its mean and is appended to the log's prior. Between measurements, the component moves as
-described in `fuselog.replay.inference.model.gauss_markov`. Errors of the points of a map are added in
-the same way; see `fuselog.replay.inference.model.point_errors`.
+This is a transformation of models: each parameter becomes a component of the state, which the functions
+of the model read in place of the parameter. Derivatives, samples and smoothers then include the
+component without special treatment, because the result is an ordinary model. The prior of the component
+is appended to the prior of the log; its mean is the value of the parameter. Between measurements, the
+component changes as described in `fuselog.replay.inference.model.gauss_markov`. Errors of the points of
+a map are added in the same way; see `fuselog.replay.inference.model.point_errors`.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ Start = Callable[[Mapping[str, Ragged]], object]
 
 
 class Added(NamedTuple):
-    """Components that are added to the state (parameters, then point errors) and their processes."""
+    """Components that are added to the state (parameters, then point errors), with their processes."""
 
     parameters: Names
     errors: Errors
@@ -63,7 +63,7 @@ class Added(NamedTuple):
 
 
 def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added:
-    """Return the components to be estimated in addition to the state, as the settings request.
+    """Return the components that the settings add to the state.
 
     Args:
         label: label of the estimator, for errors.
@@ -130,7 +130,7 @@ def check_augmentable(where: str, model: Model) -> None:
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
-    """Add parameters and errors to a model's state; without any, return the model itself.
+    """Add parameters and errors to the state of a model; if there are none, return the model itself.
 
     >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
@@ -181,7 +181,7 @@ def with_gauss_markov(settings: Floats, added: Added) -> Floats:
 def begin(
     label: str, topic: str, bound_model: BoundModel, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
-    """Make the function that extends the log's prior on `topic` to the augmented state.
+    """Make the function that extends the prior on `topic` to the augmented state.
 
     Args:
         label: label of the estimator, for errors.
@@ -242,7 +242,7 @@ def _augmented(model: Model, names: Names) -> Model:
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """Add components to a motion that are random walks or return to their given values."""
+    """Extend a motion by components that are random walks or return to their given values."""
     n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)

@@ -1,7 +1,7 @@
-"""Binding of a model to a log: finds the topics that serve the model, by the model's names for them.
+"""Binding of a model to a log: search for the topics of a model by their names in the model.
 
-All models are bound in the same way: the topics of a model are searched under every prefix that has its
-prior, such as `/robot1/odometry` next to `/robot1/prior`. Sensors without a topic are left out.
+All models are bound in the same way: the topics of a model are searched under every prefix with a prior,
+such as `/robot1/odometry` next to `/robot1/prior`. Sensors without a topic are left out.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -21,18 +21,18 @@ from fuselog.replay.inference.model.model import (
     Sensor,
 )
 
-START = "start"  # frame of estimates that begin at zero, at an unknown position
+START = "start"  # frame of estimates that begin at zero because the initial position is unknown
 
 
 class Found(NamedTuple):
-    """The topics of a log that a model uses.
+    """Topics of a log that a model uses.
 
     Attributes:
         prefix: prefix of the names of its topics, such as `/robot1`.
-        prior: topic of the prior; in a log without one, its name if it existed.
-        truth: topic that estimates are compared with.
+        prior: topic of the prior; in a log without a prior, the name that it would have.
+        truth: topic with which estimates are compared.
         control: topic that drives the motion.
-        sensors: sensors that the log has, with their topics.
+        sensors: sensors of the model that are in the log, with their topics.
         has_prior: whether the log has the prior; otherwise see
             `fuselog.replay.inference.run.initialization`.
         fallbacks: topics that replace some components of the control.
@@ -67,7 +67,7 @@ def roles_of(model: Model) -> list[str]:
 
 
 class UnderPrefix(NamedTuple):
-    """The topics under one prefix of a log; `names` maps the model's names to names of topics."""
+    """Topics under one prefix of a log; `names` maps names in the model to names of topics."""
 
     topics: Mapping[str, Topic]
     prefix: str
@@ -78,7 +78,7 @@ class UnderPrefix(NamedTuple):
         return resolved(self.names.get(name, name), self.prefix)
 
     def topic(self, name: str, schema: Schema) -> Topic | None:
-        """Return the topic of this name if its messages have the schema or can be converted to it."""
+        """Return the topic of this name if its messages have the schema, or can be converted to it."""
         found = self.topics.get(self.place(name))
         return found if found is not None and found.schema_name in serving(schema) else None
 
@@ -96,7 +96,7 @@ def serving(schema: Schema) -> tuple[str, ...]:
 def first_and_more(
     named: Mapping[str, str | Sequence[str]],
 ) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Split the topics given for each of the model's names into the first topic and the others.
+    """Split the topics for each name in the model into the first topic and the others.
 
     >>> first_and_more({"pose": "/amcl/pose", "fix": ["/gps1/fix", "/gps2/fix"]})
     ({'pose': '/amcl/pose', 'fix': '/gps1/fix'}, {'fix': ['/gps2/fix']})
@@ -113,7 +113,7 @@ def with_more(
     topics: Mapping[str, Topic],
     more: Mapping[str, Sequence[str]],
 ) -> Found:
-    """Add further topics for a model's sensors, each next to the first topic of its sensor.
+    """Add further topics for sensors, each after the first topic of its sensor.
 
     Raises BadInput if a topic has a type that its sensor does not accept, or if the model does not use
     that sensor with this log.
@@ -143,13 +143,13 @@ def topics_of(
 ) -> list[Found]:
     """Find every object in a log that this model describes.
 
-    The topics of an object share a namespace. If this cannot apply because each sensor has a namespace
-    of its own, all topics belong to one object; see `_one_thing`.
+    The topics of an object share a namespace. If that is impossible because each sensor has its own
+    namespace, all topics belong to one object; see `_one_thing`.
 
     Args:
         model: the model.
         topics: topics of the log, by name.
-        names: names of topics, by the model's names for them.
+        names: names of topics, by their names in the model.
     """
     names = names or {}
     one = _one_thing(model, topics, names)
@@ -175,8 +175,8 @@ def _one_thing(
     A log with one topic for the control has one object, in the namespace of that topic. A log without a
     control has one object if no sensor, prior or truth occurs twice; its namespace is that of the prior,
     or the common part of the sensors' namespaces. A topic that this namespace lacks is taken from
-    elsewhere if it occurs once; if it occurs several times, it is not used. Poses are not taken from
-    elsewhere either, since they may be goals or be in a frame of their own.
+    another namespace if it occurs only once; if it occurs several times, it is not used. Poses are never
+    taken from other namespaces, because they may be goals or in a separate frame.
     """
     there = {name: topic for name, topic in topics.items() if not name.startswith("/estimates/")}
     homes: list[str] = []
@@ -217,14 +217,14 @@ def _one_thing(
 
 
 def _serves(model: Model, name: str, topic: Topic) -> bool:
-    """Test whether a sensor's topic belongs to the model's system, or a prior to its state."""
+    """Test whether a topic belongs to the system of the model or, for a prior, to its state."""
     if name == model.prior:
         return model.state.keys() <= set(topic.metadata.get("components", "").split(","))
     return topic.metadata.get("system", model.system) == model.system
 
 
 def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
-    """List the topics of any namespace that end with this name and serve as messages of the schema."""
+    """List the topics of any namespace that end with this name and match the schema."""
     end = f"/{name.removeprefix('/')}"
     return [
         each
@@ -234,20 +234,20 @@ def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
 
 
 def _common(spaces: Collection[str]) -> str:
-    """Return the longest namespace that contains all of these."""
+    """Return the longest common namespace of these namespaces."""
     parts = zip(*(space.split("/") for space in spaces), strict=False)
     alike = takewhile(lambda each: len(set(each)) == 1, parts)
     return "/".join(each[0] for each in alike)
 
 
 def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[str, str]:
-    """Suggest settings for unused topics that could serve as a sensor or fallback that the log lacks.
+    """Suggest settings for unused topics that could replace a missing sensor or fallback.
 
-    A topic can serve if only one sensor or fallback accepts its type, or otherwise if its name ends with
-    the model's name for it.
+    A topic is suggested if only one sensor or fallback accepts its type, or if its name ends with the
+    name in the model.
 
     Returns:
-        The option that uses the topic, by topic.
+        The option with which a topic is used, by topic.
     """
     kinds = {sensor.topic: sensor.schema for sensor in model.all_sensors}
     if model.control is not None:
@@ -304,8 +304,8 @@ def _suffices(
 ) -> bool:
     """Test whether a model can start from the prior or these sensors, and continue.
 
-    A log without a prior fits a model that can start without one if a sensor measures the state itself.
-    A log without sensors fits if it also has no part of them, such as sightings without their map.
+    A log without a prior fits a model that can start without one, if a sensor measures the state itself.
+    A log without sensors fits if it also lacks all parts of sensors, such as sightings without a map.
     """
     if not has_prior and (model.start is None or here.has(model.prior)):
         return False
@@ -325,10 +325,10 @@ def measures_state(model: Model, sensor: Sensor) -> bool:
 
 
 def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Found:
-    """Determine the frame of the positions: the log's local tangent plane, or a frame of their own.
+    """Determine the frame of the positions: the log's local tangent plane, or a separate frame.
 
-    See also `Filter.start`. Raises BadInput if one sensor measures positions in a frame of its own and
-    another one on earth, or if fixes are used and channels state different origins.
+    See also `Filter.start`. Raises BadInput if one sensor measures positions in a separate frame and
+    another on earth, or if fixes are used and channels state different origins.
     """
     placing = [(sensor, topic) for sensor, topic in found.sensors if "x_m" in sensor.measured]
     if "x_m" not in model.state:

@@ -1,4 +1,4 @@
-"""Bound models: models whose motion and sensors at hand are traced for a method."""
+"""Bound models: models with traced functions of their motion and of the sensors in a log."""
 
 import sys
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ Part = TypeVar("Part")
 
 
 class BoundModel(NamedTuple):
-    """A bound model: a model with its motion and the sensors that the log has.
+    """Model with one motion and the sensors that are in the log.
 
-    `modes` are the motions of all modes in order, for a method that uses all of them. Use `stage_of` to
-    make one with traced functions.
+    `modes` are the motions of all modes in order, for a method that uses all of them. Use
+    `bound_model_of` to make a bound model with traced functions.
     """
 
     model: Model
@@ -33,10 +33,10 @@ def bound_model_of(
     modes: Sequence[Motion] = (),
     names: tuple[str, ...] | None = None,
 ) -> BoundModel:
-    """Return a model with one of its motions, some of its sensors, and optionally all modes, traced.
+    """Make a bound model of a motion, some sensors and optionally all modes, with traced functions.
 
-    `names` are the parameters that functions may read, by default the model's own. Unchanged parts are
-    the same objects in every call.
+    `names` are the parameters that functions may read, by default those of the model. Unchanged parts
+    are the same objects in every call.
 
     Raises BadInput if a function cannot be traced.
     """
@@ -98,7 +98,7 @@ def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Senso
 
 
 def traced_model(model: Model, names: tuple[str, ...]) -> Model:
-    """Return the model with traced switching; its motion and sensors stay unchanged."""
+    """Return the model with traced switching; motion and sensors are not changed."""
     if model.switching is None:
         return model
     switching = _with_traced(model.switching, rates=(names,))
@@ -116,7 +116,7 @@ _KNOWN: dict[tuple[object, ...], tuple[object, object]] = {}
 
 
 def _same_again(part: Part, **changes: object) -> Part:
-    """Return the part with these changes, as the same object for the same changes."""
+    """Return the part with these changes; equal changes give the same object."""
     key = id(part), *((name, id(each)) for name, each in changes.items())
     known = _KNOWN.get(key)
     if known is None:

@@ -1,6 +1,6 @@
-"""Checks of a model against what it declares, made by calling its functions, for the author's tests.
+"""Checks of a model against its declarations, by calls of its functions, for the author's tests.
 
-Each failure of `check_model`, found at random states, is one sentence with the function's file and line.
+`check_model` calls the functions at random states; a failure is one sentence with file and line.
 """
 
 import warnings
@@ -40,8 +40,7 @@ from fuselog.replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
-# Step for the test that noise is additive, its tolerance, and the share of a variance from other
-# components.
+# Test of additive noise: step, tolerance, and limit of the share of a variance from other components.
 SHORT_S, ADDS_UP, FROM_OTHERS = 0.01, 0.1, 0.01
 STEP = 1e-5  # of central differences
 TURN = 2.0 * np.pi
@@ -52,16 +51,16 @@ Derivatives = Callable[[Floats, Sequence[Floats]], dict[str, Floats]]
 
 
 class _Call(NamedTuple):
-    """A model's function of a state and other inputs, as a method calls it.
+    """Function of a model with a state and other inputs, as a method calls it.
 
     Attributes:
-        what: its name and place, for messages.
+        what: its name, file and line, for messages.
         function: the function.
         state: names and kinds of the state's components.
         outputs: names and kinds of the returned components.
-        inputs: further arguments to differentiate by: by name, their number of components, and whether
-            they are zero.
-        rest: the last arguments.
+        inputs: further arguments to differentiate by: for each name, the number of components, and
+            whether it is zero.
+        rest: the remaining arguments.
     """
 
     what: str
@@ -86,24 +85,24 @@ def check_model(
 ) -> "Checked":
     """Check all functions of a model against what the model declares.
 
-    Process noise that does not add up, because two half steps add another variance than one whole step,
-    is only reported and raises a warning: published filters with a fixed rate use noise per step.
+    Process noise is not additive if two half steps add a different variance than one whole step. This
+    only causes a warning, because published filters with a fixed rate use noise per step.
 
     Args:
         model: the model.
-        parameters: values of its parameters; a parameter that is not given and has no default is 1.
-        states: states (n, components) at which to call the functions; by default, random ones of order
-            one.
+        parameters: values of its parameters; a parameter without a value and without a default is 1.
+        states: states (n, components) at which the functions are called; by default, random states of
+            order one.
         seed: seed of the random states, controls and points of a map.
 
     Returns:
-        Sentences about what was checked, what was not checked, and process noise that does not add up.
+        Sentences on the checks that were made, those that were not, and noise that is not additive.
 
     Raises AssertionError, with one sentence, if a function cannot be traced, if its derivatives differ
     from central differences or from those written by hand, if a number of components is wrong, if a
-    function that is declared linear is not, if an angle is declared linear or the reverse, if a unit
-    vector changes its length, or if a variance is negative. Raises BadInput if a parameter is not one of
-    the model's.
+    function is declared linear but is not linear, if an angle is declared linear or the reverse, if a
+    unit vector changes its length, or if a variance is negative. Raises BadInput if the model does not
+    have a parameter.
     """
     values = build(model.parameters, parameters or {}, "check_model")
     names = number_fields(model.parameters)
@@ -164,7 +163,7 @@ def check_model(
 
 
 class Checked(tuple[str, ...]):
-    """Sentences about what was checked; a notebook shows one per line."""
+    """Sentences about the checks that were made; a notebook shows one per line."""
 
     def __repr__(self) -> str:
         return "\n".join(self)
@@ -173,7 +172,7 @@ class Checked(tuple[str, ...]):
 def _checked(
     model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
 ) -> Checked:
-    """Describe for every function what was checked, and what was not because nothing is declared."""
+    """Describe, for every function, the checks that were made and those without a declaration."""
     sentences = [f"{model.summary}: {len(calls)} functions at {states} states"]
     for call, part in zip(calls, parts, strict=True):
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
@@ -222,7 +221,7 @@ def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
 
 
 def _derivatives_of(call: _Call) -> Derivatives:
-    """Make a function of a state and other inputs that returns exact Jacobians by name of the input."""
+    """Make a function that returns the exact Jacobians by the state and by other inputs."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
     counts = {name: n for name, (n, _) in call.inputs.items()}
     inputs = [Input("state", kinds, "state")]
@@ -246,7 +245,7 @@ def _derivatives_of(call: _Call) -> Derivatives:
 def _check_derivatives(
     call: _Call, exact: Derivatives, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
-    """Compare derivatives with central differences and handwritten ones; return the one by the state."""
+    """Compare derivatives with central differences and handwritten ones; return that by the state."""
     jacobians = exact(state, others)
     for index, (name, jacobian) in enumerate(jacobians.items()):
         for column, slopes in enumerate(_slopes(call, [state, *others], index).T):
@@ -256,7 +255,7 @@ def _check_derivatives(
 
 
 def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
-    """Compute the Jacobian (outputs, size) by one argument from central differences."""
+    """Compute the Jacobian (outputs, size) by one argument by central differences."""
     outputs = tuple(call.outputs.values())
     kinds = tuple(call.state.values()) if index == 0 else ("linear",) * len(arguments[index])
     add, size = boxplus(kinds), tangent_size(kinds)
@@ -274,7 +273,7 @@ def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
 def _check_correction(
     correct: Correction, model: Model, state: Floats, rng: np.random.Generator
 ) -> None:
-    """Check that a small correction moves only its own component, and that `step` inverts `back`."""
+    """Check that a small correction changes only its own component, and that `step` inverts `back`."""
     at, direction = tuple(state), rng.normal(size=model.tangent)
     slope = tuple(direction / np.dot(direction, correct.along(at)))
     for moved in (correct.move, correct.back):
@@ -319,7 +318,7 @@ def _check_by_hand(
 def _compare(
     call: _Call, exact: Floats, others: Floats, by: tuple[str, int], tolerance: float, how: str
 ) -> None:
-    """Raise AssertionError if a column of a Jacobian differs from that of another computation."""
+    """Raise AssertionError if a column of a Jacobian differs between two computations."""
     name, column = by
     found = exact[:, column]
     allowed = tolerance * np.maximum(1.0, np.maximum(np.abs(found), np.abs(exact).max(initial=0.0)))
@@ -412,12 +411,12 @@ def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
 
 
 def _check_period(name: str, index: int, model: Model, calls: list[_Call], states: Floats) -> None:
-    """Find components that are declared linear but only enter through sine and cosine, as angles do."""
+    """Find components that are declared linear but are used only in sines and cosines, like angles."""
     if model.kinds[index] != "linear":
         return
 
     def changes(shift: float) -> bool:
-        """Test whether shifting the component changes anything besides the component itself."""
+        """Test whether a shift of the component changes anything except the component itself."""
         for call in calls:
             zeros = [np.full(n, 0.0 if zero else 0.5) for n, zero in call.inputs.values()]
             for state in states:
@@ -466,10 +465,10 @@ def _matrix(
 def _not_additive(
     model: Model, motion: Motion, numbers: Settings, states: Floats, rng: np.random.Generator
 ) -> list[str]:
-    """Describe components that get another variance in one step than in two halves of it.
+    """Describe components whose added variance differs between one step and two half steps.
 
-    Components that get a share of their variance from others during the step are left out, because the
-    noise may be an approximation of limited order there.
+    Components that get a share of their variance from others during the step are left out, because their
+    noise may be an approximation of limited order.
     """
     whole, half = (
         _motion_call(model, motion, numbers)._replace(rest=(step_s, numbers))
@@ -502,7 +501,7 @@ def _not_additive(
 
 
 def _spread(call: _Call, motion: Motion, state: Floats, others: list[Floats]) -> Floats:
-    """Compute the covariance that a step adds: additive noise, other noise, and noise of the control."""
+    """Compute the covariance that a step adds, from additive noise, other noise and control noise."""
     (step_s, numbers), arguments = call.rest, [state, *others]
     size = tangent_size(tuple(call.state.values()))
     total = np.zeros((size, size))

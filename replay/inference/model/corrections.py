@@ -1,9 +1,9 @@
 """Corrections of a state and its covariance by a step of the tangent space, in updates and smoothers.
 
-Each component moves separately (`manifold.boxplus`), unless a model defines how components bend together
-(`model.Correction`). In both cases, the covariance is transformed from the tangent space of the old mean
-to that of the new one by the derivative of the moved state with respect to the step; in the other
-direction, by the derivative of the step with respect to the state that it leads to.
+Each component is corrected separately (`manifold.boxplus`), unless a model defines a correction along a
+curve (`model.Correction`). In both cases, the covariance is transformed from the tangent space of the
+old mean to that of the new mean by the derivative of the moved state with respect to the step, and in
+the other direction by the derivative of the step with respect to the moved state.
 """
 
 from typing import Protocol
@@ -57,7 +57,7 @@ class RelinearisingWork(CorrectionWork, Protocol):
 
 
 class FillSlope(Protocol):
-    """Function that fills the slope (t,) for a mean (n,) and a covariance (t, t); see `Correction`."""
+    """Function that fills the slope (t,) at a mean (n,) and a covariance (t, t); see `Correction`."""
 
     def __call__(self, mean: Floats, covariance: Floats, slope: Floats, /) -> None: ...
 
@@ -86,7 +86,7 @@ class StepTo(Protocol):
 
 
 class Chain(Protocol):
-    """Function that converts a Jacobian (m, t) at the moved state, in place, to one by the step."""
+    """Function that converts a Jacobian (m, t) at the moved state to one by the step, in place."""
 
     def __call__(self, rows: Floats, work: RelinearisingWork, /) -> None: ...
 
@@ -94,11 +94,11 @@ class Chain(Protocol):
 def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> FillSlope:
     """Make `fill(mean, covariance, slope)`, which computes the slope (t,) of `model.Correction`.
 
-    Without a correction of its own, the function leaves the slope unchanged.
+    If the model has no correction, the slope is not changed.
 
     Args:
         kinds: kinds of the state's components.
-        correct: the model's own correction, if it has one.
+        correct: the correction of the model, if it has one.
         form: the form in which the filter stores covariances.
     """
     if correct is None:
@@ -126,8 +126,9 @@ def correcting(
 ) -> Correct:
     """Make `move(mean, covariance, work)`, which moves a state and its covariance by `work.step`.
 
-    If components bend together, they do so along `work.slope`; `work.state`, `work.transition` and
-    `work.product` are then overwritten. With `back`, the step is one of a smoother's backward pass.
+    If the model has a correction, components move along the curve with the tangent `work.slope`, and
+    `work.state`, `work.transition` and `work.product` are overwritten. With `back`, the step is part of
+    a smoother's backward pass.
     """
     if correct is not None:
         step_together = stepping(kinds, correct.back if back else correct.move)
@@ -155,14 +156,14 @@ def correcting(
 
 
 def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
-    """Make `compare(origin, mean, covariance, work)`, which finds the step that `correcting` inverts.
+    """Make `compare(origin, mean, covariance, work)`, which finds the step between two states.
 
-    It fills `work.change[0]` with the step from the origin (n,) to the mean, and transforms the
-    covariance from the mean's tangent space to the origin's.
+    It fills `work.change[0]` with the step from the origin (n,) to the mean, the inverse of
+    `correcting`, and transforms the covariance from the tangent space of the mean to that of the origin.
 
     Args:
         kinds: kinds of the state's components.
-        correct: the model's own correction, if it has one.
+        correct: the correction of the model, if it has one.
     """
     if correct is not None:
         t, read_state = tangent_size(kinds), tuple_of(len(kinds))
@@ -201,7 +202,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
 
 
 def relinearising(model: Model) -> tuple[StepTo, Chain]:
-    """Make the functions that find an iterated update's linearisation point and apply the chain rule.
+    """Make the functions for the linearisation point and the chain rule of an iterated update.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`. After that, `chain(rows,
     work)` converts a Jacobian (m, t) at that state to one by the step.
@@ -238,7 +239,7 @@ def relinearising(model: Model) -> tuple[StepTo, Chain]:
 def stepping(kinds: Kinds, move: AlongSlope) -> StepTo:
     """Make `step_to(mean, work)`, which fills `work.state` and its derivative `work.transition`.
 
-    The mean is moved by `work.step` and bends along `work.slope`.
+    The mean is moved by `work.step` along the curve with the tangent `work.slope`.
     """
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
@@ -253,7 +254,7 @@ def stepping(kinds: Kinds, move: AlongSlope) -> StepTo:
 
 
 def correcting_more(model: Model, more: int) -> Correction | None:
-    """Extend a model's correction to further components of the state, which move separately."""
+    """Extend the correction of a model to further components of the state, which move separately."""
     if model.correct is None:
         return None
     n, t, correct = model.size, model.tangent, model.correct

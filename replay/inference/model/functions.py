@@ -1,7 +1,7 @@
-"""Types of the functions that a model consists of, by what they take and return.
+"""Types of the functions of a model, by arguments and results.
 
-The functions take and return tuples of numbers: states (n,), the control, and the point that a message
-refers to. Parameters are a NamedTuple of numbers. All arguments are positional.
+Arguments and results are tuples of numbers: states (n,), the control, and the point to which a message
+refers. Parameters are a NamedTuple of numbers. All arguments are positional.
 """
 
 from collections.abc import Callable
@@ -9,14 +9,14 @@ from typing import Any, Protocol
 
 from fuselog.replay.engine.arrays import Floats, Numbers, Settings
 
-# Any function of a model, for code that wraps or traces all of them, whatever arguments they take.
+# Any function of a model, for code that wraps or traces functions with any arguments.
 ModelFunction = Callable[..., Any]  # type: ignore[explicit-any]
 
 # (state, control, duration_s, parameters) -> state. Noise that is not additive is an argument after the
 # control, so there are four or five arguments.
 Move = Callable[..., Numbers]  # type: ignore[explicit-any]
 
-# (state, reference, parameters) -> what a sensor measures (m,). Noise that is not additive is an
+# (state, reference, parameters) -> the measured quantities (m,). Noise that is not additive is an
 # argument after the state, so there are three or four arguments.
 Measure = Callable[..., Numbers]  # type: ignore[explicit-any]
 

@@ -1,6 +1,6 @@
-"""Processes of added components: a random walk, or a first-order Gauss-Markov process.
+"""Processes of added components: random walks and first-order Gauss-Markov processes.
 
-For the latter see Gelb, Applied Optimal Estimation, 1974, section 3.6.
+For Gauss-Markov processes, see Gelb, Applied Optimal Estimation, 1974, section 3.6.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from fuselog.replay.inference.model.parameters import ModelParameters
 
 
 class GaussMarkov(NamedTuple):
-    """A first-order Gauss-Markov process, or a random walk.
+    """First-order Gauss-Markov process, or random walk.
 
     Attributes:
         sigma: standard deviation at the start.
         drift: density of the random walk, per square root of a second.
-        time_s: time constant of the return to the mean, while noise maintains sigma; infinite for a
+        time_s: time constant of the return to the mean, with noise that maintains sigma; infinite for a
             random walk.
     """
 
@@ -31,7 +31,7 @@ class GaussMarkov(NamedTuple):
 def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
-    """Add the parameters of these components' processes to a model's parameters."""
+    """Add the parameters of the processes of components to the parameters of a model."""
     processes: dict[str, AnyArgument] = {
         f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }

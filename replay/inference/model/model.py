@@ -1,8 +1,8 @@
-"""Models: how a state moves, and what sensors measure of it.
+"""Models of a state: its motion, and the sensors that measure it.
 
-A model is written once, as plain component-first functions: they take tuples of components, return
-tuples, and also run on arrays. Every method (see `fuselog.replay.inference.kalman.methods`) can estimate
-the state of every model that provides what the method needs.
+A model is written once, as plain component-first functions: arguments and results are tuples of
+components, which may be arrays. Every method (see `fuselog.replay.inference.kalman.methods`) can
+estimate the state of every model that provides what the method needs.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,7 +36,7 @@ FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A map: fixed points on a topic, to which measurements refer by number.
+    """Map of fixed points on a topic; measurements refer to the points by number.
 
     Attributes:
         topic: topic of the map.
@@ -64,15 +64,15 @@ class Map:
 @renamed(instead="fallbacks")
 @dataclass(frozen=True, eq=False)
 class Control:
-    """The control of a model: what drives its motion.
+    """Control of a model: the input that drives its motion.
 
     Attributes:
-        topic: name of its topic, under the prefix of what is estimated.
+        topic: name of its topic, under the prefix of the estimated object.
         schema: schema of its messages.
         components: names of its components, which are fields of the messages unless `read` is given.
         read: stream -> (n, components).
         interpolated: whether the control is linear between two messages, so that the motion uses the
-            mean of both ends of a step; otherwise a message holds until the next one.
+            mean of both ends of a step; if not, a message applies until the next one.
         initial: control before the first message; zeros by default.
         gap: parameter with the longest time, in s, without messages of an interpolated control. In a
             longer gap the estimate ends, or is unknown until messages resume; see `Motion.gap_noise`.
@@ -81,7 +81,7 @@ class Control:
         fallbacks: other topics that replace the components of the same names if the log has them, such
             as the turn rate of a gyro in place of that of the wheels.
         noise: for a fallback, the names under which its channel may state the noise of the control, by
-            parameter; while the fallback is used, no other channel is asked for these parameters.
+            parameter; while the fallback is used, only its channel can state these parameters.
     """
 
     topic: str
@@ -100,26 +100,26 @@ class Control:
 @renamed(lost="gap_noise")
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How a state moves.
+    """Motion of a state.
 
     Attributes:
         move: (state, control, duration_s, parameters) -> state; with `noises`, (state, control, noise,
             duration_s, parameters) -> state.
         noise: (state, duration_s, parameters) -> variances of the additive noise in the tangent space,
             or the rows of the lower triangle of its covariance; with `noises`, the variances of these.
-        noises: number of noise components that enter `move` other than by addition.
+        noises: number of noise components that are arguments of `move` instead of being added.
         noise_block: number of components in the lower triangle, if variances of the other components
             follow it; zero for all components.
         control_noise: (duration_s, parameters) -> variances of the control's error over the duration;
-            they enter the state through the derivative by the control.
+            the derivative by the control propagates them to the state.
         gap_noise: (state, duration_s, parameters) -> variances in the tangent space that are added after
-            the control was missing for longer than its `gap`. The state stays the same, so they must
-            cover any motion in the meantime; no estimates are made during the gap.
+            the control was missing for longer than its `gap`. The state is not changed, so the variances
+            must cover any motion in the meantime; there are no estimates during the gap.
         linear: whether `move` is linear in the state; sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both Jacobians;
-            only needed if they are written by hand, since they are otherwise derived from `move`.
-        moments: (mean, covariance, control, duration_s, parameters) moves both in place, exactly,
-            without the additive noise; for the method `analytic`.
+            only for handwritten Jacobians, because they are otherwise derived from `move`.
+        moments: (mean, covariance, control, duration_s, parameters) moves mean and covariance exactly,
+            in place, without the additive noise; for the method `analytic`.
     """
 
     move: Move
@@ -140,11 +140,11 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Switching:
-    """Changes between modes: a Markov chain in continuous time.
+    """Changes between modes, as a Markov chain in continuous time.
 
     Attributes:
-        rates: (parameters) -> number of changes per second from the first mode to each of the others in
-            order, then from the second one, and so on: M (M - 1) numbers for M modes.
+        rates: (parameters) -> rates of change per second: from the first mode to each of the others in
+            order, then from the second mode, and so on; M (M - 1) numbers for M modes.
         initial: (parameters) -> probabilities of the modes at the time of the prior; equal by default.
     """
 
@@ -155,24 +155,24 @@ class Switching:
 @renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A sensor: the quantity that it measures, as a function of the state.
+    """Sensor: its measurement as a function of the state.
 
     Attributes:
-        topic: name of its topic, under the prefix of what is estimated; a leading slash makes it a full
-            name.
-        schema: schema of its messages. A GeodeticFix is accepted as a PositionFix, through the origin of
-            the log's local tangent plane.
+        topic: name of its topic, under the prefix of the estimated object; a leading slash makes it a
+            full name.
+        schema: schema of its messages. A GeodeticFix is accepted as a PositionFix; it is converted with
+            the origin of the log's local tangent plane.
         measured: names of the measured components, with their kinds ("linear" or "angle").
         measure: (state, reference, parameters) -> measurement; with `noises`, (state, noise, reference,
-            parameters). `reference` is the point of the map, or empty. A component that has no
-            information about this state, or no derivative there, is NaN, as if the message lacked it.
+            parameters). `reference` is the point of the map, or empty. A component that is undefined at
+            this state, or has no derivative, is NaN, as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of these. With `covariance`, it applies to messages without one;
-            a message with neither is skipped and counted.
+            with `noises`, the variances of these. With `covariance`, it applies to messages without a
+            covariance; a message with neither is skipped and counted.
         vector: field with the measured components as a vector. The channel's metadata name its entries
             in `components`, in any order; those of a position need no names. By default, every component
             is a separate field.
-        noises: number of noise components that enter `measure` other than by addition.
+        noises: number of noise components that are arguments of `measure` instead of being added.
         covariance: field with the covariance of the vector; with `read`, stream -> (n, m, m), NaN if
             unknown.
         reference: map whose points the messages refer to, or several maps with one point each.
@@ -191,8 +191,8 @@ class Sensor:
             state (t, m).
         log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
             that can use it.
-        stated: parameters that its channel may state in another form: metadata -> number, NaN if it does
-            not.
+        stated: parameters that its channel may state in another form: metadata -> number, or NaN if it
+            is not stated.
     """
 
     topic: str
@@ -228,7 +228,7 @@ class Sensor:
 
     @property
     def control_start(self) -> int:
-        """Number of entries of `reference` before those of the control, that is, of the points."""
+        """Number of entries of `reference` before the control, that is, those of the points."""
         return sum(each.size for each in self.maps)
 
     @property
@@ -263,17 +263,18 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Correction of a state in which one direction of its error, such as the heading, bends the others.
+    """Correction of a state along a curve, such as the circle on which it moves with its heading.
 
-    A belief that is wide in that direction is not an ellipsoid: as a function of the error along it, the
-    mean of the other components follows a curve. `slope` (t,) is the tangent of that curve, P d / d' P d
-    with the covariance P and the direction d. Small steps move every component separately: at zero, the
-    derivative of the moved state is the identity matrix.
+    If the state is very uncertain in one direction of its error, such as the heading, its distribution
+    is not an ellipsoid: as a function of the error in this direction, the mean of the other components
+    follows a curve. `slope` (t,) is the tangent of the curve, P d / d' P d with the covariance P and the
+    direction d. Small steps move every component separately: at zero, the derivative of the moved state
+    is the identity matrix.
 
     Attributes:
         along: state -> d (t,).
         move: (state, step, slope) -> state after an update by a step (t,) of the tangent space.
-        step: (state, target, slope) -> the step that `back` takes from the state to the target.
+        step: (state, target, slope) -> the step with which `back` moves the state to the target.
         back: (state, step, slope) -> state after a step of a smoother's backward pass.
     """
 
@@ -286,34 +287,35 @@ class Correction:
 @renamed(estimable="augmentable")
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model of one kind of object; a log may contain several, each under its own prefix.
+    """Model of one kind of object; a log may contain several objects, each under its own prefix.
 
     Attributes:
         summary: description in one line.
         state: components by name, with their kinds; the four components of a quaternion are adjacent.
         parameters: type of its parameters.
-        sensors: all sensors that it can use; any of them makes a log fit. A model with a position
+        sensors: all sensors that it can use; a log fits if it has any of them. A model with a position
             (linear `x_m` and `y_m`, perhaps `z_m`) also uses position fixes; see `all_sensors`.
-        motion: how the state moves.
+        motion: motion of the state.
         modes: other motions by name, for methods with several modes; `motion` is then one of them.
-        switching: how the object changes between its modes.
-        control: what drives its motion; a log without this topic does not fit.
-        prior, truth: topics of the first Gaussian and of the reference, under the prefix.
+        switching: changes of the object between its modes.
+        control: input that drives the motion; a log without this topic does not fit.
+        prior, truth: topics of the prior and of the true states, under the prefix.
         output: last part of the name of the estimates' topic.
         system: the `system` that a channel's metadata must name, if any.
         needs_sensor: whether a log must have at least one of its sensors.
         start: assumptions for a log without the prior; None if such a log does not fit.
         takes_fixes: whether it can use position fixes.
-        correct: how an update moves the state, if not every component moves separately.
+        correct: correction of the state by an update, unless every component moves separately.
         by_name: whether it is only used if it is named, because it also fits logs of other models.
-        augmentable: parameters that can be added to the state, linear or angles: those that motion and
-            sensors read, except noise. See `fuselog.replay.inference.model.augmentation`.
-        calibration: parameters that describe how sensors are mounted, scaled, biased and delayed, each
-            with a useful standard deviation; an estimate that is less certain counts as undetermined.
-        owned: parameters that belong to single topics, by name: the topic, and the name of the parameter
-            there. See `fuselog.replay.inference.model.own_parameters`.
+        augmentable: parameters that can be added to the state, with their kinds (linear or angle): those
+            that motion and sensors read, except noise. See
+            `fuselog.replay.inference.model.augmentation`.
+        calibration: parameters of the mounting, scale, bias and delay of sensors, each with a useful
+            standard deviation; an estimate with a larger standard deviation counts as undetermined.
+        owned: parameters that belong to single topics, by name: the topic, and the general name of the
+            parameter. See `fuselog.replay.inference.model.own_parameters`.
 
-    An object on a line whose distance from the origin is measured:
+    An object that moves on a line; its distance from the origin is measured:
 
     >>> import numpy as np
     >>> from fuselog.recorders.log import schemas
@@ -370,7 +372,7 @@ class Model:
 
     @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """The sensors, with that of position fixes unless the model has its own."""
+        """Sensors, including that of position fixes unless the model defines its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
         has_position = names[:2] == list(POSITION[:2])
         has_own = any(sensor.topic == FIX for sensor in self.sensors)
@@ -388,7 +390,7 @@ class Model:
         return ".".join(self.owned[name]) if name in self.owned else name
 
     def kind_of(self, name: str) -> str:
-        """Return the general parameter that a topic's parameter replaces, or else the name itself.
+        """Return the general parameter that a parameter of a topic replaces; otherwise, the name itself.
 
         Args:
             name: name of the parameter.
@@ -397,7 +399,7 @@ class Model:
 
     @property
     def finds_start(self) -> bool:
-        """Whether the model finds its own start; see `Start.find`."""
+        """Whether the model finds its start from messages; see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Parameters of single topics, such as lever arms of two receivers, or the offset of a second compass.
+"""Parameters of single topics, such as the lever arms of two receivers.
 
-This is a transformation of models: the sensor of a topic reads the topic's parameter in place of the
-general one. The parameter is called, for example, `/gps2/fix.lever_x_m`, and has the value of
-`lever_x_m` unless it is set. Methods, augmented states and exported C code treat it as any other
+This is a transformation of models: the sensor of a topic reads the parameter of the topic in place of
+the general one. An example of a name is `/gps2/fix.lever_x_m`; the parameter has the value of
+`lever_x_m` unless it is set. Methods, augmented states and exported C code treat it like any other
 parameter.
 """
 
@@ -32,7 +32,7 @@ Tables = Mapping[str, Mapping[str, object]]
 def with_own_parameters(
     model: Model, found: Found, tables: Tables, parameters: Parameters
 ) -> tuple[Model, Found, CombinedParameters]:
-    """Return a model whose topics have their own parameters, its topics, and the parameters.
+    """Return a model with separate parameters for topics, its topics, and the parameters.
 
     A topic gets its own parameters if some are set for it, or if several topics serve the same sensor.
 
@@ -109,7 +109,7 @@ def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
 def _transformed(
     model: Model, sensors: tuple[Sensor, ...], own: tuple[tuple[int, str], ...]
 ) -> tuple[Model, tuple[Sensor, ...]]:
-    """Give the sensors with these numbers the parameters of their topics.
+    """Replace the parameters of the sensors with these numbers by those of their topics.
 
     Raises BadInput if the names of two topics differ only in punctuation.
     """
@@ -183,7 +183,7 @@ def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
 
 @pure
 class _Own:
-    """Parameters of which some are replaced by those of a topic."""
+    """Parameters, some of which are replaced by those of a topic."""
 
     def __init__(self, parameters: Settings, fields: tuple[tuple[str, str], ...]) -> None:
         self._parameters, self._fields = parameters, dict(fields)
@@ -194,9 +194,10 @@ class _Own:
 
 
 def _reading(function: OfModel, place: int, fields: Mapping[str, str]) -> OfModel:
-    """Make a function whose argument at an index, the parameters, is replaced by the topic's own.
+    """Make a function whose parameters, the argument at an index, are replaced by those of the topic.
 
-    The function counts as unchanged if the given one is unchanged; see `fuselog.replay.tracing.reads`.
+    The function counts as unchanged if the given function is unchanged; see
+    `fuselog.replay.tracing.reads`.
     """
     pairs = tuple(fields.items())
 

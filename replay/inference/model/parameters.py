@@ -10,14 +10,14 @@ from pydantic import Field, PositiveFloat
 from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.arrays import Settings
 
-# The parameters of a model and of a method combined, in a class that is made when both are known; see
+# Combined parameters of a model and a method, in a class that is made when both are known; see
 # `fuselog.replay.inference.estimators.combined`.
 CombinedParameters = Any  # type: ignore[explicit-any]
 
 
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """List the parameters that model functions can read: all that are numbers."""
+    """List the parameters that the functions of a model can read, that is, all numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")
     return tuple(
@@ -36,21 +36,21 @@ def settings_type(names: tuple[str, ...]) -> type[Settings]:
 class ModelParameters(Parameters):  # type: ignore[explicit-any]
     """Options of every model.
 
-    A parameter that is not set is read from the channels of the log: from the sensor's own channel
-    first, then from those of the control, the prior and the other sensors.
+    A parameter that is not set is read from the channels of the log: first from the sensor's own
+    channel, then from those of the control, the prior and the other sensors.
 
     Attributes:
         gate_probability: measurements whose NIS exceeds this quantile of the chi-square distribution are
             rejected; 1 accepts all.
-        gate_reopens_s: time since a sensor's last accepted measurement after which its gate opens, so
-            that a filter that has drifted, such as in an outage, accepts the measurements that correct
+        gate_reopens_s: time since a sensor's last accepted measurement after which its gate opens; a
+            filter that has drifted, for example in an outage, then accepts the measurements that correct
             it.
         inflate_nis: NIS above which the innovation covariance is inflated until the NIS has this value.
-        student_freedom: degrees of freedom of a Student's t-distribution that innovations are assumed to
-            have.
+        student_freedom: degrees of freedom of the Student's t-distribution that is assumed for
+            innovations.
         switch_nis: NIS above which measurements are increasingly down-weighted, as in dynamic covariance
             scaling.
-        sigma_fix_m: standard deviation of each component of a fix that does not state its covariance.
+        sigma_fix_m: standard deviation of each component of a fix whose message states no covariance.
     """
 
     OWNED: ClassVar[Mapping[str, tuple[str, str]]] = {}  # see `Model.owned`

@@ -1,9 +1,9 @@
-"""Augmentation of a state by lasting measurement errors about each point of a map.
+"""Augmentation of a state by persistent measurement errors for each point of a map.
 
-These model measurement noise that is not white: ranges to one anchor, or between an anchor and a tag,
-have the same error for seconds. This is a transformation of models: each point or pair of points gets a
-component of the state, which is added to the measurements about it. The component is a random walk or a
-first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with
+They model measurement noise that is not white: for example, ranges to one anchor, or between an anchor
+and a tag, have the same error for seconds. This is a transformation of models: each point or pair of
+points gets a component of the state, which is added to its measurements. The component is a random walk
+or a first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with
 Applications to Tracking and Navigation, 2001, section 8.2.
 """
 
@@ -30,7 +30,7 @@ Names = tuple[str, ...]
 
 
 class PointError(NamedTuple):
-    """The error of the `measured` component about the points with these numbers, one per map."""
+    """Error of the `measured` component for the points with these numbers, one per map."""
 
     measured: str
     numbers: tuple[int, ...]
@@ -47,15 +47,15 @@ Errors = tuple[PointError, ...]
 def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
     """Return the errors that an entry of `estimate` names; empty if it names a parameter.
 
-    `range_m[3]` is the error of range_m about point 3; `range_m[0:8]` are those about points 0 to 7;
-    `range_m[0:8,0:3]` are those of all pairs with points 0 to 2 of the second map.
+    `range_m[3]` is the error of range_m for point 3; `range_m[0:8]` are the errors for points 0 to 7;
+    `range_m[0:8,0:3]` are those for all pairs with points 0 to 2 of the second map.
 
     Args:
         where: the estimator and option, for errors.
-        model: model with the sensors whose errors they are.
+        model: model with the sensors that have these errors.
         asks: the entry, such as `range_m[0:8]`.
 
-    Raises BadInput if the model has no such measurement about points of maps.
+    Raises BadInput if the model has no such measurement of points of maps.
     """
     found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
     if found is None:
@@ -122,7 +122,7 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
 
 @lru_cache(maxsize=256)
 def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
-    """Return the sensor with these errors added to the measurements about their points."""
+    """Return the sensor with these errors added to the measurements of their points."""
     own = [
         (model.size + index, list(sensor.measured).index(each.measured), each.numbers)
         for index, each in enumerate(errors)

@@ -1,4 +1,4 @@
-"""Numbers that a model's functions read, collected from parameters or from a log's channels."""
+"""Numbers that the functions of a model read, from parameters or from channels of a log."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
@@ -23,8 +23,8 @@ from fuselog.replay.inference.model.validation import (
     switching_of,
 )
 
-# (settings (1 + sensors, fields), row) -> its parameters; row 0 is the motion, the others are the
-# sensors.
+# (settings (1 + sensors, fields), row) -> the parameters in this row; row 0 is for the motion, the
+# others are for the sensors.
 ReadSettings = Callable[[Floats, int], Settings]
 
 
@@ -40,13 +40,13 @@ def reading_settings(names: tuple[str, ...]) -> ReadSettings:
 
 
 def trial_parameters(model: Model) -> Settings:
-    """Make parameters for trial calls of functions: every number is one."""
+    """Make parameters for trial calls of functions, in which every number is 1."""
     names = number_fields(model.parameters)
     return settings_type(names)(*(1.0,) * len(names))
 
 
 class TracedParameters:
-    """Parameters that record in `read` which of them a model's functions read; unset ones are 1."""
+    """Parameters that record in `read` the names that functions read; unset parameters are 1."""
 
     def __init__(self, values: Mapping[str, float | None]) -> None:
         self._values = values
@@ -66,8 +66,8 @@ def settings_of(
 ) -> Floats:
     """Collect the numbers (1 + sensors, fields) of motion and sensors from parameters and channels.
 
-    A number that is not given is taken from the channels of the control, the prior and the sensors; a
-    sensor uses its own channel first.
+    A number that is not given is read from the channels of the control, the prior and the sensors; for a
+    sensor, its own channel is first.
 
     Args:
         label: label of the estimator, for errors.
@@ -75,8 +75,8 @@ def settings_of(
         found: its topics.
         parameters: parameters given by the user.
 
-    Raises BadInput if no channel states a number that is needed, if a channel states one that the
-    parameter does not allow, or if the model does not match its declarations.
+    Raises BadInput if no channel states a needed number, if a channel states an invalid value of a
+    parameter, or if the model does not match its declarations.
     """
     model = bound_model.model
     names = number_fields(model.parameters)
@@ -132,7 +132,7 @@ def _stated(
 ) -> float:
     """Return the value that channels state for a parameter; NaN if none states it.
 
-    The noise of a control that a fallback replaces is that of the fallback's topic.
+    If a fallback replaces the control, the noise is read from the topic of the fallback.
     """
     for drive, topic in found.fallbacks:
         for other in drive.noise.get(name, ()):
@@ -144,10 +144,10 @@ def _stated(
 
 
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
-    """List the numbers of the plane's origin that are neither given nor stated for the model itself.
+    """List the numbers of the tangent plane's origin that are neither given nor stated by channels.
 
-    They are taken from the origin of the plane into which fixes are projected, so that, for example,
-    gravity is that of the position.
+    They are taken from the origin of the tangent plane into which fixes are projected, so that, for
+    example, gravity matches the position.
     """
     stating = _stating(found)
     return tuple(
@@ -161,7 +161,7 @@ def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, .
 
 
 def _of_origin(bound_model: BoundModel, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """Return numbers of the plane's origin; typical values until the first fix is known."""
+    """Return the numbers of the tangent plane's origin, or typical values until the first fix."""
     start = bound_model.model.start
     usual = start.parameters if start is not None else {}
     return {
@@ -185,8 +185,8 @@ def placed_settings(
         names: names of the columns.
         found: topics of the model.
         parameters: parameters given by the user.
-        origins: (runs, 3) origin of each run's plane, its first fix if none is stated; None without
-            fixes.
+        origins: (runs, 3) origin of each run's tangent plane, which is its first fix if none is stated;
+            None without fixes.
         runs: number of runs.
     """
     placed = np.empty((runs, *settings.shape[-2:]))
@@ -240,7 +240,7 @@ def assumed_of(
 def _needed(
     where: str, bound_model: BoundModel, given: tuple[tuple[str, float | None], ...]
 ) -> tuple[set[str], ...]:
-    """Return the parameters that motion and sensors read; raise BadInput if declarations are wrong."""
+    """Return the parameters that motion and sensors read; raise BadInput for wrong declarations."""
     model, values = bound_model.model, dict(given)
     check_state(where, model)
     check_correction(where, model)

@@ -1,4 +1,4 @@
-"""The start of a model in a log that has no prior."""
+"""Start of a model in a log without a prior."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ class Align(Protocol):
 @renamed(suspect="check_prior")
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Assumptions about the start in a log without a prior, which was not recorded for the model.
+    """Assumptions about the start in a log without a prior, that is, not recorded for the model.
 
     The estimate starts at the first message that measures components of the state by name, with their
     covariance, such as a fix or a pose. Other components are zero, with the uncertainty given here.
@@ -30,17 +30,17 @@ class Start:
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
         parameters: numbers that no channel of such a log states.
-        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
-            None if these do not determine it yet. The path (k, n) is where the control alone leads from
-            zero at the first k fixes (k, 2), with their covariances (k, 2, 2), which span this time. The
-            state is that at the last of these fixes, and the estimate starts just after it, so that no
-            fix is used twice. For a state that a position does not determine.
-        find: (streams, parameters) -> `Started`, used in place of the above for a state that is found
-            from several messages. The streams are the first messages of a run and the maps, by the
-            model's names for their topics. Raises BadInput if they do not determine the state. Such a
+        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state at the
+            last of k fixes, or None if they do not determine the state yet. The path (k, n) starts at
+            zero and follows from the control only; the fixes (k, 2) have covariances (k, 2, 2) and span
+            `span_s`. The estimate starts just after the last fix, so that no fix is used twice. It is
+            needed for a state that a single position does not determine.
+        find: (streams, parameters) -> `Started`, used instead of the above for a state that is found
+            from several messages. The streams are the first messages of a run and the maps, by the names
+            of their topics in the model. It raises BadInput if they do not determine the state. Such a
             model needs a sensor.
         check_prior: (streams, parameters) -> sentences on contradictions between the prior and these
-            messages, if the log has a prior. They are only reported.
+            messages, if the log has a prior. They are reported but are not errors.
     """
 
     sigmas: Mapping[str, float]
@@ -51,7 +51,7 @@ class Start:
 
 
 class Started(NamedTuple):
-    """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found."""
+    """Start of a run: stamp, mean (n,), covariance (t, t), and a description of the method."""
 
     time_ns: int
     mean: Floats

@@ -22,13 +22,13 @@ def check_state(where: str, model: Model) -> None:
 
 
 def check_motion(where: str, model: Model, motion: Motion, parameters: Settings) -> None:
-    """Call a motion's functions once, uncompiled.
+    """Call the functions of a motion once, uncompiled.
 
     Args:
         where: the estimator, for errors.
         model: model of the motion.
-        motion: one of its motions.
-        parameters: a number for every parameter, in an object that records which are read.
+        motion: one of the motions of the model.
+        parameters: a number for every parameter, in an object that records the names read.
 
     Raises BadInput if a function fails or contradicts the model's declarations.
     """
@@ -50,7 +50,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Settings)
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
-@lru_cache(maxsize=64)  # independent of the parameters, of which a search tries hundreds
+@lru_cache(maxsize=64)  # independent of the parameters, for which a search tries hundreds of values
 def check_correction(where: str, model: Model) -> None:
     """Call the functions of a model's correction once, uncompiled; see `check_motion`."""
     if model.correct is not None:
@@ -72,7 +72,7 @@ def check_switching(where: str, model: Model, parameters: Settings) -> None:
 
 
 def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats, Floats]:
-    """Return the rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
+    """Return the rates (M (M - 1),) between the modes of a model and the initial probabilities (M,).
 
     Args:
         where: the estimator, for errors.
@@ -104,13 +104,13 @@ def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats
 
 
 def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings) -> None:
-    """Call a sensor's functions once, uncompiled; see `check_motion`.
+    """Call the functions of a sensor once, uncompiled; see `check_motion`.
 
     Args:
         where: the estimator, for errors.
         model: model of the sensor.
-        sensor: one of its sensors.
-        parameters: a number for every parameter, in an object that records which are read.
+        sensor: one of the sensors of the model.
+        parameters: a number for every parameter, in an object that records the names read.
     """
     where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
@@ -139,7 +139,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
 
 
 def _check_interpolated(where: str, model: Model, control: Control) -> None:
-    """Raise BadInput if a sensor's control is not interpolated: its measurements would be NaN."""
+    """Raise BadInput if the control of a sensor is not interpolated: measurements would be NaN."""
     driving = model.control
     if driving is None or driving.components != control.components:
         asked, given = (
@@ -158,7 +158,7 @@ def _check_interpolated(where: str, model: Model, control: Control) -> None:
 
 
 def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """Return a state for trial calls of functions: distinct numbers and unit vectors."""
+    """Return a state of distinct numbers and unit vectors, for trial calls of functions."""
     found: list[float] = []
     while len(found) < len(kinds):
         kind = kinds[len(found)]

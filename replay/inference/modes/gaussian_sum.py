@@ -1,9 +1,9 @@
-"""Gaussian-sum filter (`bank`): narrow Gaussians from a prior that is too wide in an angle for one.
+"""Gaussian-sum filter (`bank`), which splits a prior that is too wide in an angle.
 
 The prior is split along the widest direction of its angles, such as an unknown heading, into adjacent
-Gaussians. Each is filtered separately; every message weights them by its likelihood, and the estimate is
-their mixture. Members with negligible probability are removed, and the remaining ones are merged when
-they agree, so that eventually the sum costs as much as one filter.
+Gaussians. Each Gaussian is filtered separately; every message weights them by its likelihood, and the
+estimate is their mixture. Members with negligible probability are removed, and the remaining ones are
+merged when they agree; eventually, the sum costs as much as one filter.
 
 Magill, Optimal Adaptive Estimation of Sampled Stochastic Processes, IEEE TAC 10(4), 1965.
 """
@@ -53,12 +53,12 @@ AGREED = 0.1  # mean squared distance below which the members are merged
 
 
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """The filter of every member, and the number of members.
+    """Filter of every member, and number of members.
 
-    Members are adjacent, and the standard deviation of each is half their distance, so that their sum is
-    smooth. A narrower prior has fewer members; one that is no wider than a member is not split. The
-    number is odd: with an even number, every member has an exact opposite, and rounding would determine
-    whether it is half a turn to the left or to the right, and thereby the mean.
+    Members are adjacent, with a standard deviation of half their distance, so that their sum is smooth.
+    A narrower prior has fewer members; a prior that is no wider than a member is not split. The number
+    is odd: with an even number, every member has an exact opposite, and rounding would decide whether
+    the opposite is half a turn to the left or to the right, which changes the mean.
 
     Attributes:
         filter: the filter of every member: ekf, iekf, ukf, lrkf, analytic or sqrt.
@@ -77,12 +77,12 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 class GaussianSumBelief(NamedTuple):
-    """The Gaussians of all runs, the first axis; the remaining ones of M members come first.
+    """Gaussians of all runs (the first axis); the remaining members, of M, come first.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
         probability, log_probability: (runs, M).
-        member: (runs, M) index of each among the original members.
+        member: (runs, M) original index of each member.
         left: (runs,) number of remaining members.
     """
 
@@ -95,7 +95,7 @@ class GaussianSumBelief(NamedTuple):
 
 
 class GaussianSumMemory(NamedTuple):
-    """Working memory of one core: the members' filter, their mixture, and `factor` (t, t)."""
+    """Working memory of one core: for the filter of members, their mixture, and `factor` (t, t)."""
 
     filters: tuple[CoreMemory]
     mixture: MixtureMemory
@@ -125,7 +125,7 @@ def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> S
         return well
 
     def keep_possible(run: int, belief: GaussianSumBelief) -> None:
-        """Remove members with negligible probability, and move the others to the front."""
+        """Remove members of negligible probability, and move the others to the front."""
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
         count = belief.left[run]
@@ -145,7 +145,7 @@ def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> S
         belief.left[run] = kept
 
     def merge_agreeing(run: int, belief: GaussianSumBelief, memory: GaussianSumMemory) -> None:
-        """Merge all Gaussians into one if their means differ by little relative to the covariance."""
+        """Merge all Gaussians into one if their means differ little compared to the covariance."""
         count = belief.left[run]
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
@@ -215,7 +215,7 @@ def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> S
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
-    """Find the direction (t,) in which a covariance (t, t) is widest among all angles, and its variance.
+    """Find the direction (t,) among all angles in which a covariance is widest, and its variance.
 
     If several directions are equally wide, the result is that of the first angle or orientation, as
     close as possible to the first of its axes.
@@ -268,7 +268,7 @@ def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int
 
 
 class GaussianSumFilter(MixtureFilter):
-    """A Gaussian-sum filter; the probabilities of its members are on the topic `modes`."""
+    """Gaussian-sum filter; the probabilities of its members are on the topic `modes`."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -277,7 +277,7 @@ class GaussianSumFilter(MixtureFilter):
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior, which is split; see `Filter.start`."""
+        """Make the initial state of every run from its prior, which is split; see `Filter.start`."""
         state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief
         runs = len(mean)
@@ -310,7 +310,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _gaussian_sum(name: str, variant: str, members: int) -> Method:
-    """Make the method that uses `members` filters of this name."""
+    """Make the method that uses up to `members` filters of this name."""
     inner = filter_with(name, variant)
 
     def steps(bound_model: BoundModel) -> Steps:

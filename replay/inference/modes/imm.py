@@ -1,14 +1,15 @@
-"""Interacting multiple models (IMM): one filter for each mode, and the modes' probabilities.
+"""Interacting multiple models (IMM): one filter per mode, and probabilities of the modes.
 
-Over dt seconds an object changes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt).
-Before a prediction the modes' Gaussians are mixed,
+Within dt seconds, an object changes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt).
+Before a prediction, the Gaussians of the modes are mixed,
 
     c_j = sum_i mu_i Pi_ij,  mu_(i|j) = mu_i Pi_ij / c_j,
 
 each mode predicts its own mixture, and every message makes mu_j proportional to mu_j N(v_j; 0, S_j).
-Mixtures are formed in the tangent space of the most probable mode; covariances are transformed to it,
-and from there to that of the mixture's mean, by the right Jacobian. Probabilities are also stored as
-logarithms, because those of a mode that fits badly are below the smallest floating-point number.
+Mixtures are computed in the tangent space of the most probable mode; the right Jacobian transforms
+covariances to this space, and from there to that of the mean of the mixture. Probabilities are also
+stored as logarithms, because the probability of a mode that fits badly can be below the smallest
+floating-point number.
 
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
 """
@@ -67,12 +68,12 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """The filter of every mode, and additional outputs.
+    """Filter of every mode, and additional outputs.
 
     Attributes:
         filter: the filter of every mode: ekf, iekf, ukf, lrkf, analytic or sqrt.
-        smoothed_modes: whether to also write the probabilities of the modes given all data, at the end
-            of the run and on a separate topic; the state is not smoothed.
+        smoothed_modes: whether to output, at the end of the run and on a separate topic, also the
+            probabilities of the modes given all data; the state is not smoothed.
     """
 
     filter: str = "ekf"
@@ -91,7 +92,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Steps:
-    """Make the steps of an interacting multiple model filter whose modes have these filters.
+    """Make the steps of an interacting multiple model filter with these filters of the modes.
 
     Args:
         bound_model: the bound model with all its modes and the sensors of the log.
@@ -169,7 +170,7 @@ def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Step
 
 
 class InteractingFilter(MixtureFilter):
-    """A filter for all modes of a model."""
+    """Filter for all modes of a model."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -178,13 +179,13 @@ class InteractingFilter(MixtureFilter):
 
     @cached_property
     def chain(self) -> tuple[Floats, Floats]:
-        """The rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
+        """Rates between the modes (M (M - 1),), and initial probabilities of the modes (M,)."""
         model = self.bound_model.model
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior, which is the same in all modes; see `Filter.start`."""
+        """Make the initial state of every run: its prior, in all modes; see `Filter.start`."""
         state, (_, initial) = super().start(static), self.chain
         mean, covariance = (
             np.repeat(each[:, None], len(initial), axis=1) for each in state.carried.belief
@@ -209,7 +210,7 @@ class InteractingFilter(MixtureFilter):
         return after, made
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter the events that still wait, and smooth the modes' probabilities if requested."""
+        """Filter the events that still wait, and smooth the mode probabilities if requested."""
         state, made = self.ended(state)
         return [*made, self.smoothed(join(state.kept))] if state.kept else made
 

@@ -1,4 +1,4 @@
-"""Mixing of the Gaussians of modes: transition matrix, weights of mixtures, and their moments."""
+"""Mixing of the Gaussians of modes: transition matrix, mixing weights, and moments of mixtures."""
 
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -31,10 +31,10 @@ class MixtureMemory(NamedTuple):
     """Working memory for a mixture of M Gaussians.
 
     Attributes:
-        centre: (n,) mean in whose tangent space mixtures are formed.
+        centre: (n,) mean in whose tangent space mixtures are computed.
         away, carried: (M, t), (M, t, t) the Gaussians in that tangent space.
         shift: (t,) mean of a mixture in that tangent space.
-        records: innovations of every Gaussian's update; the first axis is the mode.
+        records: innovations of the updates of all Gaussians; the first axis is the mode.
         open_gate: (m + 1,) bounds that accept every measurement.
     """
 
@@ -95,7 +95,7 @@ class FillWeights(Protocol):
 class ToCommonTangent(Protocol):
     """Function that transforms means (M, n) and covariances (M, t, t) to one common tangent space.
 
-    It is that of the most probable mode.
+    This is the tangent space of the most probable mode.
     """
 
     def __call__(
@@ -113,12 +113,12 @@ class MixModes(Protocol):
 
 @lru_cache(maxsize=16)
 def transition_matrix(modes: int) -> FillTransition:
-    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformisation.
+    """Make `fill_transition(rates, duration_s, transition)`, which computes Pi = expm(rates dt).
 
-    With L dt added to the diagonal, where L is the fastest rate at which a mode is left, the matrix has
-    no negative entries, so that no digits cancel; the factor exp(-L dt) compensates for this. The
-    duration is halved until the series is short, and the result is squared as often; finally the rows
-    are normalised to a sum of one.
+    The method is uniformisation: with L dt added to the diagonal, where L is the fastest rate of leaving
+    a mode, the matrix has no negative entries, so no digits cancel; the factor exp(-L dt) compensates
+    for this. The duration is halved until the series is short, and the result is squared as many times;
+    finally, the rows are normalised to a sum of one.
     """
     changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
     rate_of = tuple(
@@ -168,10 +168,11 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
 
 
 def mixing_weights(modes: int) -> FillWeights:
-    """Make `fill_weights(probability, log_probability, memory)`, which replaces probabilities by c.
+    """Make `fill_weights(probability, log_probability, memory)`, which predicts probabilities.
 
-    Row j of the memory's weights becomes mu_(i|j). If c_j is tiny, it is computed from logarithms; a
-    mode that cannot be reached from any mode with positive probability keeps its own Gaussian.
+    The probabilities are replaced by c, and row j of the weights in memory becomes mu_(i|j). If c_j is
+    tiny, it is computed from logarithms; a mode that cannot be reached from any mode with positive
+    probability keeps its own Gaussian.
     """
 
     def weigh_by_logarithms(end: int, log_probability: Floats, memory: InteractingMemory) -> float:
@@ -255,7 +256,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[ToCommonTa
 
 
 def likeliest_of(probability: Floats) -> int:
-    """Return the index of the most probable mode, the first one if there are several."""
+    """Return the index of the most probable mode; if several are equal, the first."""
     likeliest = 0
     for mode in range(1, len(probability)):
         if probability[mode] > probability[likeliest]:

@@ -29,11 +29,11 @@ from fuselog.replay.inference.run.recursion import EstimateRows, InnovationRows
 
 
 class ModeBelief(NamedTuple):
-    """Belief of all runs, the first axis: one Gaussian for each of M modes.
+    """Belief of all runs (the first axis): one Gaussian for each of M modes.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
-        probability, log_probability: (runs, M) of the modes.
+        probability, log_probability: (runs, M) probabilities of the modes, and their logarithms.
     """
 
     mean: Floats
@@ -43,7 +43,7 @@ class ModeBelief(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Estimates with probabilities, which the filter fills; see `recursion.EstimateRows`."""
+    """Estimates and probabilities that the filter fills; see `recursion.EstimateRows`."""
 
     end: Integers
     time_ns: Integers
@@ -87,10 +87,10 @@ class UpdateMixture(Protocol):
 
 
 def predicting(filters: Sequence[Steps]) -> PredictModes:
-    """Make `predict(belief, ...)`, which predicts every mode's Gaussian and returns whether all succeed.
+    """Make `predict(belief, ...)`, which predicts the Gaussians of all modes and returns the success.
 
-    Steps take the number of a run, and Gaussians whose first axis is the run. Here and in
-    `mixture_update`, all Gaussians belong to one run, and the number of the mode takes the place of the
+    The arguments of steps are the number of a run, and Gaussians whose first axis is the run. Here and
+    in `mixture_update`, all Gaussians belong to one run, and the number of the mode replaces that of the
     run.
     """
     predictions = tuple(each.predict for each in filters)
@@ -111,12 +111,12 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
     It is called as `update(gaussians, (probability, log_probability), ...)` and works in place; see
     `Steps.updates`. A measurement within the gate of one mode is accepted by all modes, because
     likelihoods of different measurements cannot be compared. The recorded innovation is that of the
-    mixture, whose covariance includes the spread of the modes' innovations; the log-likelihood is log
-    sum_j mu_j N(v_j; 0, S_j).
+    mixture; its covariance includes the spread between the innovations of the modes; the log-likelihood
+    is log sum_j mu_j N(v_j; 0, S_j).
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
         update_mode: update of one Gaussian by this sensor; see `Steps.updates`.
     """
     components, measured = (
@@ -147,7 +147,7 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
                 covariance[i, j] = covariance[j, i] = entry
         write_innovation(innovation, record)
         squared = whiten(innovation, drop_missing(innovation))[0]
-        if np.isnan(squared):  # singular at the precision of covariances: use the mean of the modes' NIS
+        if np.isnan(squared):  # singular at the precision of covariances: use the mean NIS of the modes
             squared = 0.0
             for mode in range(len(probability)):
                 squared += probability[mode] * records.numbers[mode, 0]
@@ -204,7 +204,7 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
 
 
 class MixtureFilter(Filter, ABC):
-    """A filter whose belief is several Gaussians, whose probabilities are a further output."""
+    """Filter whose belief is several Gaussians; their probabilities are a further output."""
 
     @property
     @abstractmethod
@@ -220,12 +220,12 @@ class MixtureFilter(Filter, ABC):
         return Mixtures(end, time_ns, mean, covariance, probability), innovations
 
     def output_streams(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
-        """Make the streams of the state and of the modes' probabilities."""
+        """Make the streams of the state and of the mode probabilities."""
         modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
         return [self.states(EstimateRows(*mixtures[:4]), offsets), modes]
 
     def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
-        """Make the stream of the modes' probabilities (n, M)."""
+        """Make the stream of the mode probabilities (n, M)."""
         stream = make_stream(
             f"/estimates/{self.name}/{name}",
             schemas.MODE_PROBABILITIES,

@@ -1,4 +1,4 @@
-"""Smoothing of the probabilities of modes, given all data of a run.
+"""Smoothing of mode probabilities, given all data of a run.
 
 Kim, Journal of Econometrics 60, 1994.
 """
@@ -33,7 +33,7 @@ def smoothing_over_runs(modes: int) -> OverRuns:
 
 
 def smoothing(modes: int) -> RunOnce:
-    """Make `smooth(run, ...)`, which replaces probabilities (n, M) by those given all data of the run.
+    """Make `smooth(run, ...)`, which replaces probabilities (n, M) by those given all data of a run.
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
     """

@@ -1,4 +1,4 @@
-"""The particle filter as an estimator, which is seeded by a run's first measurement, and as a method."""
+"""Particle filter as an estimator, seeded by the first measurement of a run, and as a method."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -47,18 +47,19 @@ MOST_PARTICLES = 1_000_000
 
 
 class ParticleParameters(MethodParameters):  # type: ignore[explicit-any]
-    """Number of particles, and when they are resampled.
+    """Number and resampling of particles.
 
     Random numbers depend on `seed` and on the run's first measurement.
 
     Attributes:
         particles: number of particles.
-        resample_below: threshold of the effective number of particles, 1 / sum w^2, as a fraction of
-            all; below it, the particles are resampled.
+        resample_below: fraction of effective particles, (1 / sum w^2) / particles, below which the
+            particles are resampled.
         seed: seed of the random numbers.
-        cloud: whether to also write all particles of every estimate.
-        progressive: whether to process a measurement in several parts if it would reduce the effective
-            number below `resample_below`, and to spread resampled particles by a Gaussian kernel.
+        cloud: whether to also output all particles of every estimate.
+        progressive: whether to process a measurement in several parts if it would reduce the fraction of
+            effective particles below `resample_below`, and to spread resampled particles by a Gaussian
+            kernel.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000
@@ -132,10 +133,10 @@ _draw_normals = compiled(fill_normals)
 
 
 class ParticleFilter(Filter):
-    """A particle filter, whose runs start when their first measurement arrives, which seeds them."""
+    """Particle filter; the first measurement of a run seeds and starts the run."""
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior; see `Filter.start`."""
+        """Make the initial state of every run from its prior; see `Filter.start`."""
         state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
@@ -173,7 +174,7 @@ class ParticleFilter(Filter):
         return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
-        """Report on the topic `started` which parameters of newly started runs cannot change."""
+        """Report parameters of newly started runs that cannot change, on the topic `started`."""
         options = self.parameters
         moving = {*(options.estimate_time_s or ())}
         moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
@@ -193,9 +194,9 @@ class ParticleFilter(Filter):
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Filter events that wait for a control or a measurement; the prior then seeds the run.
+        """Filter the events that still wait for a control or a measurement.
 
-        Then the prior seeds the run.
+        A run without a measurement is seeded by its prior.
         """
         state, made = self.ended(state)
         if state.kept is None:
@@ -206,7 +207,7 @@ class ParticleFilter(Filter):
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
     def begun(self, state: FilterState, seeds: Mapping[int, list[Columns]]) -> FilterState:
-        """Draw particles from the priors of some runs, each seeded by its data."""
+        """Draw particles from the priors of some runs, each with a generator seeded by its data."""
         if not seeds:
             return state
         carried = state.carried
@@ -225,7 +226,7 @@ class ParticleFilter(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Clouds, InnovationRows]:
-        """Make arrays of estimates, with particles if requested, and of innovations to fill."""
+        """Allocate arrays for estimates, with particles if requested, and for innovations."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.bound_model.model.size))
@@ -267,7 +268,7 @@ class ParticleFilter(Filter):
 
 
 def draw(model: Model, cloud: Cloud, run: int) -> int:
-    """Draw the particles of a run from its prior, and return its counter."""
+    """Draw the particles of a run from its prior, and return the counter of its generator."""
     states, t = cloud.states[run], model.tangent
     numbers = np.empty(-(-len(states) * t // WORDS) * WORDS)
     counter = _draw_normals(numbers, np.empty(len(numbers), np.uint64), cloud.key[run], 0)
@@ -292,7 +293,7 @@ def _made_for(parameters: ParticleParameters) -> Method:
 
 
 def _lacks_likelihood(model: Model) -> str:
-    """Name a sensor whose noise does not enter linearly and that has no likelihood function."""
+    """Name a sensor whose noise is not additive and that has no likelihood function."""
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:

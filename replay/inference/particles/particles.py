@@ -1,6 +1,6 @@
-"""Prediction and resampling of the bootstrap particle filter, in which every particle has its own noise.
+"""Prediction and resampling of the bootstrap particle filter, with separate noise for each particle.
 
-All noise is drawn, whether it enters by addition, through the control or in the motion. A measurement
+All noise is sampled: additive noise, noise of the control, and noise within the motion. A measurement
 weights the particles by its likelihood; they are resampled before a prediction if few of them are
 effective. Mean and covariance are those of the weighted particles, in the tangent space.
 
@@ -34,14 +34,14 @@ from fuselog.replay.inference.sampling.resampling import choose_systematically
 
 
 class Cloud(NamedTuple):
-    """The particles of all runs; the first axis is the run.
+    """Particles of all runs; the first axis is the run.
 
     Attributes:
-        prior: Gaussian that the particles are drawn from.
+        prior: Gaussian from which the particles are drawn.
         states: (runs, N, n).
         weight: (runs, N), with sum 1.
-        offsets, shift: (runs, N, t), (runs, t) working memory: tangent vectors from the mean to the
-        states.
+        offsets, shift: (runs, N, t), (runs, t) working memory for tangent vectors from the mean to the
+            states.
         key, counter: (runs, 2), (runs,) state of the run's random generator; the counter is 0 before the
         first draw.
     """
@@ -75,9 +75,9 @@ class SensorMemory(NamedTuple):
 
     Attributes:
         innovation: innovation of the cloud as a whole.
-        differences: (N, m) measurement minus prediction.
-        noise: (1 or N, m, m) covariance of the noise, later its factor; one for each particle if they
-            differ.
+        differences: (N, m) measured minus predicted.
+        noise: (1 or N, m, m) covariance of the noise, later its factor; N if it differs between
+            particles.
         determinant: (1 or N,) log det of the covariance.
         kept: (m,) indices of the components that are used.
     """
@@ -94,9 +94,9 @@ class Kernel(NamedTuple):
 
     Attributes:
         width: width of the Gaussian kernel, relative to the standard deviation of the cloud.
-        numbers, words, drawn: normal random numbers, the words they are made from, and the numbers as
-        (N, t).
-        mean, covariance: (n,), (t, t) of the cloud; the covariance is later replaced by its factor.
+        numbers, words, drawn: normal random numbers, their random words, and the numbers as (N, t).
+        mean, covariance: (n,), (t, t) mean and covariance of the cloud; the covariance is later replaced
+            by its factor.
         trial: (N,) weights.
     """
 
@@ -114,15 +114,15 @@ class ParticleMemory(NamedTuple):
 
     Attributes:
         least_effective: effective number below which particles are resampled.
-        numbers, words, drawn: normal random numbers, the words they are made from, and the numbers as
-        (N, noises of the motion).
+        numbers, words, drawn: normal random numbers, their random words, and the numbers as (N, noises
+            of the motion).
         control, noise: (controls,), (noises of the motion,) drawn for one particle.
         lower: (t, t) factor of the covariance of additive noise.
         chosen, spare: (N,), (N, n) for resampling.
         likelihood: (N,) logarithms.
-        sensors: one for each sensor.
+        sensors: memory of each sensor.
         work: workspace for derivatives by noise.
-        kernel: memory to spread the particles; for zero particles if it is not used.
+        kernel: memory to spread the particles, which is empty if it is not used.
     """
 
     least_effective: float
@@ -147,7 +147,7 @@ class Renew(Protocol):
 
 
 class Drive(Protocol):
-    """Function that returns a particle's control (controls,)."""
+    """Function that returns the control (controls,) of a particle."""
 
     def __call__(self, interval: Interval, drawn: Floats, memory: ParticleMemory, /) -> Numbers: ...
 
@@ -167,7 +167,7 @@ class MoveParticle(Protocol):
 
 
 class SpreadParticles(Protocol):
-    """Function that fills offsets (N, t) with draws of the additive noise at states (N, n).
+    """Function that fills offsets (N, t) with samples of the additive noise at states (N, n).
 
     It returns False if a covariance is not positive semidefinite.
     """
@@ -178,11 +178,12 @@ class SpreadParticles(Protocol):
 
 
 def moving(bound_model: BoundModel, by_control: int, renew: Renew) -> PredictRun:
-    """Make the prediction, in which every particle moves with its own noise after any resampling.
+    """Make the prediction: resample if necessary, then move every particle with its own noise.
 
     Args:
         bound_model: the bound model.
-        by_control: number of a particle's draws, at the start, that are errors of the control.
+        by_control: number of random numbers of a particle that are errors of the control; they come
+            first.
         renew: `renew(run, cloud, memory)` resamples and returns whether it succeeded.
     """
     model, motion = bound_model.model, bound_model.motion
@@ -212,14 +213,14 @@ def moving(bound_model: BoundModel, by_control: int, renew: Renew) -> PredictRun
 
 
 def resampling(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
-    """Resample without moving the particles, and return True."""
+    """Resample without spreading the particles, and return True."""
     states, weight, key = cloud.states[run], cloud.weight[run], cloud.key[run]
     cloud.counter[run] = resample(states, weight, key, cloud.counter[run], memory)
     return True
 
 
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
-    """Resample the particles, so that all have the same weight, and return the new counter.
+    """Resample the particles to equal weights, and return the new counter.
 
     Args:
         states: (N, n).
@@ -247,7 +248,7 @@ def effective_number(weight: Floats) -> float:
 def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
     """Multiply weights of sum 1 by a power of likelihoods, and normalise them.
 
-    A particle whose likelihood is NaN gets the mean of the others.
+    A particle whose likelihood is NaN gets the mean likelihood of the others.
 
     Args:
         weight: (N,), changed in place.
@@ -274,7 +275,7 @@ def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
 
 
 def _driving(bound_model: BoundModel) -> Drive:
-    """Make `drive(interval, drawn, memory)`, which returns a particle's control as a tuple."""
+    """Make `drive(interval, drawn, memory)`, which returns the control of a particle as a tuple."""
     controls, variances = bound_model.model.controls, bound_model.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
@@ -330,7 +331,7 @@ def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: Parti
 def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
     """Make `spread(states, offsets, interval, memory)`, which draws the additive noise.
 
-    The draws are tangent vectors at the states before they move. The noise is factored only if it
+    The samples are tangent vectors at the states before the motion. The noise is factored only if it
     differs from that of the previous particle. The function returns False if a covariance is not
     positive semidefinite.
     """
@@ -365,7 +366,7 @@ def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
 
 
 def summing_up(model: Model) -> EstimateRun:
-    """Make the estimate: intrinsic mean and covariance, and the particles if requested."""
+    """Make the estimate: intrinsic mean and covariance, and particles if they are requested."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)
     weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}

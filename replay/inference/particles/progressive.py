@@ -1,10 +1,10 @@
 """Progressive particle updates, which process a measurement in parts and spread resampled particles.
 
-A measurement that is much narrower than the cloud leaves only a few particles, and without noise of the
-motion all later ones are copies of these. Therefore the likelihood is raised to a power that leaves
-enough particles effective, the particles are resampled, and the rest of the likelihood follows.
-Resampled particles are drawn from a Gaussian kernel around each, shrunk towards their mean so that mean
-and covariance stay the same.
+If a measurement is much more accurate than the cloud, only a few particles keep weight; without noise of
+the motion, all later particles are copies of these. Therefore, the likelihood is first raised to a power
+for which enough particles stay effective, the particles are resampled, and the rest of the likelihood is
+applied. Resampled particles are spread by a Gaussian kernel and shrunk towards their mean, which
+preserves mean and covariance.
 
 Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised particle filters", 2001, in
 Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
@@ -33,7 +33,7 @@ from fuselog.replay.inference.particles.particles import (
 )
 
 MOST_PARTS = 100  # maximum number of parts of one measurement
-_HALVINGS = 10  # bisections of the interval of the power; more if the power is below all of these
+_HALVINGS = 10  # bisections of the interval of the power; more if the power is still too large
 _MOST_HALVINGS = 60
 
 
@@ -91,9 +91,9 @@ def renewing(model: Model) -> Renew:
 
 
 class Look(Protocol):
-    """Function that prepares the likelihood for moved particles.
+    """Function that prepares the likelihood after particles have moved.
 
-    It returns the number of components that are used.
+    It returns the number of used components.
     """
 
     def __call__(
@@ -128,13 +128,13 @@ class Take(Protocol):
 def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
     """Make `take(run, cloud, data, parameters, memory, own, kept)`, which weights and moves particles.
 
-    It returns the log-likelihood, NaN if no particle explains the measurement, and whether everything
-    else succeeded.
+    It returns the log-likelihood (NaN if no particle explains the measurement), and whether all other
+    steps succeeded.
 
     Args:
         model: model whose state the particles have.
-        look: `look(states, data, parameters, memory, kept)` prepares what the likelihood needs for moved
-            particles and returns the number of components that are used.
+        look: `look(states, data, parameters, memory, kept)` prepares the likelihood after particles have
+            moved, and returns the number of used components.
         likelihood: log p at one particle; see `update.weighing`.
     """
     renew = renewing(model)
@@ -171,7 +171,7 @@ def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
 
 
 def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemory) -> float:
-    """Find the largest power, at most `left`, that leaves enough particles effective."""
+    """Find the largest power, at most `left`, for which enough particles stay effective."""
     least = memory.least_effective
     if not effective_after(weight, likelihood, left, memory.kernel.trial) < least:
         return left

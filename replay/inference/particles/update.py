@@ -1,4 +1,4 @@
-"""Update of particles, which weights each by the likelihood of the measurement."""
+"""Update of particles: each is weighted by the likelihood of the measurement."""
 
 from typing import Protocol
 
@@ -49,12 +49,12 @@ def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> Upda
     """Make the update by sensor `number`, which weights particles by the likelihood of the measurement.
 
     The recorded innovation, its NIS and the gate use the first two moments of the cloud; the
-    log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
-    and a particle that does not predict one of the others keeps its share of the weight.
+    log-likelihood is that of the weighted particles. A component that no particle can predict is left
+    out, and a particle that cannot predict one of the other components keeps its share of the weight.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
         progressive: whether a measurement may be processed in parts.
     """
     sensor = bound_model.sensors[number]
@@ -99,7 +99,7 @@ def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> Upda
 
 
 def _at_once(likelihood: Likelihood) -> Take:
-    """Make `take`, see `taking_in_parts`, which processes a measurement as a whole."""
+    """Make `take` (see `taking_in_parts`), which processes a measurement as a whole."""
 
     def take(
         run: int,
@@ -119,7 +119,7 @@ def _at_once(likelihood: Likelihood) -> Take:
 
 
 def _looking(compare: CompareParticles, number: int) -> Look:
-    """Make `look`, see `taking_in_parts`, for the likelihood of Gaussian noise."""
+    """Make `look` (see `taking_in_parts`) for the likelihood of Gaussian noise."""
 
     def look(
         states: Floats, data: Floats, parameters: Settings, memory: ParticleMemory, kept: int
@@ -180,7 +180,7 @@ def _comparing(bound_model: BoundModel, number: int) -> CompareParticles:
 
 
 def keep_predicted(own: SensorMemory) -> int:
-    """Store the measured components that at least one particle predicts, and return their number."""
+    """List the measured components that at least one particle can predict, and return their number."""
     size = 0
     for j in range(len(own.kept)):
         for i in range(len(own.differences)):
@@ -192,7 +192,7 @@ def keep_predicted(own: SensorMemory) -> int:
 
 
 def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
-    """Test whether a particle predicts all components that are used."""
+    """Test whether a particle can predict all used components."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
             return False
@@ -202,13 +202,13 @@ def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
 def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, ...]) -> None:
     """Fill the innovation of the cloud: mean and covariance of the differences, plus the noise.
 
-    Angles are unwrapped relative to the difference of the first particle that has one.
+    Angles are unwrapped relative to the difference of the first particle with a prediction.
 
     Args:
         weight: (N,).
-        own: memory of the sensor, with differences and noise.
+        own: memory of the sensor, with the differences and the noise.
         size: number of components that are used.
-        angular: (m,) which components are angles.
+        angular: (m,) whether each component is an angle.
     """
     mean, spread, _ = own.innovation
     mean[:], spread[:, :] = np.nan, 0.0
@@ -241,9 +241,9 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
 
 
 def factor_kept(own: SensorMemory, size: int) -> None:
-    """Factor the noise of the components that are used, move it to the front, and compute log det.
+    """Factor the noise of the used components, move it to the front, and compute log det.
 
-    The latter is NaN if the covariance is not positive definite.
+    The log det is NaN if the covariance is not positive definite.
     """
     for number in range(len(own.noise)):
         noise, determinant = own.noise[number], 1.0
@@ -259,10 +259,10 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 
 
 def _likelihood(bound_model: BoundModel, number: int) -> Likelihood:
-    """Make `likelihood(states, i, data, parameters, own, size)`: log p of a measurement at particle i.
+    """Make `likelihood(states, i, data, parameters, own, size)`, the log-likelihood at particle i.
 
-    This is the model's own likelihood, or that of Gaussian noise; NaN if the particle does not predict
-    the measurement.
+    It uses the likelihood function of the model, or else Gaussian noise; it returns NaN if the particle
+    cannot predict the measurement.
     """
     sensor = bound_model.sensors[number]
     if sensor.log_likelihood is None:
@@ -281,10 +281,10 @@ def _likelihood(bound_model: BoundModel, number: int) -> Likelihood:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int
 ) -> float:
-    """Compute log p of Gaussian noise, see `inflation`; the difference is replaced by L^-1 v.
+    """Compute the log-likelihood for Gaussian noise, and replace the difference by L^-1 v.
 
     Args:
-        states: (N, n), not used: the differences are known.
+        states: (N, n), not used, because the differences are known.
         i: index of the particle.
         data: (width,) data of the event, not used.
         parameters: parameters of the sensor, for `inflation`.

@@ -1,4 +1,4 @@
-"""Runs of one model by one method over messages: events, recursion, initialization and reprocessing.
+"""Processing of messages by one model and one method, from events to reprocessing.
 
 Begin with `recursion`.
 """

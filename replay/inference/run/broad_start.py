@@ -1,7 +1,7 @@
 """Starts that hardly depend on parameters, so that likelihoods can be compared.
 
-A start that depends on the parameters, such as one aligned with the first fixes, consumes more messages
-if their noise is stated larger; the likelihoods would then be of different messages.
+A start may depend on the parameters: if it is aligned with the first fixes, it uses more messages if
+their stated noise is larger; likelihoods would then be those of different messages.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -16,8 +16,8 @@ from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.run.first_messages import unknown
 
 BROAD_M = 1000.0  # standard deviation of a position about its first message
-# For a sensor that measures the state: the measured components, and the mean (n,) and sigmas (t,) of the
-# state according to its first message.
+# Measured components of a sensor that measures the state, and the mean (n,) and sigmas (t,) of the state
+# according to its first message.
 Reference = tuple[Collection[str], Floats, Floats]
 PARTS, BROAD_RAD = 8, 0.45  # number of equally likely parts of an angle, and the sigma of each
 
@@ -30,7 +30,8 @@ def broad_priors(
 ) -> list[Stream]:
     """Make the priors of all runs, one stream for each of the equally likely parts of an angle.
 
-    A filter is linear in a heading only nearby, so an angle of the state is divided into PARTS.
+    A filter is linear only in a small interval of a heading, so an angle of the state is divided into
+    PARTS.
 
     Args:
         model: model of the state.

@@ -26,7 +26,7 @@ from fuselog.replay.inference.run.timing import last_of_stamps, select_events, s
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of a map in all runs: keys, run * 2^32 + number, sorted; their positions (n, d)."""
+    """Points of a map in all runs: sorted keys, run * 2^32 + number, and positions (n, d)."""
 
     keys: Integers
     places: Floats
@@ -50,7 +50,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
 
     Args:
         ragged: messages of the map's topic, in all runs.
-        asked: the map as the model describes it.
+        asked: description of the map in the model.
 
     Raises BadInput if the points lack a component.
     """
@@ -62,7 +62,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
 
 
 class Context(NamedTuple):
-    """Data that messages refer to: each map's points, by its topic, and the origins of the planes.
+    """Data to which messages refer: points of maps, by topic, and origins of tangent planes.
 
     The origins (runs, 3) are latitude, longitude and altitude; None if no fix needs them.
     """
@@ -85,7 +85,7 @@ def data_columns(bound_model: BoundModel) -> tuple[int, int]:
 def events_of(
     bound_model: BoundModel, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """Return the result of `filter_events`, which may be known from an earlier replay of the block.
+    """Return the result of `filter_events`, which may be cached from an earlier replay of the block.
 
     Args:
         bound_model, found, block, context, settings: as for `filter_events`.
@@ -115,12 +115,12 @@ def filter_events(
         settings: (1 + sensors, fields); see `settings_of`.
 
     Returns:
-        The events, and which messages (n,) of the block are skipped because they lack a covariance.
+        The events, and whether each message (n,) of the block is skipped because it lacks a covariance.
     """
     merged, control = block.events, bound_model.model.control
     width, start = data_columns(bound_model)
     uses: list[tuple[str, Table]] = []
-    sampled: list[int] = []  # columns of samples, which do not hold until the next one
+    sampled: list[int] = []  # columns of samples, which do not apply until the next sample
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
         replaced = {name for each, _ in found.fallbacks for name in each.components}
@@ -158,7 +158,7 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """Messages of one topic: data (n, width), source, reference, and whether a covariance is missing."""
+    """Messages of one topic: data (n, width), source, reference, and marks of missing covariances."""
 
     data: Floats
     source: Integers
@@ -167,9 +167,9 @@ class Table(NamedTuple):
 
 
 def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
-    """Convert a topic's messages to a further sensor's measurements, with indices among all events.
+    """Convert the messages of a topic to measurements of a further sensor, with indices of events.
 
-    Messages that the sensor does not measure anything from are left out.
+    Messages without a measurement for the sensor are left out.
     """
     before = list(block.streams).index(name)
     begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
@@ -183,7 +183,7 @@ def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple
 
 
 def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents]]) -> FilterEvents:
-    """Insert further events after those at the given indices."""
+    """Insert further events after the events at the given indices."""
     places, others = zip(*again, strict=True)
     order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
     offsets, *columns = zip(events, *others, strict=True)
@@ -221,8 +221,8 @@ def sensor_table(
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
-        ragged: its messages in all runs.
+        number: index of the sensor.
+        ragged: messages of the sensor in all runs.
         context: maps and origins.
         settings: (1 + sensors, fields); see `settings_of`.
 
@@ -272,11 +272,11 @@ def sensor_table(
 
 
 def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:
-    """Compute the variances that a sensor assigns to messages without a covariance; NaN if it has none.
+    """Compute the variances of a sensor for messages without a covariance; NaN if there are none.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        number: number of the sensor among these.
+        number: index of the sensor.
         settings: (1 + sensors, fields); see `settings_of`.
     """
     sensor = bound_model.sensors[number]
@@ -321,7 +321,7 @@ def _field(stream: Stream, name: str, size: int) -> Floats:
 
 
 def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int) -> Floats:
-    """Call a model's own function on a topic; raise BadInput if its array has another shape."""
+    """Call the `read` function of a model on a topic; raise BadInput if its array has a wrong shape."""
     if not len(ragged):  # the width of vectors is unknown here
         return np.empty((0, components))
     numbers = np.asarray(read(ragged.stream), float)
@@ -361,7 +361,7 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 def passed_over(
     name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
-    """Report messages that were skipped because they lack a covariance; empty if no topic can.
+    """Report messages that were skipped because they lack a covariance; empty if none can lack it.
 
     Args:
         name: name of the filter.

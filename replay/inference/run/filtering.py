@@ -1,4 +1,4 @@
-"""A filter in a replay: one model with one method, bound to the topics of a log."""
+"""Filter in a replay: one model and one method, bound to the topics of a log."""
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ from fuselog.replay.inference.run.timing import (
 )
 from fuselog.replay.inference.sampling.samplers import Sampler
 
-# The history of a smoother for its backward pass, or of a filter for reprocessing; the type is its own.
+# History of a smoother for its backward pass, or of a filter for reprocessing, each of its own type.
 Kept = Any  # type: ignore[explicit-any]
 
 
@@ -84,10 +84,10 @@ class FilterState(NamedTuple):
 
     Attributes:
         carried: see `recursion.RecursionState`.
-        context: maps and origins that messages refer to.
+        context: maps and origins to which messages refer.
         generators: random generators of samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
-        unsettled: events that wait for messages that arrive later but were measured earlier.
+        unsettled: events that wait for messages that may arrive later but were measured earlier.
         kept: history of a smoother for its backward pass, or of a filter for reprocessing.
         next_output: (runs,) number of the next additional estimate.
     """
@@ -136,14 +136,14 @@ def samplers_of(
 
 @dataclass(frozen=True)
 class Filter:
-    """A bound filter, with the `start`, `run` and `finish` of an `estimator.Recursive`.
+    """Bound filter, with the functions `start`, `run` and `finish` of an `estimator.Recursive`.
 
     Attributes:
-        name: its output topics begin with this, after `/estimates/`.
+        name: part of the names of its output topics after `/estimates/`.
         found: its topics.
         bound_model, method, parameters: the bound model, the method and its parameters.
         settings: (1 + sensors, fields); see `settings_of`.
-        samplers: one for each of `Steps.sampled`.
+        samplers: one sampler for each of `Steps.sampled`.
         each_run: (runs, 1 + sensors, fields), the settings if each run has its own.
     """
 
@@ -164,7 +164,7 @@ class Filter:
         return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior; runs with an invalid prior do not start."""
+        """Make the initial state of every run from its prior; a run without a valid one cannot start."""
         model = self.bound_model.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
@@ -178,7 +178,7 @@ class Filter:
             for topic, asked in maps.items()
         }
         waiting = None
-        if model.control is not None and model.control.interpolated:  # control from the start on
+        if model.control is not None and model.control.interpolated:  # the control at the start
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.bound_model)
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
         context = Context(points, self.origins(static, len(mean)))
@@ -195,7 +195,7 @@ class Filter:
         return self.steps.form
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
-        """Return the origins of the planes (runs, 3), as stated or from the first fixes."""
+        """Return the origins of tangent planes (runs, 3), as stated or from the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
@@ -219,7 +219,7 @@ class Filter:
     def ready(
         self, state: FilterState, events: FilterEvents, *, is_end: bool
     ) -> tuple[FilterState, FilterEvents]:
-        """Return the events that need not wait for others, and a state that keeps the waiting ones."""
+        """Return the events that need not wait, and a state that keeps the waiting events."""
         next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
@@ -285,7 +285,7 @@ class Filter:
 
     @cached_property
     def beside_settings(self) -> Hashable:
-        """All that defines the filter except settings that only the loop over the runs reads."""
+        """Definition of the filter, except settings that only the loop over the runs reads."""
         names = {*number_fields(self.bound_model.model.parameters)} - {"gate_probability"} | {
             "of_topics"
         }
@@ -306,7 +306,7 @@ class Filter:
 
     @property
     def why_in_sequence(self) -> str:
-        """Reason why the filter needs its messages in order; empty if it can reprocess late ones."""
+        """Reason why the filter needs its messages in order; empty if it can reprocess messages."""
         control = self.bound_model.model.control
         if self.parameters.every_s is not None:
             return "it does not support estimates between messages (every_s, --every)"
@@ -363,7 +363,7 @@ class Filter:
     def parts(
         self, generators: tuple[Samples, ...], events: FilterEvents
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Yield slices of runs (None for all) with functions that make a core's working memory."""
+        """Yield slices of runs (None for all), and functions that make the working memory of a core."""
         if not self.is_random:
             yield None, self.scratch
             return
@@ -377,14 +377,14 @@ class Filter:
 
     @cached_property
     def scratch(self) -> Scratch:
-        """Working memory of each core, with samples that serve every event."""
+        """Working memory of each core, with samples that are used for every event."""
         [(_, sets)] = sample_sets(self.samplers, (), np.zeros(1, np.int64))
         return Scratch(partial(self.steps.memory, sets))
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[EstimatesToFill, InnovationRows]:
-        """Make arrays of estimates and innovations to fill; see `recursion.no_results`."""
+        """Allocate arrays for estimates and innovations; see `recursion.no_results`."""
         return no_results(due, recorded, self.bound_model.model, innovation_size)
 
     @cached_property
@@ -401,15 +401,15 @@ class Filter:
 
     @property
     def truth(self) -> str:
-        """Topic that the estimates are compared with."""
+        """Topic with which the estimates are compared."""
         return self.found.truth
 
     def output_streams(self, estimates: EstimatesToFill, offsets: Integers, /) -> list[Ragged]:
-        """Make the streams of estimates; run r owns offsets[r]:offsets[r + 1]."""
+        """Make the streams of estimates; rows offsets[r]:offsets[r + 1] belong to run r."""
         return [self.states(estimates, offsets)]
 
     def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
-        """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
+        """Make the stream of states; rows offsets[r]:offsets[r + 1] belong to run r."""
         model, (_, time_ns, mean, covariance) = self.bound_model.model, estimates
         columns = {
             "sensor_time_ns": time_ns,
@@ -431,12 +431,12 @@ class Filter:
         return innovation_components(self.bound_model.sensors)
 
     def innovations(self, innovations: InnovationRows, offsets: Integers) -> Ragged:
-        """Make the stream of innovations, for a filter with sensors; see `states`."""
+        """Make the stream of innovations of a filter with sensors; see `states`."""
         topic = f"/estimates/{self.name}"
         return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)
 
 
 @lru_cache(maxsize=64)
 def _nis_bounds(probability: float, components: int) -> Floats:
-    """Compute the quantiles (components + 1,) of the NIS; without components it is unbounded."""
+    """Compute the quantiles (components + 1,) of the NIS; infinity for zero components."""
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))

@@ -1,4 +1,4 @@
-"""The first messages of every run, and what they determine."""
+"""First messages of every run, and states that they determine."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from fuselog.replay.engine.vectors.tangent import manifold_blocks, named_now, ta
 from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.start import Start
 
-WIDER = 30.0  # times a message's standard deviation: such a prior has a thousandth of its weight
+WIDER = 30.0  # times a message's sigma: such a prior has a thousandth of its weight
 
 
 class Begun(NamedTuple):
-    """Starts of the runs, to be filled: stamps (runs,), FOREVER_NS if unknown, means and covariances."""
+    """Starts of runs, to be filled: stamps (runs,), FOREVER_NS if unknown, means and covariances."""
 
     time_ns: Integers
     mean: Floats
@@ -26,7 +26,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """A sentence to report, its stamps (runs,), and the runs to which it applies (runs,)."""
+    """Sentence to report, its stamps (runs,), and the runs to which it applies (runs,)."""
 
     text: str
     time_ns: Integers
@@ -57,11 +57,11 @@ def unknown(state: Components, start: Start | None) -> tuple[Floats, Floats]:
 
 
 def state_by_message(bound_model: BoundModel, number: int, data: Floats) -> tuple[Floats, Floats]:
-    """Compute the mean (n,) and the much larger sigmas (t,) of a state that one message measures.
+    """Compute the mean (n,) and wide sigmas (t,) of a state that one message measures.
 
     Args:
         bound_model: the bound model with its sensors.
-        number: number of the sensor.
+        number: index of the sensor.
         data: measurement and noise of the message, as a row of `sensor_table`.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]
@@ -81,7 +81,7 @@ def state_by_message(bound_model: BoundModel, number: int, data: Floats) -> tupl
 def first_of_runs(
     ragged: Ragged, clock: Clock, usable: Booleans | None
 ) -> tuple[Integers, Booleans, Integers]:
-    """Find the first usable message of every run (runs,): its stamp, whether there is one, and its row.
+    """Find stamp, existence and row (runs,) of the first usable message of every run.
 
     Args:
         ragged: messages of a topic, in all runs.
@@ -105,7 +105,7 @@ def heads_of_runs(ragged: Ragged, count: int) -> Ragged:
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """Assign the messages of a stream to those runs that have one.
+    """Assign the messages of a stream to the runs that have a message.
 
     Args:
         stream: the messages, in the order of their runs.

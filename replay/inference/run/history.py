@@ -20,10 +20,10 @@ Structure = tuple[tuple[str, "int | Structure"], ...]
 
 
 class KeptMessages(NamedTuple):
-    """Messages in order, and the belief after each; the first axis is run and message.
+    """Messages in order, and the belief after each; the first axis is the message, run by run.
 
     Attributes:
-        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last as uint32.
+        time_ns, source, data, target_id: see `recursion.FilterEvents`; `target_id` is stored as uint32.
         position: position in the file.
         after: state after the message.
         has_innovation: whether the message was an update and therefore has an innovation.
@@ -47,8 +47,8 @@ class History(NamedTuple):
 
     Attributes:
         start_ns: (runs,) stamps of the priors.
-        first, counts: (runs,) rows of each run: run r has C rows of `kept`, of which `counts[r]` are
-        filled, starting at row r C + first[r]. The messages after the first filled row can be
+        first, counts: (runs,) rows of each run: run r has C rows of `kept`; `counts[r]` of them are
+            filled, starting at row r C + first[r]. The messages after the first filled row can be
         reprocessed from the state stored in it.
         kept: (runs C) the messages.
     """
@@ -76,7 +76,7 @@ class History(NamedTuple):
         return np.append(0, np.cumsum(self.counts))
 
     def with_room(self, capacity: int) -> "History":
-        """Copy the history to one with `capacity` rows per run, of which the first are filled."""
+        """Copy the history to `capacity` rows per run; the filled rows come first."""
         rows, runs = self.rows, np.arange(len(self.first))
         places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
 
@@ -122,7 +122,7 @@ def no_history(bound_model: BoundModel, carried: RecursionState) -> History:
 
 
 def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """Count the most messages of a run within any window, among the stored and the new ones.
+    """Count the most messages of any run within a window, among stored and new messages.
 
     Args:
         history: history of all runs.
@@ -139,7 +139,7 @@ def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
 
 
 def structure_of(rows: Columns) -> Structure:
-    """Describe a possibly nested NamedTuple of arrays by its names and numbers of axes."""
+    """Describe a NamedTuple of arrays, possibly nested, by its names and numbers of axes."""
     return tuple(
         (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
         for name, column in zip(rows._fields, rows, strict=True)

@@ -1,9 +1,9 @@
-"""Initialization of a filter in a log without a prior, and of the origin of its tangent plane.
+"""Initialization of a filter in a log without a prior, and of its tangent plane.
 
 Such a log gets a prior at the first message that measures the state; see `start.Start`. The prior is
 much wider than the message, so that the message itself, which is also processed as a measurement,
-determines the estimate. If no channel states the origin of the plane, it is the first geodetic fix. All
-such decisions are reported on the topic `started`.
+determines the estimate. If no channel states the origin of the tangent plane, the first geodetic fix is
+used. All such decisions are reported on the topic `started`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,8 +42,8 @@ from fuselog.replay.inference.run.recursion import CONTROL, FilterEvents
 from fuselog.replay.inference.run.timing import compensate_delays, delays_of
 
 FOREVER_NS = np.iinfo(np.int64).max
-HEAD = 16  # first messages of a run that are tried first, one of which is usually usable
-CERTAIN = 1e-6  # times the standard deviations of a start, for an estimate that defines its own frame
+HEAD = 16  # number of messages of a run that are tried first; one of them is usually usable
+CERTAIN = 1e-6  # factor on standard deviations of a start that defines its own frame
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class Initializer:
     """Search for the start of a filter in the first messages of a log.
 
     Attributes:
-        name: its output topics begin with this, after `/estimates/`.
+        name: part of the names of its output topics after `/estimates/`.
         found: its topics.
         bound_model: the bound model, with the sensors of the log.
         settings: (1 + sensors, fields), numbers of motion and sensors.
-        assumed: parameters among them that the log does not state.
+        assumed: parameters of motion and sensors that the log does not state.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Initializer:
 
     @property
     def initialization(self) -> Initialization | None:
-        """How the start is found; None if the log states everything."""
+        """Method of finding the start; None if the log states everything."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
@@ -83,7 +83,7 @@ class Initializer:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """The sensors that measure the state itself, with their numbers."""
+        """Sensors that measure the state itself, with their indices."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
@@ -92,7 +92,7 @@ class Initializer:
 
     @property
     def _starting(self) -> list[Topic]:
-        """The topics whose first message determines the start."""
+        """Topics whose first message determines the start."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.fallbacks)]
         if self.bound_model.model.finds_start:
@@ -102,7 +102,7 @@ class Initializer:
 
     @property
     def _aligns(self) -> bool:
-        """Whether fixes must determine the whole state, and can."""
+        """Whether several fixes must determine the whole state, and are able to."""
         model = self.bound_model.model
         kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
         can_align = bool(model.start and model.start.align)
@@ -212,7 +212,7 @@ class Initializer:
         return of_runs(stream, has_begun), facts
 
     def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
-        """Report which components the fixes did not determine, for runs that start without alignment."""
+        """Report the components that fixes did not determine, for runs that start without alignment."""
         _, sensor, _ = self._measuring[0]
         measured = sensor.measured
         names = ", ".join(name for name in self.bound_model.model.state if name not in measured)
@@ -223,7 +223,7 @@ class Initializer:
         return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
     def _assumption(self, name: str, number: float) -> str:
-        """Describe an assumed parameter, with its meaning if the model gives one."""
+        """Describe an assumed parameter, with its meaning if the model documents it."""
         meaning = meanings(self.bound_model.model.parameters).get(name, "")
         sentence = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{sentence} ({meaning.rstrip('.')})" if meaning else sentence
@@ -278,7 +278,7 @@ class Initializer:
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Settings]:
-        """Return first messages and maps, by the model's names of their topics, and the parameters."""
+        """Return first messages and maps, by the names of topics in the model, and the parameters."""
         model, control = self.bound_model.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -342,7 +342,7 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Start runs just after first fixes that, with the path between them, determine the state.
+        """Start runs just after the first fixes that determine the state, with the path between them.
 
         If several topics serve the same sensor, the fixes of the first topic are used.
         """
@@ -374,7 +374,7 @@ class Initializer:
     def _align(
         self, events: FilterEvents, run: int, bound_model: BoundModel
     ) -> tuple[int, Floats, Floats] | None:
-        """Align a run: return stamp, mean and covariance at one of its first fixes, or None."""
+        """Align a run; return stamp, mean and covariance at one of its first fixes, or None."""
         model = bound_model.model
         assert model.start is not None
         assert model.start.align is not None
@@ -410,7 +410,7 @@ class Initializer:
         return None
 
     def _parameters(self) -> Settings:
-        """Return the parameters; parameters of topics are those of the first topic of each sensor."""
+        """Return the parameters; for each sensor, use those of its first topic."""
         model = self.bound_model.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
         for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):

@@ -1,7 +1,7 @@
 """Loops over the events of a run, shared by filters, trackers and networks.
 
 Events may be messages, scans of detections or activities of nodes. All have `offsets` (runs + 1,) and
-`time_ns` (n,), and are the field `events` of a recursion's inputs.
+`time_ns` (n,); they are the field `events` in the inputs of a recursion.
 """
 
 from typing import Protocol
@@ -11,7 +11,7 @@ from fuselog.replay.engine.streams.results import ALL_WELL
 
 
 class OnEvent(Protocol):
-    """Function that is called for an event of a run; it returns ALL_WELL or the number of the failure.
+    """Function that is called for an event of a run; it returns ALL_WELL or the number of a failure.
 
     Inputs, state, results and memory are those of the recursion; see `over_events`.
     """
@@ -29,7 +29,7 @@ class OnEvent(Protocol):
 
 
 class OnStamp(Protocol):
-    """Function that moves the state of a run through all events of a stamp.
+    """Function that updates the state of a run by all events of a stamp.
 
     It returns whether the run continues.
     """
@@ -48,7 +48,7 @@ class OnStamp(Protocol):
 
 
 class Follow(Protocol):
-    """Function that moves the state of a run through all its events and fills the results."""
+    """Function that updates the state of a run by all its events and fills the results."""
 
     def __call__(
         self,
@@ -67,11 +67,11 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
     The run ends when its `state.failure` is not ALL_WELL, or after its last event.
 
     Args:
-        process: `process(run, event, inputs, state, results, memory)` moves the state through an event
-            and returns ALL_WELL or the number of the failure. Negative numbers do not end the run, but
+        process: `process(run, event, inputs, state, results, memory)` updates the state by an event and
+            returns ALL_WELL or the number of a failure. A negative number does not end the run, but
             nothing is recorded for the event.
-        record: called in the same way after ALL_WELL; it fills the results that are requested.
-        fails: whether a run may fail; otherwise the state needs no `failure`, and all events are
+        record: function that is called in the same way after ALL_WELL; it fills the requested results.
+        fails: whether a run may fail; if not, the state needs no `failure`, and all events are
             processed.
 
     Returns:
@@ -102,7 +102,7 @@ def over_stamps(process: OnStamp) -> Follow:
     """Make the loop over the events of one run that processes all events of a stamp together.
 
     Args:
-        process: `process(run, begin, end, inputs, state, results, memory)` moves the state through the
+        process: `process(run, begin, end, inputs, state, results, memory)` updates the state by the
             events from `begin` to `end` and returns whether the run continues.
 
     Returns:

@@ -1,9 +1,9 @@
-"""Reprocessing of out-of-sequence messages: the final belief equals that of processing in order.
+"""Reprocessing of out-of-sequence messages, with the same final belief as processing in order.
 
 For every message within a window, the filter stores the message, the state after it, and its innovation.
 An out-of-sequence message is inserted at its stamp and position in the file, and all messages after it
-are processed again. Estimates that were already issued stay as they were; an innovation is issued once
-no message can change it.
+are processed again. Estimates that were already output are not changed; an innovation is output once no
+message can change it.
 """
 
 from collections.abc import Mapping
@@ -58,7 +58,7 @@ class LateState(NamedTuple):
 
     Attributes:
         carried: state after all messages so far.
-        failure: its failures.
+        failure: failures of the runs.
         history: the stored messages.
         window_ns: largest delay of a message that is reprocessed.
         repeated: (n,) number of updates that each event caused to be repeated.
@@ -89,7 +89,7 @@ def reprocessing(
 ) -> Follow:
     """Make the loop over the events of one run in order of arrival; see `recursion.recursion`.
 
-    `structure` is that of `KeptMessages`.
+    `structure` is the structure of `KeptMessages`.
     """
     write = writing_estimates(estimate)
     copy, restore = copying_rows(structure), copying_rows(dict(structure)["after"])
@@ -118,7 +118,7 @@ def reprocessing(
     def process_again(
         run: int, row: int, inputs: RunInputs, state: LateState, memory: CoreMemory
     ) -> int:
-        """Predict to a stored message and update by it; return the failure or ALL_WELL."""
+        """Predict to a stored message and update by it; return a failure or ALL_WELL."""
         events, carried, kept, at = inputs.events, state.carried, state.history.kept, state.row
         stored = FilterEvents(
             events.offsets,
@@ -219,14 +219,14 @@ def last_row(run: int, history: History) -> int:
 # As an estimator
 
 
-# A `filtering.Filter` and its state; this module cannot import that one.
+# A `filtering.Filter` and its state; this module cannot import `filtering`.
 AnyFilter = Any  # type: ignore[explicit-any]
 AnyFilterState = Any  # type: ignore[explicit-any]
 
 
 @dataclass(frozen=True)
 class OutOfSequenceFilter:
-    """A filter that reprocesses messages up to `window_ns` late; its methods are those of `Filter`.
+    """Filter that reprocesses messages with delays of up to `window_ns`; same methods as `Filter`.
 
     `inner` is a `filtering.Filter`, and the states are of its type.
     """
@@ -235,7 +235,7 @@ class OutOfSequenceFilter:
     window_ns: int
 
     def start(self, static: Mapping[str, Ragged]) -> AnyFilterState:
-        """Make the state at every run's prior."""
+        """Make the initial state of every run from its prior."""
         state = self.inner.start(static)
         return state._replace(kept=no_history(self.inner.bound_model, state.carried))
 
@@ -277,7 +277,7 @@ class OutOfSequenceFilter:
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: AnyFilterState) -> list[Ragged]:
-        """Return the innovations that could still have changed."""
+        """Return the innovations that further messages could have changed."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
@@ -290,12 +290,12 @@ class OutOfSequenceFilter:
 
 
 def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
-    """Report the out-of-sequence messages, and how many updates each caused to be repeated.
+    """Report the out-of-sequence messages, with the number of updates that each caused to repeat.
 
     Args:
         name: name of the estimator.
         events: the n events of the block.
-        repeated: (n,) zero for messages that were not late.
+        repeated: (n,) number of updates; zero for messages in order.
     """
     is_late = repeated > 0
     stream = make_stream(
@@ -311,7 +311,7 @@ def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
     """Set the log times of estimates to the arrival times of the events that requested them.
 
-    Each run has one estimate for each such event after its prior, or only for the first of these.
+    Each run has one estimate for each of these events after its prior, or for only the first ones.
 
     Args:
         estimates: estimates of the filter.

@@ -1,4 +1,4 @@
-"""Descriptions of what an estimator reads: numbers of topics, and parameters with their roles."""
+"""Descriptions of the inputs of an estimator: numbers of topics, and parameters with their roles."""
 
 from functools import partial
 
@@ -18,11 +18,11 @@ from fuselog.replay.inference.model.settings import TracedParameters, reading_se
 from fuselog.replay.inference.model.validation import trial_state
 from fuselog.replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
 
-STEP = 1e-3  # change of parameters and controls by which their effects are compared
+STEP = 1e-3  # change of parameters and controls for comparing their effects
 
 
 def reading_of(bound_model: BoundModel, found: Found, settings: Floats) -> Reading:
-    """Describe what an estimator reads.
+    """Describe the inputs of an estimator.
 
     Args:
         bound_model: the bound model before tracing, with the sensors of the log.
@@ -71,7 +71,7 @@ def reading_of(bound_model: BoundModel, found: Found, settings: Floats) -> Readi
 
 
 def _measured(sensor: Sensor, stream: Stream) -> Floats:
-    """Read a sensor's measurements (n, m); geodetic fixes are relative to the first one."""
+    """Read the measurements (n, m) of a sensor; geodetic fixes are relative to the first one."""
     ragged = gather([stream])
     if stream.schema.full_name == GEODETIC:
         ragged = in_plane(ragged, origins_of(gather([stream.take(slice(0, 1))])))
@@ -99,7 +99,7 @@ def _noises(bound_model: BoundModel, found: Found) -> dict[str, str]:
 
 
 def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
-    """List the parameters whose squares a variance is linear in."""
+    """List the parameters on whose squares a variance depends linearly."""
     traced, ones = TracedParameters(dict.fromkeys(names)), dict.fromkeys(names, 1.0)
     kind = settings_type(names)
     with np.errstate(all="ignore"):
@@ -116,7 +116,7 @@ def _squared(variances: OfParameters, names: tuple[str, ...]) -> list[str]:
 
 
 def _augmentable(bound_model: BoundModel, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """Return the parameters that can be estimated, with their kinds and the topics that read them."""
+    """Return the parameters that can be estimated, with their kinds and the topics that use them."""
     readers = _readers(bound_model, found)
     by_name = {
         name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
@@ -126,7 +126,7 @@ def _augmentable(bound_model: BoundModel, found: Found) -> dict[str, tuple[str, 
 
 
 def _calibration(bound_model: BoundModel, found: Found) -> dict[str, float]:
-    """Return the calibration parameters that are read here, with their useful standard deviations."""
+    """Return the calibration parameters that are used, with their useful standard deviations."""
     used = set().union(*(read for _, read in _readers(bound_model, found)))
     used |= {sensor.delay for sensor, _ in found.sensors}
     return {name: sigma for name, sigma in bound_model.model.calibration.items() if name in used}
@@ -205,7 +205,7 @@ def _own_errors(
 def _control_noise(
     bound_model: BoundModel, found: Found, settings: Floats, step_s: float
 ) -> dict[tuple[str, int], float]:
-    """Return the variances of the control's components, for messages that hold for `step_s`."""
+    """Return the variances of the control's components, for messages that apply for `step_s`."""
     variances = bound_model.motion.control_noise
     if variances is None:
         return {}

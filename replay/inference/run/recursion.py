@@ -1,8 +1,8 @@
-"""The recursion through the events of a run in time, common to all models and methods.
+"""Recursion through the events of a run in time, common to all models and methods.
 
 The recursion makes one prediction per distinct stamp and one update per message, in the given order; a
 control message changes the control of the next prediction. Messages before the time of the state are
-ignored. The run ends when its belief is no longer a Gaussian.
+ignored. The run ends when its belief becomes invalid.
 """
 
 import math
@@ -40,12 +40,12 @@ from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.settings import ReadSettings
 from fuselog.replay.inference.run.loops import Follow, over_events
 
-CONTROL = -1  # source of an event; sensors count from zero, and NOTHING is only a time
+CONTROL = -1  # source of an event; sensors count from zero, and NOTHING means only a time
 NOTHING = -2
 
 
 class FilterEvents(NamedTuple):
-    """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
+    """Events of all runs in order; events offsets[r]:offsets[r + 1] belong to run r.
 
     Attributes:
         offsets: (runs + 1,).
@@ -54,7 +54,7 @@ class FilterEvents(NamedTuple):
         data: (n, width) numbers of the message, see `update.message_layout`; with an interpolated
             control, the last columns are the control.
         wants_estimate: (n,) whether the event requests an estimate.
-        target_id: (n,) what the message refers to, 0 for nothing.
+        target_id: (n,) number of the target of the message, or 0.
         arrival: (n, 2) time of arrival, and position in the file; (n, 0) if events arrive in the order
             of their stamps.
     """
@@ -72,7 +72,7 @@ class RecursionState(NamedTuple):
     """State of the recursion between blocks; the first axis is the run.
 
     Attributes:
-        belief: the belief, of the method's own type.
+        belief: the belief, of a type that the method defines.
         control: (runs, controls) current control.
         time_ns: (runs,) time of the belief.
         accepted_ns: (runs, sensors) time of the last measurement that the gate accepted, or of the
@@ -88,7 +88,7 @@ class RecursionState(NamedTuple):
 
 
 class EstimateRows(NamedTuple):
-    """Estimates that the recursion fills; those of run r end before row `end[r]`."""
+    """Estimates that the recursion fills; the filled rows of run r end before row `end[r]`."""
 
     end: Integers
     time_ns: Integers
@@ -122,7 +122,7 @@ class RunInputs(NamedTuple):
 
 
 class RunResults(NamedTuple):
-    """Results of a recursion: the method's own estimates, and innovations."""
+    """Results of a recursion: estimates of a type that the method defines, and innovations."""
 
     estimates: EstimatesToFill
     innovations: InnovationRows
@@ -136,7 +136,7 @@ def recorded_innovations(
     Args:
         topic: topic of the estimator.
         components: names and kinds of the measured components.
-        truth: topic that the estimates are compared with.
+        truth: topic with which the estimates are compared.
         innovations: (n, ...) innovations of all runs, concatenated; see `filled`.
         offsets: (runs + 1,) first row of each run.
     """
@@ -161,15 +161,15 @@ ResultsType = TypeVar("ResultsType", bound=tuple[AnyArgument, ...])
 def no_results(
     due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[EstimateRows, InnovationRows]:
-    """Make empty results; run r owns the rows from due[r] and recorded[r] to those of the next run.
+    """Allocate results; the rows of run r begin at due[r] and recorded[r].
 
-    All columns share one array: with many arrays, the operating system maps every page separately, which
-    takes half as long as running a small filter.
+    All columns share one array: with many arrays, the operating system would map every page separately,
+    which takes half as long as running a small filter.
 
     Args:
         due: (runs + 1,) offsets of the estimates.
         recorded: (runs + 1,) offsets of the innovations.
-        model: model, for the sizes of its state and tangent space.
+        model: model, which has the sizes of state and tangent space.
         innovation_size: number of components that all sensors measure.
     """
     places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
@@ -202,7 +202,7 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     """Remove the rows of results that were not filled; return the results and their new offsets.
 
     Args:
-        results: estimates or innovations, with the `end` that each run reached.
+        results: estimates or innovations, with the `end` of each run's filled rows.
         offsets: (runs + 1,) first row of each run.
     """
     end, *columns = results
@@ -214,7 +214,7 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
 
 
 class ProcessEvent(Protocol):
-    """Function that predicts to an event of a run and updates by it; see `processing`."""
+    """Function that predicts a run to an event and updates by it; see `processing`."""
 
     def __call__(
         self,
@@ -281,7 +281,7 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
     ) -> bool:
         control, data = carried.control[run], inputs.events.data[event]
         first = len(data) - controls
-        if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
+        if interpolated and not np.isnan(control[0]):  # the control of the step is the mean of both ends
             for k in range(controls):
                 control[k] = 0.5 * (control[k] + data[first + k])
         interval = Interval(control, duration_s, settings_of(inputs.settings[run], 0), event)
@@ -295,9 +295,9 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Predict to one event and update by it; return the failure or ALL_WELL.
+        """Predict to one event and update by it; return a failure or ALL_WELL.
 
-        Return UNKNOWN in a gap of the control after which the filter continues.
+        In a gap of the control after which the filter continues, the result is UNKNOWN.
         """
         events, gates, innovations = inputs.events, inputs.gates, results.innovations
         source, data = events.source[event], events.data[event]
@@ -361,7 +361,7 @@ def recursion(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) 
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Write an estimate if the event requests one and is not before the state's time."""
+        """Write an estimate if the event requests one and is not older than the state."""
         time_ns = inputs.events.time_ns[event]
         if inputs.events.wants_estimate[event] and time_ns >= carried.time_ns[run]:
             return write(run, run, time_ns, carried.belief, results.estimates, memory)
@@ -371,9 +371,9 @@ def recursion(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) 
 
 
 def writing_estimates(estimate: EstimateRun) -> WriteEstimate:
-    """Make `write(run, row, time_ns, belief, estimates, memory)`, which writes a run's next estimate.
+    """Make `write(run, row, time_ns, belief, estimates, memory)`, which writes the next estimate.
 
-    The estimate is that of a row of the belief. The function returns the failure, see `fault_of`; an
+    The estimate is made from a row of the belief. The function returns a failure, see `fault_of`; an
     invalid estimate is not kept.
 
     Args:

@@ -1,4 +1,4 @@
-"""Samples of randomised filters: one random generator per run, one set per event."""
+"""Samples of randomised filters, with one random generator per run and one set per event."""
 
 from collections.abc import Iterator, Sequence
 
@@ -32,7 +32,7 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Generators, ...], offsets: Integers
 ) -> Iterator[tuple[RowSlice, tuple[SampleSets, ...]]]:
-    """Yield slices of runs with their samples; the largest random function limits the runs per slice.
+    """Yield slices of runs with their samples; the largest sampled function limits their size.
 
     Args:
         samplers: one for each sampled function.

@@ -11,11 +11,11 @@ from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.parameters import number_fields
 from fuselog.replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 
-EARLY = 1000  # output times: a prior that is older than this is taken to be from another time
+EARLY = 1000  # intervals of output: a prior that is older than this does not start the output times
 
 
 def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
-    """Return which events (n,) request an estimate: those of the control alone may not."""
+    """Test whether each event (n,) requests an estimate; events of only the control may not."""
     control = bound_model.model.control
     if control is None or control.estimates or not bound_model.sensors:
         return events.wants_estimate
@@ -23,7 +23,7 @@ def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
 
 
 def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
-    """Return which events (n,) are the last of a stamp that has a chosen event.
+    """Test whether each event (n,) is the last of a stamp that has a chosen event.
 
     Args:
         is_last: (n,) whether each event is the last of its stamp.
@@ -36,14 +36,14 @@ def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
 
 
 def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
-    """Compute the delays of stamps after the measurement, in ns, by source of an event.
+    """Compute the delays, from measurement to stamp in ns, by source of the event.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
         settings: (1 + sensors, fields); see `settings_of`.
 
     Returns:
-        (sensors + 2,) delays of the sensors, then 0 for NOTHING, then that of the CONTROL.
+        (sensors + 2,) delays of the sensors, then 0 for NOTHING, then the delay of CONTROL.
     """
     names, control = number_fields(bound_model.model.parameters), bound_model.model.control
     asked = [(number + 1, sensor.delay) for number, sensor in enumerate(bound_model.sensors)]
@@ -55,10 +55,10 @@ def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
 def compensate_delays(
     bound_model: BoundModel, events: FilterEvents, delays_ns: Integers, *, is_end: bool
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Move events to the times of measurement, in order; return them and the events that must wait.
+    """Move events to their times of measurement, in order; return ready and waiting events.
 
-    An event waits if it was measured less than the longest delay before a run's last stamp, because an
-    older one may still arrive; at the end, no event waits.
+    An event waits if it was measured less than the longest delay before the last stamp of its run,
+    because an earlier event may still arrive; at the end, no event waits.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -80,19 +80,19 @@ def compensate_delays(
 
 
 def last_of_stamps(events: FilterEvents) -> Booleans:
-    """Return whether the next event of the run has another stamp or arrival time."""
+    """Test whether the next event of the run has a different stamp or arrival time."""
     return last_of_equals(events.offsets, events.time_ns, *events.arrival.T[:1])
 
 
 def output_times(
     offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
 ) -> FilterEvents:
-    """Make events that are only times; run r owns offsets[r]:offsets[r + 1].
+    """Make events that are only times; events offsets[r]:offsets[r + 1] belong to run r.
 
     Args:
         offsets: (runs + 1,).
         time_ns: (n,) the times.
-        width: number of columns of the other events' data.
+        width: number of data columns of the other events.
         wants_estimate: whether each event requests an estimate.
     """
     count = len(time_ns)
@@ -102,7 +102,7 @@ def output_times(
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
-    """Merge two sequences of events by time, run by run; at equal stamps, the first goes first."""
+    """Merge two sequences of events by time, run by run; at equal stamps, the first comes first."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
@@ -113,7 +113,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
 
 
 def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
-    """Add arrivals to events if the other events have them: output times arrive at their stamps."""
+    """Add arrival times to events, equal to their stamps, if the other events have arrival times."""
     if events.arrival.shape[1] >= other.arrival.shape[1]:
         return events
     time_ns = events.time_ns
@@ -133,9 +133,9 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Replace the control's samples of one stamp by their mean, so that each of them counts.
+    """Replace control samples with the same stamp by their mean, so that all of them count.
 
-    A recorder may give two samples the same stamp; one of them would otherwise be used for no time.
+    A recorder may give two samples the same stamp; one of them would otherwise have no effect.
 
     Args:
         events: events in the order of their stamps.
@@ -158,13 +158,13 @@ def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
 def interpolate_control(
     events: FilterEvents, controls: int, gap_ns: float = np.inf
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Interpolate the control linearly at all events; return these and the events that must wait.
+    """Interpolate the control linearly at all events; return ready and waiting events.
 
-    Events after a run's last control message wait for the next one, together with that message. After a
-    message that is followed by a gap, the control is NaN up to and including the next message.
+    Events after a run's last control message wait for the next one, together with that message. In a
+    gap, the control is NaN after the last message before it, up to and including the next message.
 
     Args:
-        events: events in order; those of the control have it in their last columns.
+        events: events in order; control messages have the control in their last columns.
         controls: number of components of the control.
         gap_ns: longest time without messages of the control.
     """
@@ -198,7 +198,7 @@ def fill_control(bound_model: BoundModel, events: FilterEvents) -> FilterEvents:
 
 
 def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
-    """Hold the last control for events that wait for the next one at the end of a log, up to a gap.
+    """Keep the last control for events that still wait at the end of a log, up to a gap.
 
     Args:
         events: waiting events; the first one of a run is its last message of the control, if any.
@@ -221,16 +221,17 @@ def add_output_times(
 ) -> tuple[FilterEvents, Integers]:
     """Add events at regular output times, which request an estimate.
 
-    Output starts at the prior, or at the run's first event if that is more than EARLY intervals later.
+    Output starts at the prior, or at the first event of the run if it is more than EARLY intervals
+    later.
 
     Args:
         events: events in order.
         start_ns: (runs,) stamps of the priors.
         next_output: (runs,) number of the next output time.
-        every_ns: interval of output; the times are its multiples.
+        every_ns: interval of output; output times are multiples of it.
 
     Returns:
-        The events, and the next numbers (runs,).
+        The events, and the numbers (runs,) of the next output times.
     """
     times, runs, next_outputs = [], [], next_output.copy()
     for number, (begin, end) in enumerate(pairwise(events.offsets)):

@@ -1,4 +1,4 @@
-"""Cache of LCD sets on disk: each set is computed once, and damaged files are never used.
+"""Cache of LCD sets on disk; each set is computed only once, and damaged files are ignored.
 
 A file (see `fuselog.recorders.compiling.cache`) contains a NumPy npz archive whose members are named
 after their sets. Common sets ship with the package (see `sampling.ship`); others are stored in the
@@ -38,17 +38,18 @@ class SetName:
     seed: int = 0
 
     def __str__(self) -> str:
-        """Return the name in an archive; its version must change whenever the computed sets change."""
+        """Return the name in an archive; the version in it must change if the computed sets change."""
         kind = "symmetric" if self.symmetric else "free"
         return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
 
 
 def cached_set(name: SetName, report: Report = silent) -> Array:
-    """Return one set (count, dimension), from the shipped file, the user's cache, or a new computation.
+    """Return one set (count, dimension) from the shipped file or the user's cache, or compute it.
 
     Args:
         name: the set.
-        report: called with messages if the set is computed, on the progress, and if it cannot be stored.
+        report: function that is called with messages about the computation of the set, and if it cannot
+            be stored.
 
     Raises:
         BadInput: no such set exists, see `check_count`.
@@ -74,7 +75,7 @@ def cached_set(name: SetName, report: Report = silent) -> Array:
 
 
 def compute_set(name: SetName, report: Report = silent) -> Array:
-    """Compute one set; the same name gives the same bytes on one machine."""
+    """Compute one set; on one machine, the result for a name is always the same."""
     generator = np.random.default_rng(name.seed)
     return moment_corrected(
         lcd_samples(name.dimension, name.count, generator, symmetric=name.symmetric, report=report)
@@ -92,7 +93,7 @@ def read_set(source: Path | Traversable, name: SetName) -> Array | None:
 
 
 def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:
-    """Write sets to one file, which appears completely or not at all; raise BadInput if this fails."""
+    """Write sets to one file, completely or not at all; raise BadInput if this fails."""
     archive = io.BytesIO()
     members = {str(name): points for name, points in sets.items()}
     np.savez(archive, **members)  # type: ignore[arg-type]

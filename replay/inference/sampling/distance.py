@@ -66,7 +66,7 @@ def lcd_distance(points: Array, weights: Array | None = None) -> float:
 
 
 def lcd_distance_and_gradient(points: Array, weights: Array) -> tuple[float, Array]:
-    """Compute D / pi^(N/2) and its gradient (L, N) by the points (L, N), without checks."""
+    """Compute D / pi^(N/2) and its gradient (L, N) with respect to the points, without checks."""
     rates, factors, constant = _quadrature(points.shape[1])
     decays = np.expm1(-np.multiply.outer(np.sum(points**2, axis=1), rates))
     pulls = 4 * np.vecdot(decays + 1, factors * rates)
@@ -93,8 +93,8 @@ def _quadrature(dimension: int) -> _Quadrature:
     )
 
 
-# The costly loops below do not sum over their innermost index, so a compiler can vectorise them without
-# reordering. With fastmath, the results depended on whether numba's cache was warm.
+# The expensive loops below do not sum over their innermost index, so a compiler can vectorise them
+# without reordering. With fastmath, the results depended on the state of numba's cache.
 
 
 def _sum_pairs(coordinates: Array, weights: Array, gradient: Array, work: Array) -> float:
@@ -127,7 +127,7 @@ _pair_sum = compiled(_sum_pairs)
 
 
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
-    """Fill e1 with E1(u) and e2 with E2(u) - 1: by the series, and by another method for u > 1."""
+    """Fill e1 with E1(u) and e2 with E2(u) - 1, by the series or, for u > 1, a continued fraction."""
     for j in range(len(u)):
         e2[j] = log(u[j])
     for j in range(len(u)):
@@ -144,7 +144,7 @@ def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
 
 
 def _exponential_integrals_beyond_one(u: float) -> tuple[float, float]:
-    """Compute E1(u) and E2(u) - 1 for u > 1, by evaluating the continued fraction of E1 from its end."""
+    """Compute E1(u) and E2(u) - 1 for u > 1 by the continued fraction of E1, evaluated from its end."""
     tail = 0.0
     for k in range(20 + int(80 / u), 0, -1):
         tail = k / (1 + k / (u + tail))

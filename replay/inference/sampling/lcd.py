@@ -1,4 +1,4 @@
-"""LCD sampling: equally weighted samples of N(0, I) that are as close to it as possible.
+"""LCD sampling: equally weighted samples that are as close to N(0, I) as possible.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V.A. The paper does not mention that the optimum's covariance is too small (eigenvalues of 0.82
@@ -19,7 +19,7 @@ Report = Callable[[str], object]
 
 STARTS = 8
 OBJECTIVE_SCALE = 1000.0
-# D is flat around its optimum: stop only when rounding stops the line search.
+# D is flat around its optimum, so stop only when rounding stops the line search.
 OPTIMISER = {"ftol": 1e-15, "gtol": 1e-9, "maxcor": 20, "maxiter": 10**6, "maxfun": 10**6}
 
 
@@ -36,7 +36,7 @@ def lcd_samples(
     starts: int = STARTS,
     report: Report = silent,
 ) -> Array:
-    """Compute the sample set (count, dimension) with the smallest D of several local optima.
+    """Compute the sample set (count, dimension) with the smallest D among several local optima.
 
     The set is not moment-corrected.
 
@@ -44,8 +44,8 @@ def lcd_samples(
         dimension: N.
         count: L.
         generator: draws the starts from N(0, I); the optimum and its rotation depend on it.
-        symmetric: whether the set contains the mirror image of every sample at the origin; with an odd
-            count, one sample is at the origin.
+        symmetric: whether the set contains the negative of every sample; with an odd count, one sample
+            is at the origin.
         starts: number of local optima to find.
         report: called with a message before each start.
 
@@ -74,7 +74,7 @@ def lcd_samples(
     for start in range(starts):
         report(f"{count} samples in {dimension} dimensions: start {start + 1} of {starts}")
         begin = generator.standard_normal(free * dimension)
-        with threadpool_limits(1):  # for products this small, a second core would only spin
+        with threadpool_limits(1):  # for such small products, a second core would only wait
             optima.append(minimize(objective, begin, jac=True, method="L-BFGS-B", options=OPTIMISER))
     found: Array = min(optima, key=lambda optimum: optimum.fun).x
     return whole(found)
@@ -94,7 +94,7 @@ def check_count(dimension: int, count: int, symmetric: bool) -> None:
 
 
 def moment_corrected(points: Array) -> Array:
-    """Shift the set (L, N) to mean 0, and multiply it by C^(-1/2) to get covariance I.
+    """Shift the set (L, N) to mean 0, and multiply it by C^(-1/2), which results in covariance I.
 
     Raises:
         BadInput: the set's covariance is singular.

@@ -1,4 +1,4 @@
-"""Names of samplings, as on a command line, and their meaning.
+"""Names of samplings, as on a command line, and their parsing.
 
 ukf  ukf:kappa=0              unscented
 gf-25                         25 Gaussian-filter points on each axis
@@ -41,7 +41,7 @@ PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-
 
 
 class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
-    """A way to sample N(0, I) in any dimension; `str` returns its name."""
+    """Method of sampling N(0, I) in any dimension; `str` returns its name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     family: ClassVar[str]
@@ -62,7 +62,7 @@ class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
     def _at(self, dimension: int, report: Report, /) -> Sampler: ...
 
     def __str__(self) -> str:
-        """Return the name, without options that have their default."""
+        """Return the name, without options that have their default values."""
         number = "" if self.number is None else f"-{getattr(self, self.number)}"
         options = [
             f":{key}" if value is True else f":{key}={value}"
@@ -83,7 +83,7 @@ class Unscented(Sampling):  # type: ignore[explicit-any]
 
 
 class GaussianFilter(Sampling):  # type: ignore[explicit-any]
-    """Points on the axes only, `per_axis` on each."""
+    """Points on the axes only, with `per_axis` points on each."""
 
     family = "gf"
     number = "per_axis"
@@ -105,7 +105,7 @@ class RandomisedUnscented(Sampling):  # type: ignore[explicit-any]
 
 
 class SmartSampling(Sampling):  # type: ignore[explicit-any]
-    """LCD samples of the S2KF; rotation 0 leaves the set as it was found."""
+    """LCD samples of the S2KF; with rotation 0, the set is not rotated."""
 
     family = "s2kf"
     number = "count"

@@ -1,4 +1,4 @@
-"""Systematic resampling: draws as many particles as before, each in proportion to its weight.
+"""Systematic resampling of the same number of particles, each in proportion to its weight.
 
 Kitagawa, Journal of Computational and Graphical Statistics 5(1), 1996.
 """
@@ -10,9 +10,9 @@ def choose_systematically(weights: Floats, start: float, chosen: Integers) -> No
     """Fill `chosen` (N,), in order, with the indices of the particles at the positions (i + start) / N.
 
     Args:
-        weights: (N,), with sum 1; particle k covers the positions from the sum of the weights before it,
-            inclusive, to that sum plus its own weight.
-        start: offset in [0, 1), the same for all.
+        weights: (N,), with sum 1; particle k covers the interval of positions from the sum of the
+            weights before it (inclusive) to that sum plus its weight.
+        start: offset in [0, 1), the same for all positions.
         chosen: (N,), filled with indices of particles.
     """
     count = len(weights)

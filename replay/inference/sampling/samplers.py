@@ -1,4 +1,4 @@
-"""Samplers of N(0, I), with the interface that filters use.
+"""Samplers of N(0, I), with a common interface for filters.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section I.B; the randomised set is that of Dunik, Straka and Simandl, "The Development of a Randomised
@@ -28,12 +28,12 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler for one dimension.
+    """Sampler for one dimension.
 
     `draw(generator, batch)` returns points (*batch, count, dimension) and weights (*batch, count).
     Unless `redrawn`, they are read-only views of one set and the generator is not used. Consecutive
-    batches have the same numbers as one batch of their total size, so that a log can be divided into
-    blocks anywhere.
+    batches have the same numbers as one batch of their total size, so a log can be divided into blocks
+    anywhere.
     """
 
     dimension: int
@@ -78,9 +78,10 @@ def unscented(dimension: int, kappa: float = 0.5) -> Samples:
 def axis_points(dimension: int, per_axis: int) -> Samples:
     """Return the Gaussian filter's set: `per_axis` points on each axis, with equal weights.
 
-    On an axis they are the medians of D slices of equal probability, Phi(x_i) = (2i-1) / (2D), scaled so
-    that the whole set has covariance I. With an odd D the axes share their centre: L = N (D - 1) + 1,
-    otherwise N D. With D = 2 this is the cubature rule, with D = 3 the equally weighted unscented set.
+    On an axis, the points are the medians of D slices of equal probability, Phi(x_i) = (2i-1) / (2D),
+    scaled so that the whole set has covariance I. With an odd D the axes share their centre: L = N (D -
+    1) + 1, otherwise N D. With D = 2 this is the cubature rule, with D = 3 the equally weighted
+    unscented set.
     """
     from scipy.special import ndtri  # slow to import
 
@@ -100,7 +101,7 @@ def randomised_unscented(
 
     With Q uniform over rotations and rho^2 ~ chi2(N + 2), an iteration's points are +- rho Q e_i with
     weight 1 / (2 rho^2 iterations) each; the centre has the remaining weight, which may be negative.
-    Every draw integrates cubics exactly, and any other function without bias.
+    Every draw integrates cubic functions exactly, and any other function without bias.
     """
     rotation_size = dimension**2
     normals = generator.standard_normal((*batch, iterations, rotation_size + dimension + 2))

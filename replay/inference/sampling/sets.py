@@ -1,7 +1,7 @@
-"""Sample sets for compiled filters: one set for all steps, or a new one for each.
+"""Sample sets for compiled filters: one set for all steps, or a new set for each step.
 
-A randomised sampling uses a separate generator for each run, seeded by the run's data, so that a run
-gives the same estimates alone and in an ensemble.
+A randomised sampling uses a separate generator for each run, seeded by the data of the run, so that a
+run has the same estimates alone and in an ensemble.
 """
 
 import copy
@@ -22,7 +22,7 @@ _UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
-    """Points (sets, L, N) and weights (sets, L); use number u takes the set (u - first) * stride."""
+    """Points (sets, L, N) and weights (sets, L); use number u reads the set (u - first) * stride."""
 
     points: Array
     weights: Array
@@ -33,7 +33,7 @@ class SampleSets(NamedTuple):
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
 ) -> Iterator[tuple[RowSlice, SampleSets]]:
-    """Yield the sets of all runs, for as many runs together as memory should hold.
+    """Yield the sets of all runs, for several runs together, limited by memory.
 
     Args:
         sampler: sampler that draws the sets.
@@ -64,7 +64,7 @@ def sets_by_runs(
 def seeded_by_data(
     generators: Generators, data: Array, offsets: NDArray[np.int64], seed: int, function: int = 0
 ) -> Generators:
-    """Copy the runs' generators; missing ones are seeded by `seed` and the run's first data.
+    """Copy the generators of runs; seed missing ones by `seed` and the first data of the run.
 
     Args:
         generators: generators of the runs.

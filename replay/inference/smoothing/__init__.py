@@ -1,4 +1,4 @@
-"""Smoothers with a backward pass over a filter or with iteration, and the posterior bound.
+"""Smoothers, by a backward pass over a filter or by iteration, and the posterior bound.
 
 Begin with `backward_pass`.
 """

@@ -1,13 +1,13 @@
 """Affine filter about a trajectory: the forward pass of a Gauss-Newton iteration.
 
-With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
-vectors d_k from these, which are in flat space:
+Motion and sensors are linearised at the latest states x_k of a run. The unknowns are the tangent vectors
+d_k from these states, which are in a vector space:
 
     d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
 
 with the rotation E and the right Jacobian Jr, which are identities except for orientations. No inverse
-of Q is needed: if it is singular, x_k is restricted to what noise can reach, and the cost is that of the
-noise. A robust loss is applied by reweighting.
+of Q is needed: if Q is singular, x_k is restricted to states that the noise can reach, and the cost is
+that of the noise. A robust loss is applied by reweighting.
 
 Bell, SIAM J. Optim. 4(3), 1994.
 """
@@ -52,11 +52,11 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 )
 
 LOSSES = ("square", "huber", "cauchy")
-NOTHING_LEFT = 1e-12  # fraction of a variance that counts as zero after conditioning on other components
+NOTHING_LEFT = 1e-12  # fraction of a variance that is zero after conditioning on other components
 
 
 class Factors(NamedTuple):
-    """Covariances of steps as factored by `factor_by_pivots`; the first axis is the step.
+    """Covariances of steps, factored by `factor_by_pivots`; the first axis is the step.
 
     Attributes:
         factor, order, rank: (steps, t, t), (steps, t), (steps,); the rank is -1 if the factor is
@@ -74,19 +74,19 @@ def no_factors(count: int, t: int) -> Factors:
 
 
 class Trajectory(NamedTuple):
-    """Trajectory at which everything is linearised, and results of a pass over it.
+    """Trajectory at which motion and sensors are linearised, and results of a pass over it.
 
     Attributes:
         mean: (nodes, n) states.
-        noises: noises of the steps to all nodes, as found in the previous pass; that pass had the least
+        noises: noises of the steps to all nodes, from the previous pass; that pass had the smallest
             cost, or this pass uses the same states again.
-        kept: (nodes, n) states of the least cost so far.
+        kept: (nodes, n) states with the smallest cost so far.
         node: (events,) node of each event's stamp.
-        scale: (nodes, t) variances of the start; divided by the damping, they are the variances with
-            which damping measures the current states.
+        scale: (nodes, t) variances of the start; divided by the damping, they are the variances of the
+            pseudo-measurements by which damping keeps the current states.
         loss: (2,) index in LOSSES, and scale of the loss.
         damping: (1,) damping of this pass.
-        cost, held: (1,) costs of the trajectory, with its own noise and with the noise at `kept`.
+        cost, held: (1,) costs of the trajectory with its own noise, and with the noise at `kept`.
         noise, found: (t, t) covariance of a step, and its factor.
         offset, column: (1, t), (t,) working memory.
     """
@@ -126,7 +126,7 @@ def affine_steps(bound_model: BoundModel) -> Steps:
 
 
 def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) -> None:
-    """Apply damping: measure each component of the state as it is, one after the other, in place.
+    """Apply damping in place: add a pseudo-measurement of the current value of each component.
 
     Args:
         mean, covariance: (t,), (t, t) in the tangent space at the trajectory's state.
@@ -181,13 +181,13 @@ def affine_motion(bound_model: BoundModel) -> Predict:
 
 
 class Carry(Protocol):
-    """Function that multiplies rows (t, m) by E(-offset); offset and working memory step are (t,)."""
+    """Function that multiplies rows (t, m) by E(-offset); `offset` and `step` are (t,)."""
 
     def __call__(self, offset: Floats, rows: Floats, step: Floats, /) -> None: ...
 
 
 class Reach(Protocol):
-    """Function that computes a node's offset from its origin (n,) and returns whether it is known."""
+    """Function that computes the offset of a node from its origin (n,); returns if it is defined."""
 
     def __call__(self, trajectory: "Trajectory", node: int, origin: Floats, /) -> bool: ...
 
@@ -195,7 +195,7 @@ class Reach(Protocol):
 def carrying(kinds: tuple[str, ...]) -> Carry:
     """Make `carry(offset, rows, step)`, which multiplies rows (t, m) by E(-offset).
 
-    It transforms tangent vectors at one state to those at the state that differs by `offset`. `step` is
+    It transforms tangent vectors at one state to those at a state that differs by `offset`. `step` is
     working memory.
     """
     turn, turn_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
@@ -212,9 +212,9 @@ def carrying(kinds: tuple[str, ...]) -> Carry:
 def reaching(kinds: tuple[str, ...]) -> Reach:
     """Make `reach(trajectory, node, origin)`, which computes a state's offset from its origin.
 
-    It fills `offset`, and adds its square in units of the noise to the costs. In directions without
-    noise, the state is moved to where noise can reach. It returns False if the offset or its cost is
-    undefined.
+    It fills `offset`, and adds the square of the offset in units of the noise to the costs. In
+    directions without noise, the state is moved so that the noise can reach it. It returns False if the
+    offset or its cost is undefined.
     """
     add, subtract = boxplus(kinds), boxminus(kinds)
 
@@ -247,13 +247,13 @@ def reaching(kinds: tuple[str, ...]) -> Reach:
 
 
 def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Floats) -> float:
-    """Compute the square of an offset in units of a noise, restricted to the directions of the noise.
+    """Compute the square of an offset in units of the noise, in the directions that have noise.
 
     Args:
         offset: (t,).
         factors: factors of the covariances of all steps.
         step: index of the step.
-        whitened: (t,) whose first rank entries are filled.
+        whitened: (t,), of which the first `rank` entries are filled.
     """
     factor, order, squared = factors.factor[step], factors.order[step], 0.0
     for k in range(factors.rank[step]):
@@ -268,12 +268,12 @@ def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Float
 def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floats) -> int:
     """Compute the pivoted Cholesky factor of a positive semidefinite matrix.
 
-    The next row is that with the largest remaining fraction of its diagonal entry; fractions below
+    The next row is the one with the largest remaining fraction of its diagonal entry; fractions below
     NOTHING_LEFT are rounding errors.
 
     Args:
         matrix: (t, t).
-        factor: (t, t) whose first rank columns are filled.
+        factor: (t, t), of which the first `rank` columns are filled.
         order: (t,), filled: row order[k] of the factor ends in column k.
         left: (t,) working memory.
 

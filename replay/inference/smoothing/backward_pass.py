@@ -2,13 +2,14 @@
 
 In the forward pass, the filter stores a node at every stamp with an estimate: its Gaussian, and the
 relation to the previous node. The backward pass starts at the last node. For a step from k to k + 1 with
-the prediction (m-, P-) and D, the covariance of the state before the step with the state after it,
+the prediction (m-, P-) and D, the covariance between the states before and after the step,
 
     G = D P-^-1,  ms_k = m_k (+) G (ms_(k+1) (-) m-),  Ps_k = (P_k - G D') + G Ps_(k+1) G'
 
-with D from the derivative for extended filters and from the samples for the others. Several predictions
-between two nodes form one such step: their G are multiplied. For states that are not vectors, (+) and
-(-) and the tangent spaces of the covariances are those of `fuselog.replay.inference.model.corrections`.
+where D is computed from the derivative for extended filters and from the samples for the others. Several
+predictions between two nodes are one step: their G are multiplied. For states that are not vectors, (+)
+and (-) and the tangent spaces of the covariances are those of
+`fuselog.replay.inference.model.corrections`.
 
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
@@ -48,10 +49,10 @@ FOREVER_NS = np.iinfo(np.int64).max
 
 
 class Chain(NamedTuple):
-    """Belief of the states and their relation to the last node; the first axis is the run.
+    """Belief of the states, and their relation to the last node; the first axis is the run.
 
     Attributes:
-        mean, covariance: those of the filter, (runs, n) and (runs, t, t).
+        mean, covariance: mean and covariance of the filter, (runs, n) and (runs, t, t).
         predicted, slope: (runs, n) last prediction before its correction, and (runs, t) its slope; see
         `fuselog.replay.inference.model.model.Correction`.
         gain, rest: (runs, t, t) G and P - G D' of the predictions since the last node.
@@ -81,14 +82,14 @@ class Nodes(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+    """Nodes of all runs; nodes offsets[r]:offsets[r + 1] belong to run r."""
 
     nodes: Nodes
     offsets: Integers
 
 
 class ForwardMemory(NamedTuple):
-    """Working memory of the steps of one core: the filter's own, and four matrices (t, t)."""
+    """Working memory of the steps of one core: that of the filter, and four matrices (t, t)."""
 
     filter: CoreMemory
     rest: Floats
@@ -184,14 +185,14 @@ def compose(
 
 
 class Later(NamedTuple):
-    """The node after a piece: which runs have one, and the smoothed nodes, one row per run."""
+    """Node after a piece: whether each run has one, and the smoothed nodes, one row per run."""
 
     is_there: Integers
     nodes: Nodes
 
 
 class Smoothed(NamedTuple):
-    """Results of smoothing: the nodes of run r before row stop[r] are written from row start[r] on.
+    """Results of smoothing: nodes of run r before row stop[r] are written, starting at row start[r].
 
     Each estimate is smoothed from the last node within the lag.
     """
@@ -223,7 +224,7 @@ def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> 
 
 
 class GoBack(Protocol):
-    """Function that smooths the nodes of one run's piece; `later` then contains the first of them."""
+    """Function that smooths the nodes of a run in a piece; `later` then contains the first node."""
 
     def __call__(
         self, run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory, /
@@ -235,7 +236,7 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
 
     Args:
         kinds: kinds of the state's components.
-        correct: the model's own correction, if it has one.
+        correct: the correction of the model, if it has one.
     """
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)

@@ -1,9 +1,9 @@
-"""Posterior Cramer-Rao bound: the information of the measurements along the true states.
+"""Posterior Cramer-Rao bound from the information of the measurements along the true states.
 
-Each node, a stamp with an estimate, has the covariance of an extended Kalman filter that linearises at
-the truth, or of its smoother (`bound:smoother`), along this one trajectory. This needs no inverse of the
-process noise, which may be singular. The steps themselves are also written;
-`fuselog.replay.judging.consistency.bounds` computes the bound over an ensemble from them.
+Each node (a stamp with an estimate) has the covariance of an extended Kalman filter that linearises at
+the truth, or of its smoother (`bound:smoother`), along this trajectory. No inverse of the process noise,
+which may be singular, is needed. The steps are also output; `fuselog.replay.judging.consistency.bounds`
+computes the bound over an ensemble from them.
 
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """
@@ -38,10 +38,10 @@ from fuselog.replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory
 
 
 class BoundParameters(MethodParameters):  # type: ignore[explicit-any]
-    """The kind of bound, and how truth is read.
+    """Kind of bound, and interpolation of the truth.
 
     Attributes:
-        of: whether to compute the bound of filters or of smoothers.
+        of: whether the bound of filters or of smoothers is computed.
         gap_limit_s: longest gap over which truth is interpolated.
     """
 
@@ -79,7 +79,8 @@ def smooth(
 ) -> None:
     """Replace covariances of a filter by those of its smoother along one trajectory, in place.
 
-    With the gain G = P F' P-^-1, each becomes P + G (Ps - P-) G', where Ps is that of the next node.
+    With the gain G = P F' P-^-1, each covariance becomes P + G (Ps - P-) G', where Ps is that of the
+    next node.
 
     Args:
         run: index of the run.
@@ -119,7 +120,7 @@ class BoundHistory(NamedTuple):
 
 
 class BoundFilter(Filter):
-    """A filter that knows the truth; every step is a further output."""
+    """Filter that knows the truth; every step is a further output."""
 
     is_bound = True
 
@@ -138,7 +139,7 @@ class BoundFilter(Filter):
         return "a bound is only defined for messages in the order of their stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior; see `Filter.start`."""
+        """Make the initial state of every run from its prior; see `Filter.start`."""
         state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
@@ -164,7 +165,7 @@ class BoundFilter(Filter):
     def filtered(
         self, state: FilterState, events: FilterEvents
     ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
-        """Process events, with the truth at each of them."""
+        """Process events with the truth at each event."""
         truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
         after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
@@ -175,19 +176,19 @@ class BoundFilter(Filter):
         generators: tuple[Samples, ...],
         events: FilterEvents,  # noqa: ARG002
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Yield all runs, with the function that makes a core's working memory with the truths."""
+        """Yield all runs, with the function that makes the working memory of a core with the truths."""
         yield None, partial(self.steps.memory, generators)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[EstimatesToFill, InnovationRows]:
-        """Make arrays of nodes and innovations to fill."""
+        """Allocate arrays for nodes and innovations."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Process events; nodes to be smoothed are stored until the end."""
+        """Process events; nodes to smooth are stored until the end."""
         before, kept = state.carried, state.kept
         after, (nodes, offsets), made = self.filtered(state, events)
         kept, first = self.begun(before, kept, nodes, offsets)
@@ -219,7 +220,7 @@ class BoundFilter(Filter):
         return self.states(EstimateRows(offsets[1:], times, mean, covariance), offsets)
 
     def states(self, estimates: EstimateRows, offsets: Integers) -> Ragged:
-        """Make the stream of true states, each with the bound of its covariance."""
+        """Make the stream of true states, each with the bound of the covariance."""
         found = super().states(estimates, offsets)
         metadata = {**found.stream.metadata, "bound": self.parameters.of}
         return Ragged(replace(found.stream, metadata=metadata), found.offsets)
@@ -229,8 +230,8 @@ class BoundFilter(Filter):
     ) -> tuple[BoundHistory, Ragged]:
         """Make the steps to the priors of runs that reach their first node.
 
-        The noise of such a step is the prior's covariance. If the first node has the prior's stamp, the
-        step to that node is changed to this one.
+        The noise of such a step is the prior's covariance. If the first node has the stamp of the prior,
+        its step is replaced by this step.
         """
         first, is_new = offsets[:-1], ~kept.has_begun & (np.diff(offsets) > 0)
         is_there = is_new.copy()

@@ -40,7 +40,7 @@ class TrueTrajectory(NamedTuple):
     Attributes:
         mean: (runs, n) true state.
         covariance: (runs, t, t) covariance of a filter that linearises at the true state.
-        transition, noise: (runs, t, t) since the last node.
+        transition, noise: (runs, t, t) transition and noise since the last node.
         information: (runs, t, t) information of the measurements since the last node, the sum of H' R^-1
             H.
     """
@@ -65,7 +65,7 @@ class Nodes(NamedTuple):
 
 
 class BoundMemory(NamedTuple):
-    """Working memory of one core: true states at events (events, n), and noise (m, m) by sensor."""
+    """Working memory of one core: true states at events (events, n), and noise (m, m) per sensor."""
 
     truth: Floats
     noise: tuple[Floats, ...]
@@ -109,7 +109,7 @@ def bound_steps(bound_model: BoundModel) -> Steps:
 
 
 def bound_update(bound_model: BoundModel, number: int) -> UpdateRun:
-    """Make the update by sensor `number` with a zero innovation, which does not move the state."""
+    """Make the update by sensor `number` with a zero innovation, which does not change the state."""
     innovate, add_noise = linear_sensor(bound_model, number), sensor_noise(bound_model.sensors[number])
     m = len(bound_model.sensors[number].measured)
 
@@ -152,7 +152,7 @@ def add_information(information: Floats, rows: Floats, noise: Floats, size: int)
     Args:
         information: (t, t), added to in place.
         rows: H (at least size, t), overwritten.
-        noise: R, of which the first `size` rows and columns are used; replaced by its factor.
+        noise: R, of which the first `size` rows and columns are used; it is replaced by its factor.
         size: number of measured components.
     """
     t = len(information)

@@ -1,8 +1,8 @@
-"""Smoothing at a fixed lag behind a filter, with constant work per node for any lag.
+"""Smoothing with a fixed lag, with constant work per node for any lag.
 
-The lag is a sliding window of steps. Composition of steps is associative, so a queue made of two stacks
-provides the composition of all its steps with two compositions per node, independent of the number of
-nodes in the lag. On manifolds, where the means affect the steps, they cannot be composed.
+The lag is a sliding window of steps. Composition of steps is associative, so a queue of two stacks can
+maintain the composition of all its steps with two compositions per node, regardless of the number of
+nodes in the lag. On manifolds, steps depend on the means and cannot be composed.
 """
 
 from functools import lru_cache
@@ -19,10 +19,10 @@ from fuselog.replay.inference.smoothing.backward_pass import BackMemory, Nodes, 
 class Window(NamedTuple):
     """Steps within the lag of the first node that is not yet smoothed, as two stacks.
 
-    For steps to the nodes up to `turned`, each node's row has the composition of its own step and all
-    later ones up to there; those from there up to `through` are composed here. The first axis is the
-    run; nodes count from the first stored one. A step is (G, b, A): deviations from the filter's means
-    are propagated back by d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
+    The row of a node up to `turned` has the composition of its step and all later steps up to `turned`;
+    the steps from `turned` to `through` are composed in this object. The first axis is the run; nodes
+    count from the first stored one. A step is (G, b, A): deviations from the filter's means are
+    propagated back by d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
     """
 
     turned: Integers
@@ -39,13 +39,13 @@ def sliding_over_runs(kinds: tuple[str, ...]) -> OverRuns:
 
 
 def sliding(kinds: tuple[str, ...]) -> RunOnce:
-    """Make the loop over the nodes of one run in flat space, from first to last, at a fixed lag."""
+    """Make the loop over the nodes of one run, from first to last, for a fixed lag in a vector space."""
     add, subtract = boxplus(kinds), boxminus(kinds)
 
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
     ) -> None:
-        """Append the step to a node to those of the window; in its row, b replaces the prediction."""
+        """Append the step to a node to the window; in the row of the node, b replaces the prediction."""
         shift, change = nodes.predicted[row], work.change[0]
         subtract(nodes.mean[row], shift, work.change, 0)
         for i in range(len(shift)):
@@ -61,7 +61,7 @@ def sliding(kinds: tuple[str, ...]) -> RunOnce:
             extend(gain, window.shift[run], rest, nodes.gain[row], shift, nodes.rest[row], work)
 
     def go_back(gain: Floats, shift: Floats, rest: Floats, work: BackMemory) -> None:
-        """Propagate deviation and covariance of `work` back by a step."""
+        """Propagate the deviation and covariance in `work` back by a step."""
         step, deviation = work.step, work.mean
         for row in range(len(step)):
             step[row] = shift[row]

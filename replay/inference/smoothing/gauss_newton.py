@@ -1,14 +1,14 @@
 """Minimisation of the cost of all states of a run by damped Gauss-Newton steps.
 
-The cost is minimised over the state at the prior's time and at every later stamp:
+The cost is minimised over the states at the time of the prior and at every later stamp:
 
     1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
 
 A pass consists of an affine filter about the latest trajectory
 (`fuselog.replay.inference.smoothing.affine`) and the backward pass over it
 (`fuselog.replay.inference.smoothing.backward_pass`). If a step would raise the cost, it is repeated with
-damping (Levenberg and Marquardt): every state is measured as it is, with the variances of the start
-divided by the damping.
+damping (Levenberg and Marquardt): pseudo-measurements keep every state near its current value, with the
+variances of the start divided by the damping.
 
 Bell, SIAM J. Optim. 4(3), 1994; Sarkka and Svensson, ICASSP 2020.
 """
@@ -46,14 +46,14 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 
 SETTLED = 1e-10  # largest component of the last step, in standard deviations
 ROUNDING = 1e-15
-COST_ROUNDING = 1e-6  # of 1, or of the cost if larger: noise may depend on the state
+COST_ROUNDING = 1e-6  # of 1 or of the cost, if it is larger, because noise may depend on the state
 LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e12
 
 
 class Plan(NamedTuple):
-    """Inputs of a search: the prior (first axis: run), its stamps, and the control before its messages.
+    """Inputs of a search: priors of the runs, their stamps, and the control before its first message.
 
-    Also the first damping, and the maximum number of passes.
+    Further inputs are the first damping and the maximum number of passes.
     """
 
     prior: Gaussian
@@ -67,8 +67,8 @@ class SearchState(NamedTuple):
     """State of a search, for all runs.
 
     Attributes:
-        carried, piece, innovations: of the forward pass.
-        later, smoothed: of the backward pass.
+        carried, piece, innovations: state and results of the forward pass.
+        later, smoothed: state and results of the backward pass.
         kept: (nodes, n) best trajectory.
     """
 
@@ -93,7 +93,7 @@ class Ended(NamedTuple):
 
 @lru_cache(maxsize=64)
 def searching(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
-    """Make the search, which is compiled when first called, and the steps that allocate its memory."""
+    """Make the search, which is compiled when first called, and the steps, which allocate its memory."""
     steps = affine_steps(bound_model)
     settings_of = reading_settings(number_fields(bound_model.model.parameters))
     title = title_of(bound_model.model, "iterated smoother")
@@ -101,7 +101,7 @@ def searching(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
 
 
 def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> RunOnce:
-    """Make the search for one run's trajectory, for `compile_over_runs`."""
+    """Make the search for the trajectory of one run, for `compile_over_runs`."""
     kinds, n, t = bound_model.model.kinds, bound_model.model.size, bound_model.model.tangent
     follow, go_back = recursion(bound_model, steps, settings_of), backward_pass(("linear",) * t)
     add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
@@ -110,7 +110,7 @@ def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> 
     def go_forward(
         run: int, inputs: RunInputs, plan: Plan, state: SearchState, memory: ForwardMemory
     ) -> bool:
-        """Filter about the trajectory, sum its cost, and return whether everything succeeded."""
+        """Filter about the trajectory, sum the cost, and return whether all steps succeeded."""
         carried, (nodes, offsets) = state.carried, state.piece
         trajectory, belief, begin = memory.filter.samples[0], carried.belief, offsets[run]
         mean, covariance = belief.mean[run], belief.covariance[run]
@@ -139,9 +139,9 @@ def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> 
     def move(
         trajectory: Trajectory, kept: Floats, steps: Floats, begin: int, end: int
     ) -> tuple[float, float, bool]:
-        """Move the trajectory from the best one.
+        """Move the trajectory from the best trajectory by the latest steps.
 
-        Return the largest step and the sum of squared steps, both in standard deviations of the start,
+        Returns the largest step and the sum of squared steps, both in standard deviations of the start,
         and whether the steps are negligible.
         """
         largest, squares, settled = 0.0, 0.0, True
@@ -173,7 +173,7 @@ def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> 
         trajectory, begin, end = memory.filter.samples[0], offsets[run], offsets[run + 1]
         ended.passes[run] = ended.converged[run] = 0
         best, damping, again, last = np.inf, plan.damping, False, False
-        # the damping of the last step, and the predicted gain, which it should not miss by far
+        # the damping of the last step, and the predicted gain, for comparison with the actual gain
         taken, promised = 0.0, 0.0
         while begin < end:
             trajectory.damping[0] = damping

@@ -1,7 +1,7 @@
 """Iterated smoother: the most probable states of a whole run, given all measurements.
 
-It stores the events of a run, smooths them once with the extended smoother, and from there searches for
-the trajectory with the least cost; see `fuselog.replay.inference.smoothing.gauss_newton`.
+It stores the events of a run, smooths them once with the extended smoother, and then searches for the
+trajectory with the smallest cost; see `fuselog.replay.inference.smoothing.gauss_newton`.
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,8 @@ class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
         start: start of the search: smoother (result of the extended smoother), motion (the prior's mean,
             propagated by the motion) or prior (the prior's mean at all stamps).
         damping: damping of the first step, in units of the information at the start; with 0, damping is
-            only used where the cost would rise.
-        loss: loss function of residuals; huber and cauchy down-weight long ones.
+            used only if the cost would rise.
+        loss: loss function of residuals; huber and cauchy down-weight large residuals.
         loss_scale: length of a whitened residual above which huber and cauchy down-weight it.
         iterations: maximum number of iterations.
     """
@@ -75,7 +75,7 @@ class Way(NamedTuple):
     Attributes:
         events: events up to the last node, without measurements that a gate rejected.
         node: (events,) node of each event's stamp.
-        nodes, offsets: nodes of the filter; run r owns those from offsets[r] on.
+        nodes, offsets: nodes of the filter; the nodes of run r begin at offsets[r].
         states: smoothed states at the nodes.
         wanted: (nodes,) whether an estimate is requested at each node.
         made: other outputs of the filter.
@@ -91,7 +91,7 @@ class Way(NamedTuple):
 
 
 class IteratedSmoother(Smoother):
-    """A smoother that stores the events of a run and searches for its trajectory at the end."""
+    """Smoother that stores the events of a run and searches for its trajectory at the end."""
 
     @cached_property
     def lag_ns(self) -> int:
@@ -103,7 +103,7 @@ class IteratedSmoother(Smoother):
         return state._replace(kept=(*state.kept, events)), []
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Find the best trajectory, and report how the search ended."""
+        """Find the best trajectory, and report the outcome of the search."""
         state, _ = self.ended(state)
         if not state.kept:
             return []
@@ -121,7 +121,7 @@ class IteratedSmoother(Smoother):
         return [states, *way.made, *self._solution_streams(ended, way)]
 
     def smoothed_once(self, state: FilterState) -> "Way":
-        """Compute the extended smoother's states at all stamps, from the prior's on."""
+        """Compute the states of the extended smoother at all stamps, starting with that of the prior."""
         events = reduce(join_events, (*self._first(state), *state.kept))
         run = run_of_rows(events.offsets)
         asked, start_ns = events.wants_estimate, state.carried.time_ns
@@ -140,7 +140,7 @@ class IteratedSmoother(Smoother):
         return Way(used, node[known], nodes, offsets, states, wanted, made)
 
     def _moved(self, state: FilterState, way: "Way") -> Floats:
-        """Propagate the prior's means through all of every run as if nothing was measured."""
+        """Propagate the mean of the prior through each whole run, ignoring all measurements."""
         unseen = np.where(way.events.source >= 0, NOTHING, way.events.source)
         _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
         if not np.array_equal(reached, way.offsets):
@@ -152,7 +152,7 @@ class IteratedSmoother(Smoother):
         return mean
 
     def _first(self, state: FilterState) -> list[FilterEvents]:
-        """Return the prior's time as an event, unless an interpolated control already has one."""
+        """Return an event at the time of the prior, unless an interpolated control already has one."""
         control = self.bound_model.model.control
         if control is not None and control.interpolated:
             return []
@@ -269,7 +269,7 @@ class IteratedSmoother(Smoother):
 
 
 def _solved_at_the_end(bound_model: BoundModel) -> Steps:
-    """Make the steps that compute the start, those of the extended smoother."""
+    """Make the steps of the extended smoother, which computes the start."""
     return smoothing_steps(bound_model, FILTERS["ekf"].steps(bound_model))
 
 

@@ -1,8 +1,8 @@
-"""Smoothers: filters that store their nodes and pass back over them, at the end or at a lag.
+"""Smoothers: filters that store their nodes and smooth them at the end or with a lag.
 
-The stored steps and the backward pass are in `fuselog.replay.inference.smoothing.backward_pass`; sliding
-a fixed lag over them is in `fuselog.replay.inference.smoothing.fixed_lag`. On manifolds, where means
-affect the steps, each estimate of a fixed lag needs a backward pass over the whole lag.
+The stored steps and the backward pass are in `fuselog.replay.inference.smoothing.backward_pass`; the
+sliding window of a fixed lag is in `fuselog.replay.inference.smoothing.fixed_lag`. On manifolds, steps
+depend on the means, so each estimate with a fixed lag needs a backward pass over the whole lag.
 """
 
 import re
@@ -47,23 +47,23 @@ from fuselog.replay.inference.smoothing.backward_pass import (
 from fuselog.replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
-IN_MEMORY_BYTES = 10**9  # size of the nodes of whole runs; more are stored in temporary files
+IN_MEMORY_BYTES = 10**9  # limit of nodes in memory; more are stored in temporary files
 
 
 class SmootherParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """The forward filter, and how far estimates look ahead.
+    """Forward filter, and lag of the estimates.
 
     Attributes:
         forward: the filter (ekf, iekf, ukf, lrkf, analytic or sqrt), optionally with a lag, as in
-            `ekf:lag=500ms`. With a lag, an estimate uses messages up to that much later; without one, it
-            uses the whole run. Or iterated.
+            `ekf:lag=500ms`; or iterated. With a lag, an estimate uses messages until this time after it;
+            without a lag, it uses the whole run.
     """
 
     forward: str = "ekf"
 
 
 class Forward(NamedTuple):
-    """A filter's name, its variant, and the lag; FOREVER_NS for the whole run."""
+    """Name and variant of a filter, and the lag; FOREVER_NS for the whole run."""
 
     name: str
     variant: str
@@ -90,7 +90,7 @@ def parse_forward(text: str) -> Forward:
 
 
 class Stored:
-    """A piece in a temporary file, which is deleted when the object is no longer referenced."""
+    """Piece in a temporary file, which is deleted when the object is no longer referenced."""
 
     def __init__(self, piece: Piece) -> None:
         self.offsets = piece.offsets
@@ -106,25 +106,25 @@ class Stored:
 
 
 def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
-    """Return a piece, stored on disk if those in memory would become too large."""
+    """Return a piece, stored on disk if the pieces in memory would become too large."""
     in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
     size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
     return new if size <= IN_MEMORY_BYTES else Stored(new)
 
 
 class Waiting(NamedTuple):
-    """The nodes within the lag, and the steps between them."""
+    """Nodes within the lag, and the steps between them."""
 
     piece: Piece
     window: Window
 
 
 class Smoother(Filter):
-    """A filter that stores its nodes, and smooths them at the end or at a lag."""
+    """Filter that stores its nodes, and smooths them at the end or with a lag."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """Time after an estimate from which it may use messages."""
+        """Time after an estimate up to which the estimate uses messages."""
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
@@ -133,7 +133,7 @@ class Smoother(Filter):
         return "a smoother uses later messages anyway; replay it in the order of the stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the state at every run's prior; see `Filter.start`."""
+        """Make the initial state of every run from its prior; see `Filter.start`."""
         state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
@@ -144,7 +144,7 @@ class Smoother(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Nodes, InnovationRows]:
-        """Make arrays of nodes and innovations to fill."""
+        """Allocate arrays for nodes and innovations."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
@@ -180,9 +180,10 @@ class Smoother(Filter):
         return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
     def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[EstimateRows, Integers]:
-        """Smooth the nodes before row stop[run] at the lag; run r owns offsets[r]:offsets[r + 1].
+        """Smooth the nodes before row stop[run] with the lag.
 
-        The nodes and the window are changed; the window then begins at row stop[run].
+        The nodes and the window are changed; the window then begins at row stop[run]. The results of run
+        r have the rows offsets[r]:offsets[r + 1].
         """
         model = self.bound_model.model
         if not is_flat(model.kinds):
@@ -205,7 +206,7 @@ class Smoother(Filter):
     ) -> tuple[EstimateRows, Integers]:
         """Smooth the nodes of all pieces, or those of one piece before row stop[run].
 
-        Run r owns offsets[r]:offsets[r + 1].
+        The results of run r have the rows offsets[r]:offsets[r + 1].
         """
         model, runs = self.bound_model.model, len(pieces[0].offsets) - 1 if pieces else 0
         counts = [(piece.offsets[1:] if stop is None else stop) - piece.offsets[:-1] for piece in pieces]

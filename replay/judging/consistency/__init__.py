@@ -1,4 +1,4 @@
-"""Tests whether errors, innovations and scores agree with what an estimator states about them.
+"""Tests whether errors, innovations and scores agree with the uncertainty that an estimator states.
 
 Begin with `consistency`. NEES is computed with the errors, in
 `fuselog.replay.judging.errors.evaluation`.

@@ -5,11 +5,11 @@ means over the trajectories of these products (not products of means),
 
     J_(k+1) = D22 - D21 (J_k + D11)^-1 D12,  D11 = E F'Q^-1F,  D12 = -E F'Q^-1,  D22 = E Q^-1 + E H'R^-1H
 
-bounds filters. The information from later steps on step k, L_k = D11 - D12 (D22 + L_(k+1))^-1 D21,
-gives with it the blocks J_k + L_k of the joint information, which bounds smoothers. If Q is singular,
-or if runs have different stamps, there is no such mean: the bounds along the trajectories are then
-averaged, and the result says so. Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5),
-1998.
+is the bound of filters. With the information L_k = D11 - D12 (D22 + L_(k+1))^-1 D21 from later steps
+about step k, J_k + L_k are the blocks of the joint information, which is the bound of smoothers. If Q is
+singular, or if runs have different stamps, these means do not exist: the bounds along the trajectories
+are then averaged, and the result states this. Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal
+Processing 46(5), 1998.
 """
 
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from fuselog.replay.judging.metrics.sums import BinnedSums
 SINGULAR = "the process noise is singular"
 UNALIKE = "the runs have different stamps"
 LONG = "there are too many steps"
-# A noise whose correlation matrix has a smaller eigenvalue counts as singular.
+# Noise counts as singular if its correlation matrix has a smaller eigenvalue.
 LEAST_EIGENVALUE = 1e-10
 MOST_BYTES = 1 << 28  # largest size of the sums
 
@@ -45,15 +45,15 @@ class Products(NamedTuple):
 
 @dataclass
 class Bounds:
-    """Sums over the runs of one stream of steps, from which the bound is computed.
+    """Sums over the runs of a stream of steps, from which the bound is computed.
 
     Attributes:
         components: names and kinds of the tangent space.
-        is_smoother: whether the bound is one of smoothers.
+        is_smoother: whether the bound is for smoothers.
         sums: sums of the products by step, rows of 4 t^2.
         stamps: (steps,) ns since the epoch.
-        steps: number of steps of every run, by its number.
-        reason: why there is no mean over the ensemble; empty if there is one.
+        steps: number of steps of every run, by number of the run.
+        reason: reason why there is no mean over the ensemble; empty if there is one.
     """
 
     components: list[tuple[str, str]] = field(default_factory=list)
@@ -91,7 +91,7 @@ class Bounds:
         return self
 
     def _steps_of(self, output: Output) -> Integers:
-        """Return the numbers of the steps in their runs; set `reason` if the stamps of runs differ."""
+        """Return the number of each step in its run; set `reason` if the stamps of runs differ."""
         rows, numbers = output.rows, []
         for run in range(rows.runs):
             begin, end = rows.offsets[run], rows.offsets[run + 1]
@@ -124,7 +124,7 @@ class Bounds:
 
     @property
     def complaint(self) -> str:
-        """Return why there is no mean over the ensemble; empty if there is one."""
+        """Return the reason why there is no mean over the ensemble; empty if there is one."""
         if self.reason or self.sums is None:
             return self.reason
         if self.sums.width > 1:
@@ -146,7 +146,7 @@ class Bounds:
 
 
 def products_of(rows: Ragged, size: int) -> Products | None:
-    """Compute the products of every step; None if a noise is singular, or a measurement is exact."""
+    """Compute the products of every step; None if noise is singular or a measurement is exact."""
     transition, noise, information = (
         rows[name].reshape(-1, size, size) for name in ("transition", "noise", "information")
     )
@@ -162,7 +162,7 @@ def products_of(rows: Ragged, size: int) -> Products | None:
 
 
 def filter_information(mean: Products) -> Floats:
-    """Compute J (steps, t, t) by the recursion from the first step, which starts without information."""
+    """Compute J (steps, t, t) by recursion from the first step, starting without information."""
     found = mean.after + mean.measured
     for step in range(1, len(found)):
         left = mean.across[step].T @ np.linalg.solve(
@@ -173,7 +173,7 @@ def filter_information(mean: Products) -> Floats:
 
 
 def later_information(mean: Products) -> Floats:
-    """Compute L (steps, t, t), the information from all later steps on each step."""
+    """Compute L (steps, t, t), the information from all later steps about each step."""
     found = np.zeros_like(mean.after)
     for step in range(len(found) - 2, -1, -1):
         after = mean.after[step + 1] + mean.measured[step + 1] + found[step + 1]
@@ -190,8 +190,8 @@ def _add(state: Bounds, output: Output) -> Bounds:
 def root_mean_squares(state: Bounds) -> dict[str, float]:
     """Compute the lower bounds of RMSE over all steps, under the names of the RMSE.
 
-    They are returned only if the bound is that of the ensemble, and `over_ensemble` is then 1.
-    Otherwise the average along the trajectories is computed in the same way as errors are
+    The bounds are returned only if the bound over the ensemble exists; `over_ensemble` is then 1.
+    Otherwise, the average along the trajectories is computed in the same way as errors
     (`metrics.ACCURACY`).
     """
     if not state.components:

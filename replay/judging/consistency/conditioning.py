@@ -1,8 +1,8 @@
-"""Loss of precision in covariances by rounding, judged from samples of those that a replay outputs.
+"""Loss of precision in covariances due to rounding, from samples of a replay's covariances.
 
 Each pivot of a Cholesky factorisation is divided by its variance, so that units do not matter: the
-quotient is the fraction of the variance that the preceding components do not explain. It is at most
-one, and below 1e-12 only four of a double's sixteen digits are left (Higham, Accuracy and Stability of
+quotient is the fraction of the variance that the preceding components do not explain. It is at most 1;
+below 1e-12, only four of the sixteen digits of a double are left (Higham, Accuracy and Stability of
 Numerical Algorithms, 2nd edition, theorem 10.7).
 """
 
@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 
 from fuselog.replay.engine.streams.blocks import Ragged
 
-LOST = 1e-12  # a smaller pivot has lost its digits
-# One of EACH covariances of a block is sampled, evenly, but at least FEWEST and at most MOST.
+LOST = 1e-12  # a smaller pivot has lost its precision
+# One in EACH covariances of a block is sampled, evenly spaced, but at least FEWEST and at most MOST.
 EACH, FEWEST, MOST = 64, 8, 256
 
 
 class Conditioning(NamedTuple):
-    """Conditioning of samples of a topic's covariances.
+    """Conditioning of samples of the covariances on a topic.
 
     Attributes:
         sampled: number of samples.
         lost: number of samples in which a pivot has lost its digits.
         failed: number of samples that are not positive definite, beyond rounding.
         least: the smallest pivot.
-        run: number in the ensemble of the run with the smallest pivot, if its digits are lost.
+        run: number of the run with the smallest pivot in the ensemble, if its digits are lost.
         elapsed_s: time of this pivot since the run's epoch.
     """
 
@@ -90,7 +90,7 @@ def _sampled(count: int) -> NDArray[np.int64]:
 def _least_of_all(covariances: NDArray[np.float64]) -> float:
     """Compute the smallest pivot of covariances (count, n, n); NaN if one of them has no factor.
 
-    Every replay runs this and precision is rarely lost, so it uses few calls of NumPy.
+    Every replay calls this function and precision is rarely lost, so it uses few calls of NumPy.
     """
     count, size, _ = covariances.shape
     try:

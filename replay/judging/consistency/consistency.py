@@ -1,4 +1,4 @@
-"""Errors compared with the stated covariance: by component, error ellipses, dilution of precision.
+"""Comparison of errors with stated covariances: by component, error ellipses, dilution of precision.
 
 NEES itself is `fuselog.replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
 Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from fuselog.replay.engine import chi2
 
 Array = NDArray[np.float64]
-CONSISTENT = 0.999  # fraction of a consistent filter's logs in which NIS or NEES is within its interval
+CONSISTENT = (
+    0.999  # fraction of the logs of a consistent filter in which NIS or NEES is within its interval
+)
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:
@@ -19,7 +21,7 @@ def component_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
-    """Compute the area of the error ellipses of covariances (..., 2, 2) that contain this probability.
+    """Compute the area of the error ellipses of covariances (..., 2, 2) for a given probability.
 
     The area is zero if rounding makes the determinant of a singular covariance negative.
     """
@@ -28,7 +30,7 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
-    """Compute GDOP from position error, range and noise of both angles; Belfadel et al. 2014, eq (32).
+    """Compute the GDOP from position error, range and noise of both angles; Belfadel et al. 2014, (32).
 
     Args:
         position_error_m: (...,).

@@ -1,4 +1,4 @@
-"""Detection of the time from which a filter's innovations stay too large because the filter diverges."""
+"""Detection of divergence: the time from which the innovations of a filter stay too large."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ import numpy as np
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine import chi2
 
-IMPROBABLE = 1e-4  # probability of the sum of NIS over a window
+IMPROBABLE = 1e-4  # probability bound for the sum of NIS over a window
 WINDOW = 30  # number of innovations over which NIS is averaged
-USUALLY_WELL = 0.8  # fraction of the earlier windows in which NIS must be as expected
+USUALLY_WELL = 0.8  # fraction of earlier windows in which the NIS must be as expected
 
 
 class Divergence(NamedTuple):
     """Point at which a filter begins to diverge.
 
     Attributes:
-        row: the innovation after which it diverges.
+        row: index of the innovation after which the filter diverges.
         time_ns: the stamp of this innovation.
-        nis_per_component: the mean NIS per component from there on.
+        nis_per_component: the mean NIS per component from this innovation.
     """
 
     row: int
@@ -27,7 +27,7 @@ class Divergence(NamedTuple):
 
 
 def find_divergence(innovations: Stream) -> Divergence | None:
-    """Find the time from which NIS stays too large in a run in which it was as expected before.
+    """Find the time after which NIS stays too large, in a run whose NIS was as expected before.
 
     Args:
         innovations: all innovations of one estimator, in order of time.

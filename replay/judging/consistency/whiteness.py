@@ -1,9 +1,9 @@
-"""Tests whether innovations are white: normalised, uncorrelated in time, with a mean square of one.
+"""Tests of innovations for whiteness: uncorrelated in time and, when normalised, of mean square one.
 
 If the stated measurement noise is too small, successive innovations are negatively correlated; if the
-process noise is too small, positively: Mehra, "On the identification of variances and adaptive Kalman
-filtering", IEEE TAC 1970. Ljung and Box, "On a measure of lack of fit in time series models",
-Biometrika 1978.
+process noise is too small, they are positively correlated: Mehra, "On the identification of variances
+and adaptive Kalman filtering", IEEE TAC 1970. Ljung and Box, "On a measure of lack of fit in time series
+models", Biometrika 1978.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class Whiteness(NamedTuple):
 
     Attributes:
         size: number of innovations.
-        mean_square: one if the covariances are right; the mean is not removed.
+        mean_square: one if the covariances are correct; the mean is not removed.
         correlation: (lags,) the autocorrelation at lags 1, 2, ...; the mean is removed.
         ljung_box: Q = n (n + 2) sum correlation^2 / (n - lag), chi-square with one degree of freedom
             per lag.
@@ -39,15 +39,15 @@ class Whiteness(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """Return the 95 % bound of the magnitude of an autocorrelation of a white series."""
+        """Return the 95 % bound of the absolute autocorrelation of a white series."""
         return float(1.96 / np.sqrt(self.size))
 
 
 def whitened(innovations: Stream) -> Floats:
-    """Compute normalised innovations e = L^-1 v (n, m) of an innovation stream, with S = L L'.
+    """Compute the normalised innovations e = L^-1 v (n, m) of a stream of innovations, with S = L L'.
 
-    Each component is made independent of those before it. A missing component is NaN and does not
-    affect the others; an invalid covariance makes a row of NaN.
+    Each component is made independent of the components before it. A missing component is NaN and does
+    not affect the others; a row with an invalid covariance is NaN.
     """
     difference = innovations["innovation"]
     n, m = difference.shape

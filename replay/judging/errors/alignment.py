@@ -1,4 +1,4 @@
-"""Alignment of estimates with truth by the least-squares transform of their positions.
+"""Alignment of estimates with the truth by a least-squares transform of their positions.
 
 Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical axis only:
@@ -25,7 +25,8 @@ from fuselog.replay.judging.errors.planes import ALIGNED
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]
 
-# Smallest ratio of a path's two largest extents, squared; rounding makes straight lines narrower.
+# Smallest squared ratio of the two largest extents of a path; straight lines, up to rounding, are below
+# it.
 LEAST_WIDTH = 1e-10
 # The cosine of 1e-6 rad, an angle that is zero up to rounding.
 LEAST_COSINE = 1 - 1e-12
@@ -36,7 +37,7 @@ class Alignment(Movement):
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
-    """Compute the transform that brings positions (n, 3) of an estimate closest to the truth's (n, 3).
+    """Compute the transform that minimises the distances of estimated from true positions, (n, 3) each.
 
     Args:
         estimate_m: positions of the estimate in m.
@@ -45,7 +46,8 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
             not change the height; "se3" rotates and shifts; "sim3" also scales.
         where: name of the estimate in messages.
 
-    Raises BadInput if the positions do not determine the rotation: too few, or all in one line.
+    Raises BadInput if the positions do not determine the rotation, because they are too few or on one
+    line.
     """
     if align == "none":
         return Alignment()
@@ -72,7 +74,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
             "give another alignment"
         )
     scale = 1.0
-    if align == "sim3":  # (42): trace(D S) is the sum of the truth along the rotated estimate
+    if align == "sim3":  # (42): trace(D S) is the scalar product of the truth and the rotated estimate
         scale = float(np.sum(of_truth * (of_estimate @ rotation.T)) / np.sum(of_estimate**2))
     translation_m = truth_mean - scale * rotation @ estimate_mean  # (41)
     if align == "se2":
@@ -81,19 +83,19 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
 
 
 def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> float:
-    """Compute half the 95 % interval of the rotation determined by positions, about the worst axis.
+    """Compute half the 95 % interval of a rotation from positions, about the least certain axis.
 
-    With errors of variance s^2 per axis, the information on a rotation about a unit vector u is sum |u
-    x p|^2 / s^2 over the centred positions p, so its variance is s^2 divided by the sum of squared
-    distances from the axis (Sturm et al. 2012 and evo give none). Neighbouring errors are correlated,
-    so only the number of independent positions counts: n divided by the errors' correlation time
-    (Bayley and Hammersley, "The effective number of independent observations in an autocorrelated time
-    series", Supplement to JRSS 8(2), 1946).
+    With errors of variance s^2 per axis, the information on a rotation about a unit vector u is sum |u x
+    p|^2 / s^2 over the centred positions p, so its variance is s^2 divided by the sum of squared
+    distances from the axis (Sturm et al. 2012 and evo compute no such error). Neighbouring errors are
+    correlated, so only the number of independent positions counts: n divided by the errors' correlation
+    time (Bayley and Hammersley, "The effective number of independent observations in an autocorrelated
+    time series", Supplement to JRSS 8(2), 1946).
 
     Args:
         estimate_m: (n, 3), aligned positions in m.
         truth_m: (n, 3), true positions in m.
-        align: how they were aligned; with "none" the result is zero.
+        align: the alignment that was used; with "none", the result is zero.
 
     Returns:
         The error in rad; infinite if all positions are on the axis.
@@ -105,7 +107,7 @@ def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> flo
     around = float(np.sum(centred[:, :2] ** 2))
     if align not in ("yaw", "se2"):
         squares = np.linalg.eigvalsh(centred.T @ centred)
-        around = float(squares[0] + squares[1])  # about the axis of the path's largest extent
+        around = float(squares[0] + squares[1])  # about the axis of the largest extent of the path
     variance = float(np.mean(error[:, axes] ** 2))
     with np.errstate(divide="ignore"):
         sigma_rad = np.sqrt(variance * _correlation_time(error[:, axes]) / np.float64(around))
@@ -125,7 +127,7 @@ def _correlation_time(error: Floats) -> float:
 
 
 def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
-    """Transform the trajectory into the truth's frame."""
+    """Transform the trajectory into the frame of the truth."""
     turned = alignment.scale * trajectory.position_m @ alignment.rotation.T
     rotation = trajectory.rotation
     return replace(
@@ -136,11 +138,11 @@ def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
 
 
 def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
-    """Transform Gaussian estimates and their covariances into the truth's frame.
+    """Transform Gaussian estimates and their covariances into the frame of the truth.
 
-    NEES is then that of aligned errors. Positions, velocities, headings and orientations are rotated;
-    the covariance of an orientation is in the body's frame and does not change. All other components
-    are assumed to be in the body's frame.
+    The NEES is then that of aligned errors. Positions, velocities, headings and orientations are
+    rotated; the covariance of an orientation is in the body's frame and does not change. All other
+    components are assumed to be in the body's frame.
 
     Raises BadInput if a planar state would be rotated out of its plane.
     """
@@ -164,7 +166,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
 
 @dataclass(frozen=True, repr=False)
 class AlignedEstimates(LogSource):
-    """Log in which the estimates on some topics are transformed into the truth's frame."""
+    """Log in which the estimates on some topics are transformed into the frame of the truth."""
 
     alignments: Mapping[str, Alignment] = field(default_factory=dict)
 

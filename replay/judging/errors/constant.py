@@ -1,7 +1,7 @@
-"""Detection of constant errors: truth and estimate have different origins or different body points.
+"""Detection of constant errors, due to different origins or body points of truth and estimate.
 
-From errors e_k of positions, covariances P_k and headings h_k, a constant d is estimated for which e_k
-- d is small, and a lever l for which e_k - R(h_k) l is. Only mergeable sums are stored.
+From position errors e_k, covariances P_k and headings h_k, two constants are estimated: d, which
+minimises e_k - d, and a lever arm l, which minimises e_k - R(h_k) l. Only mergeable sums are stored.
 """
 
 from dataclasses import dataclass, field
@@ -12,22 +12,22 @@ import numpy as np
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
 
 SHARE = 0.5  # fraction of the mean squared error above which a constant dominates it
-HALVED = 0.5  # largest NEES without the constant, as a fraction of NEES with it
+HALVED = 0.5  # largest NEES without the constant, as a fraction of the NEES with it
 EXPLAINED, TENTH = (
     5.0,
     0.1,
-)  # largest NEES then: per component, or as a fraction
-DRIFTS = 0.5  # fraction of the rest that a line in time explains: above it, the error grows
+)  # largest remaining NEES: per component, or as a fraction
+DRIFTS = 0.5  # fraction of the rest that a linear trend explains; above it, the error grows
 
 
 class Constant(NamedTuple):
     """Constant error.
 
     Attributes:
-        turns: whether it rotates with the body: forward, left and up instead of x, y and z.
+        turns: whether the error rotates with the body: forward, left and up instead of x, y and z.
         offset_m: (2,) or (3,) the error.
-        share: fraction of the mean squared error that it explains.
-        nees, rest: NEES of the positions, with it and without it.
+        share: fraction of the mean squared error that the constant explains.
+        nees, rest: NEES of the positions with and without the constant.
     """
 
     turns: bool
@@ -79,7 +79,7 @@ class FrameSums:
             setattr(self, name, getattr(self, name) + value)
 
     def constant(self, *, turns: bool) -> Constant | None:
-        """Return the mean error if it dominates, does not grow and explains the NEES; otherwise None."""
+        """Return the mean error if it dominates, is constant and explains the NEES; otherwise None."""
         if not self.count or not self.squared:
             return None
         mean = self.error / self.count
@@ -98,7 +98,7 @@ class FrameSums:
 
 @dataclass
 class ConstantSums:
-    """Sums of one estimate stream's position errors, in the fixed frame and in the body's frame."""
+    """Sums of the position errors of a stream of estimates, in the fixed frame and the body's frame."""
 
     fixed: FrameSums = field(default_factory=FrameSums)
     turned: FrameSums = field(default_factory=FrameSums)
@@ -127,10 +127,10 @@ class ConstantSums:
         self.turned.merge(other.turned)
 
     def found(self) -> Constant | None:
-        """Find the constant error, if there is one, in the frame in which it explains more of the error.
+        """Find a constant error, if any, in the frame in which it explains more of the error.
 
-        If the body never rotates, the frames cannot be distinguished, and the error counts as another
-        origin.
+        If the body never rotates, the frames cannot be distinguished, and the error is treated as a
+        different origin.
         """
         fixed, turned = self.fixed.constant(turns=False), self.turned.constant(turns=True)
         if fixed is None or turned is None:

@@ -1,10 +1,10 @@
-"""Paired differences of a metric: the results of one estimator against those of another in every run.
+"""Paired differences of a metric between two estimators over the same runs.
 
-Intervals are percentile bootstrap intervals, see `fuselog.replay.judging.intervals`. BCa is not better
-here: paired differences of two equal estimators are symmetric even if the metric is skewed, and BCa
-then corrects only chance (over 50 runs it called 9 to 11 % of NEES different without a difference).
-Each metric has its own 95 % interval: among many metrics without a difference, about one in twenty is
-called different by chance.
+Intervals are percentile bootstrap intervals, see `fuselog.replay.judging.intervals`. BCa intervals are
+not better: paired differences of two equal estimators are symmetric even if the metric is skewed, so BCa
+corrects only random effects (over 50 runs, it classified 9 to 11 % of equal NEES as different). Each
+metric has its own 95 % interval: among many metrics without a difference, about one in twenty is
+classified as different by chance.
 """
 
 import math
@@ -19,9 +19,9 @@ from fuselog.replay.judging.verdicts import Comparison
 
 # Target of a metric: small, large, or near a value; None if no direction is better.
 Target = Literal["low", "high"] | float | None
-# Number of resampled values in memory at a time.
+# Maximum number of resampled values in memory at a time.
 BATCH_NUMBERS = 1 << 22
-# A log-likelihood has no natural zero: a margin of 0.02 means 2 nats.
+# A log-likelihood has no natural zero, so a margin of 0.02 means 2 nats.
 NATS = 100.0
 TARGETS: dict[str, Target] = {
     "*rmse*": "low",
@@ -53,13 +53,13 @@ TARGETS: dict[str, Target] = {
 }
 
 
-FEWEST_DOMINATED = 3  # fewest numbers among which one can dominate
+FEWEST_DOMINATED = 3  # smallest number of values for which one can dominate
 
 
 def dominating(values: Floats) -> int | None:
-    """Return the index of the number (n,), not negative, that exceeds the sum of all others.
+    """Return the index of the value that exceeds the sum of all others; the values (n,) are >= 0.
 
-    None if there is no such number, or if there are too few numbers.
+    The result is None if there is no such value, or if there are too few values.
     """
     if len(values) < FEWEST_DOMINATED:
         return None
@@ -73,9 +73,9 @@ class Difference(NamedTuple):
     Attributes:
         first, second: the means over the runs.
         more: second - first.
-        margin: differences up to this do not matter.
-        verdict: verdict on the second: whether the interval is beyond the margin, or within it.
-        sure: fraction of the resamples in which the difference has the same sign.
+        margin: differences up to this value are unimportant.
+        verdict: verdict on the second estimator: whether the interval is beyond the margin or within it.
+        sure: fraction of the resamples in which the difference has this sign.
         runs: number of runs.
     """
 
@@ -89,7 +89,7 @@ class Difference(NamedTuple):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Return its numbers by their column names in tables."""
+        """Return the numbers by their column names in tables."""
         about = {"margin": self.margin, "verdict": str(self.verdict), "sure": self.sure}
         ends = {"difference": self.more.value, "low": self.more.low, "high": self.more.high}
         return {"first_mean": self.first, "second_mean": self.second, **ends, **about, "runs": self.runs}
@@ -103,14 +103,15 @@ def target_of(quantity: str) -> Target:
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """Compute the difference of the second estimator to the first.
+    """Compute the difference of the second estimator minus the first.
 
     Args:
         first: (n,) the metric in every run.
         second: (n,) the metric in the same runs.
         target: target of the metric.
-        margin: fraction of the first's mean, or of the target value, that does not matter.
-        scale: replaces this mean or value.
+        margin: unimportant difference, as a fraction of the first estimator's mean or of the target
+            value.
+        scale: value that replaces this mean or target value.
     """
     means = float(first.mean()), float(second.mean())
     if scale is None:
@@ -160,7 +161,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
-    """Return the verdict on a difference; it may be only the sign if the two are around a target."""
+    """Return the verdict on a difference; if the two are on both sides of a target, only its sign."""
     if target in ("low", "high"):
         return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):

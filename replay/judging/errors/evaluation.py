@@ -1,9 +1,9 @@
-"""Errors of estimates against truth, and normalised errors that test the covariance (NEES, NIS).
+"""Errors of estimates against the truth, and normalised errors that test covariances (NEES, NIS).
 
-An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
-truth is interpolated at the estimate's stamps, but not over a gap; errors are those of the tangent
-space (see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 5.4.
+The channel of a stream of estimates states its components, their kinds and the topic of the truth. The
+truth is interpolated at the estimate's stamps, but not over a gap; errors are those of the tangent space
+(see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Sequence
@@ -42,11 +42,11 @@ from fuselog.replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]
 POSITION, HEADING = ("x_m", "y_m", "z_m"), "heading_rad"
-BOUND = "bound"  # in the metadata of a stream of lower bounds instead of estimates
+BOUND = "bound"  # in the metadata of a stream that has lower bounds instead of estimates
 
 
 class Quantity(NamedTuple):
-    """Quantity of an error figure: the name of its RMSE, its columns, the scale of its unit."""
+    """Quantity of an error figure: name of the RMSE, columns, and scale of the unit."""
 
     rmse: str
     columns: list[int]
@@ -55,21 +55,21 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one estimate stream of an ensemble, at the stamps at which the truth is known.
+    """Errors of one stream of estimates of an ensemble, at stamps with a known truth.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
-        case: what it estimates, such as `robot1`; may be empty.
+        case: name of the estimated object, such as `robot1`; may be empty.
         components: names of the d components of the tangent space.
         kinds: kind of each component: "linear", "angle" or "rotation" (about a body axis).
         run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
-        error: (n, d) estimate - truth.
-        covariance: (n, d, d) as the estimator states it.
+        error: (n, d) estimate minus truth.
+        covariance: (n, d, d) as stated by the estimator.
         nees: (n,) normalised estimation error squared; NaN if the covariance is not positive definite.
         without_truth: number of estimates without truth within the gap limit.
-        components_without_truth: components of the estimate that the truth lacks and that are not
-            judged.
+        components_without_truth: components of the estimate that are not judged because the truth lacks
+            them.
         is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
             the smallest possible squared errors.
         heading_rad: (n,) the true heading; None if truth and estimate have none.
@@ -93,7 +93,7 @@ class Errors:
 
     @property
     def squared(self) -> Floats:
-        """Return squared errors (n, d); for a bound, the smallest possible ones; infinite if large."""
+        """Return squared errors (n, d), or smallest possible ones for a bound; infinite on overflow."""
         with np.errstate(over="ignore"):
             return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
@@ -109,7 +109,7 @@ class Errors:
 
     @property
     def main(self) -> Quantity:
-        """Return the position, or else the orientation, or else the first component."""
+        """Return the main quantity: position, otherwise orientation, otherwise the first component."""
         if self.position:
             return Quantity("position_rmse_m", self.position)
         if self.rotation:
@@ -122,7 +122,7 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
-    """Select some rows of errors.
+    """Select rows of errors.
 
     Args:
         errors: errors of an ensemble.
@@ -134,17 +134,17 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
 
 
 class Innovations(NamedTuple):
-    """The n innovations of one stream of an ensemble.
+    """Innovations (n,) of one stream of an ensemble.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
-        case: what it estimates, such as `robot1`; may be empty.
+        case: name of the estimated object, such as `robot1`; may be empty.
         run, time_ns: (n,), the number of the run and the stamp.
         accepted: (n,), whether the gate accepted the measurement.
         squared: (n,), normalised innovation squared (NIS).
         degrees: (n,), number of measured components.
-        log_likelihood: (n,), of the measurements; NaN if the estimator does not state it, None for logs
-            written before it was stated.
+        log_likelihood: (n,), of the measurements; NaN if the estimator does not state it, None for old
+            logs without the field.
     """
 
     estimator: str
@@ -164,7 +164,7 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Compute the interval that contains a mean of `runs` chi-square values with this probability.
+    """Compute the interval that contains the mean of `runs` chi-square values with this probability.
 
     The 95 % interval of the mean NEES of 3 components over 50 runs is
 
@@ -186,7 +186,7 @@ def chi_square_band(degrees: NDArray[np.int64]) -> tuple[Floats, Floats]:
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Compute the interval of an RMSE over these runs, assuming that the covariances P are right.
+    """Compute the interval of an RMSE over these runs, assuming that the covariances P are correct.
 
     A sum of squared errors has mean tr P and variance 2 tr P^2. Its distribution is close to a scaled
     chi-square with these moments (Box 1954, theorem 3.1), and equal to it if all variances are equal.
@@ -215,12 +215,12 @@ def errors_of(
     first_run: int = 0,
     first_fixes: FirstFixes | None = None,
 ) -> Errors | None:
-    """Compute the errors of an ensemble's Gaussian estimates, in the components that all truths have.
+    """Compute the errors of the Gaussian estimates of an ensemble, in components that all truths have.
 
     An axis or a quaternion is judged as a whole or not at all. The result is None if a run has no truth
-    topic, if the truths have no component in common with the estimates (see
-    `components_without_truth`), or if their planes cannot be compared (see `unlike`). A truth in
-    another tangent plane is transformed to that of the estimates.
+    topic, if truths and estimates have no common component (see `components_without_truth`), or if their
+    tangent planes cannot be compared (see `unlike`). A truth in a different tangent plane is transformed
+    to that of the estimates.
 
     Args:
         estimates: the stream, or a block of it.
@@ -228,7 +228,7 @@ def errors_of(
         gap_limit_s: longest gap in s over which the truth is interpolated.
         steps: (runs,) number of earlier estimates of each run.
         first_run: number of the first run.
-        first_fixes: origins of planes of estimates whose channels state none.
+        first_fixes: origins of the tangent planes of estimates whose channels state no origin.
 
     Raises BadInput if the stream does not state its components, or if a truth states another kind for
     one of them.
@@ -298,7 +298,7 @@ def _heading_of(state: Floats, components: Components) -> Floats | None:
 
 
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
-    """Return the components of a Gaussian estimate stream that the truth of some run lacks.
+    """Return the components of a stream of Gaussian estimates that the truth of some run lacks.
 
     An axis or a quaternion is included as a whole if one of its components is missing. The result is
     empty if a run has no truth topic at all. Raises BadInput if the stream does not state its
@@ -321,7 +321,7 @@ def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tu
 
 
 def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Explain what of a Gaussian estimate stream is not judged, and why; empty if all is judged."""
+    """Explain which components of Gaussian estimates are not judged, and why; empty if all are."""
     what = " ".join(filter(None, split_topic(estimates.stream.topic)))
     if why := unlike(estimates.stream, sources, first):
         return f"{what}: not judged: {why}"
@@ -345,7 +345,7 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
 
 
 def unestimated(estimates: Stream, sources: Sequence[Source]) -> list[str]:
-    """Return the sensor errors among the truth's components that the estimates lack."""
+    """Return the sensor errors that are components of the truth but not of the estimates."""
     topic = estimates.metadata.get("truth", "")
     if not all(topic in source.topics for source in sources):
         return []
@@ -358,7 +358,7 @@ def unestimated(estimates: Stream, sources: Sequence[Source]) -> list[str]:
 
 
 def _components(stream: Stream) -> dict[str, Any]:
-    """Return names and kinds of an estimate's components; raise BadInput if it states none."""
+    """Return names and kinds of the components of estimates; raise BadInput if none are stated."""
     names = stream.components
     kinds = stream.metadata.get("kinds", "").split(",")
     if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):
@@ -377,10 +377,10 @@ def reference(
     gap_limit_s: float,
     plane: Origin | None = None,
 ) -> Floats:
-    """Interpolate the truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+    """Interpolate true states (n, components) at the stamps of the estimates of a run; see `truth_at`.
 
-    If the truth states the origin of another tangent plane than that of the estimates, it is transformed
-    to theirs.
+    If the truth states the origin of a different tangent plane, it is transformed to that of the
+    estimates.
 
     Raises BadInput if the truth lacks a component.
     """
@@ -396,7 +396,7 @@ def reference(
 
 
 def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
-    """Extract the innovations of an ensemble whose first run has this number."""
+    """Extract the innovations of an ensemble; `first_run` is the number of its first run."""
     estimator, case = split_topic(stream.stream.topic)
     return Innovations(
         estimator,

@@ -1,4 +1,4 @@
-"""Transformation of targets' true positions into the frame of estimates, by a truth of its pose."""
+"""Transformation of true positions of targets into the frame of estimates by its true pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 
 def pose_topic(topics: Mapping[str, Topic], frame: str, into: str) -> str | None:
-    """Find the truth that states the pose of a frame in another one."""
+    """Find the truth that states the pose of one frame in another frame."""
     for topic in topics_of(topics, schemas.TRUTH_STATE):
         stated = topics[topic].metadata
         is_pose = POSE.keys() <= set(stated.get("components", "").split(","))
@@ -51,10 +51,10 @@ def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Map
 def seen_in(
     frame: str, truths: Truths, topic: str, places: Floats, time_ns: Integers, gap_limit_s: float
 ) -> Floats:
-    """Transform the positions of a target into a frame; a pose stated only once holds at all times.
+    """Transform the positions of a target into a frame; a pose that is stated once applies to all times.
 
     Args:
-        frame: see `frame_of`; `not_comparable` has no objection to it.
+        frame: see `frame_of`; `not_comparable` must be empty for it.
         truths: truths of the run.
         topic: the truth of the target.
         places: (n, axes) in the frame of this topic, x and y first; heights are not changed.

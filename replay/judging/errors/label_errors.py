@@ -1,4 +1,4 @@
-"""Errors of several objects together, with the estimators' labels or the best labels of each step.
+"""Joint errors of several objects, with the labels of the estimator or the best labels of each step.
 
 Source of the total error: Zhang et al., "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., objects, axes).
@@ -16,15 +16,15 @@ MOST_PERMUTED = 6
 
 
 def total_error(squared: Floats) -> Floats:
-    """Compute (20): the root of the mean over objects of their squared errors, (..., steps).
+    """Compute the root mean square error over objects (..., steps), (20).
 
-    It is the root of a sum; the text of the paper describes a sum of roots.
+    This is the root of a sum; the text of the paper describes a sum of roots.
     """
     return np.sqrt(np.mean(squared, axis=-1))
 
 
 def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """Compute the summed squared errors (...,) with every estimate keeping its label.
+    """Compute the sum of squared errors (...,) over objects; every estimate keeps its label.
 
     Args:
         estimates: (..., objects, axes).
@@ -34,15 +34,15 @@ def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
 
 
 def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = np.inf) -> Floats:
-    """Compute the smallest summed squared errors (...,) over all labellings of the estimates.
+    """Compute the smallest sum of squared errors (...,) over all labellings of the estimates.
 
-    No error counts for more than the squared cutoff. With a cutoff this is GOSPA (alpha = 2, order 2)
-    squared, because there are as many estimates as truths.
+    Each squared error is limited to the squared cutoff. With a cutoff, the result is the squared GOSPA
+    (alpha = 2, order 2), because there are as many estimates as truths.
 
     Args:
         estimates: (..., objects, axes).
         truths: (..., objects, axes), with as many objects.
-        cutoff_m: longest distance in m that counts.
+        cutoff_m: upper limit of a distance, in m.
     """
     count = estimates.shape[-2]
     distance = np.sum((estimates[..., :, None, :] - truths[..., None, :, :]) ** 2, axis=-1)

@@ -1,4 +1,4 @@
-"""Moments at which estimates are worst: the largest NEES, and the largest error."""
+"""Moments of the worst estimates: the largest NEES and the largest error."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -15,9 +15,9 @@ class Moment(NamedTuple):
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
-        case: what it estimates, such as `robot1`; may be empty.
-        quantity: `nees`, or the error of the position, or else of the orientation, or else of all
-            components with the unit of the first, such as `error_m` of several targets.
+        case: name of the estimated object, such as `robot1`; may be empty.
+        quantity: `nees`, or the main error: that of the position, otherwise of the orientation,
+            otherwise of all components with the unit of the first, such as `error_m` of several targets.
         value: the quantity at this moment.
         run: the number of the run.
         time_ns: stamp in ns.
@@ -40,7 +40,7 @@ class Moment(NamedTuple):
 
 
 class Moments:
-    """The worst moments of each estimator and case, for any number of runs."""
+    """Worst moments of each estimator and case, for any number of runs."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, str, str], Moment] = {}
@@ -80,12 +80,12 @@ class Moments:
 
 
 def worst_of(moments: Iterable[Moment]) -> Moment | None:
-    """Return the moment of the largest NEES, or without NEES that of the largest error."""
+    """Return the moment of the largest NEES or, if there is no NEES, of the largest error."""
     return max(moments, key=lambda each: (each.quantity == NEES, _size(each)), default=None)
 
 
 def _main(errors: Errors) -> tuple[str, list[int], float]:
-    """Return the name of an estimate's main error, its columns, and the factor to its unit."""
+    """Return the name of the main error of estimates, its columns, and the factor to its unit."""
     name, columns, scale = errors.main
     if errors.position or errors.rotation:
         return name.replace("rmse", "error"), columns, scale

@@ -1,4 +1,4 @@
-"""Test whether estimates and their truth are positions in local tangent planes that can be compared."""
+"""Test whether estimates and their truth are in local tangent planes that can be compared."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,13 +18,14 @@ from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.sources import Source
 
-ALIGNED = "aligned"  # in the metadata of estimates that were aligned with the truth's frame
-# By estimator and case, as in topics: for every run, the first fix, the origin of its tangent plane.
+ALIGNED = "aligned"  # in the metadata of estimates that were aligned with the frame of the truth
+# By estimator and case, as in topics, the first fix of every run, which is the origin of its tangent
+# plane.
 FirstFixes = Mapping[str, Sequence[Origin | None]]
 
 
 def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]:
-    """Read the origins that no channel states from a replay's outputs: first fixes, run by run."""
+    """Read origins that no channel states, the first fix of every run, from the outputs of a replay."""
     return {
         topic.rpartition("/")[0]: [
             Origin(*map(float, place)) if np.isfinite(place).all() else None
@@ -38,7 +39,7 @@ def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]
 
 
 def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | None]:
-    """Return the origin of the estimates' plane in every run; None if it is not known."""
+    """Return the origin of the estimates' tangent plane in every run; None if it is not known."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return list(first.get(stream.topic.rpartition("/")[0], [None] * runs))
@@ -48,9 +49,9 @@ def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | Non
 def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
     """Explain why estimates cannot be compared with the truth of some run; empty if they can.
 
-    Planes whose origins are known can be compared. A truth that states no origin is in the plane of its
-    log, if the log has one, unless the truth has a frame of its own; estimates of a filter that set its
-    origin at the first fix are not in this plane.
+    Tangent planes with known origins can be compared. A truth that states no origin is in the tangent
+    plane of its log, if the log states one, unless the truth has a separate frame; estimates of a filter
+    with its origin at the first fix are not in this tangent plane.
 
     Args:
         stream: the estimates.

@@ -1,4 +1,4 @@
-"""Limits of trajectory figures: a truth without orientations, an imprecise alignment."""
+"""Limits of trajectory figures due to a truth without orientations or an imprecise alignment."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +8,12 @@ from fuselog.recorders.trajectories import Trajectory
 from fuselog.replay.judging.errors.alignment import Align, rotation_error_rad
 
 Floats = NDArray[np.float64]
-# Orientations that stay within STILL_RAD never turn; a path or an estimate that turns by more than
-# TURNS_RAD shows that they are not real.
+# Orientations within STILL_RAD count as constant; if the path or the estimate turns by more than
+# TURNS_RAD, constant orientations are not real.
 STILL_RAD, TURNS_RAD = 1e-6, np.radians(20.0)
 # An alignment whose rotation is less precise is reported.
 LOOSE_DEG = 1.0
-# Beyond this, an interval from the slope at the best rotation is meaningless.
+# If the interval is wider than this, its linearisation at the best rotation is meaningless.
 UNKNOWN_DEG = 60.0
 UNTURNED = (
     "its orientations are constant although its path or the estimate turns; it is treated as positions "
@@ -22,10 +22,10 @@ UNTURNED = (
 
 
 def lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
-    """Test whether a truth of positions only was written with orientations that never turn.
+    """Test whether a truth consists of positions only, with constant orientations as placeholders.
 
-    They are constant although the path turns, or the estimate turns and the path does not follow their
-    direction.
+    The orientations are constant although the path turns, or although the estimate turns and the path
+    does not follow their direction.
     """
     if truth.rotation is None or estimate.rotation is None or len(truth) < 2:
         return False
@@ -43,9 +43,9 @@ def _turned_rad(rotation: Floats) -> Floats:
 
 
 def _courses(trajectory: Trajectory) -> Floats:
-    """Compute the directions (k, 3) of a path, each over a tenth of its extent; empty for one at rest.
+    """Compute the directions (k, 3) of a path, each over a tenth of its extent; empty without motion.
 
-    Over this distance, errors of single positions do not matter.
+    Over this distance, errors of single positions are negligible.
     """
     place = trajectory.position_m
     step_m, ends = 0.1 * float(np.linalg.norm(place - place[0], axis=1).max()), [0]
@@ -63,7 +63,7 @@ def _angle_rad(course: Floats, direction: Floats) -> float:
 
 
 def doubts_of_alignment(estimate: Trajectory, truth: Trajectory, align: Align) -> list[str]:
-    """Return a sentence if positions determine the alignment's rotation only imprecisely."""
+    """Return a sentence if the positions do not determine the rotation of the alignment precisely."""
     known_deg = np.degrees(rotation_error_rad(estimate.position_m, truth.position_m, align))
     if known_deg <= LOOSE_DEG:
         return []

@@ -1,8 +1,8 @@
-"""Trajectories compared with truth: absolute and relative pose errors, APE and RPE.
+"""Comparison of trajectories with the truth: absolute and relative pose errors (APE, RPE).
 
 Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems", IROS
-2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the figures
-agree with it.
+2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the figures agree
+with those of evo.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,11 @@ Integers = NDArray[np.int64]
 DeltaUnit = Literal["m", "frames", "s"]
 Association = Literal["nearest", "interpolated"]
 POSE_KINDS = ("linear",) * 3 + ("quaternion",) * 4
-# Longest grid for the time offset.
+# Largest number of grid points for the time offset.
 MOST_STEPS = 1 << 20
 # Number of offsets on the grid, and number of the best ones from which the search continues.
 GRID, STARTS = 65, 4
-# Most steps from the peak of the correlation to the best offset; it takes a few.
+# Maximum number of steps from the peak of the correlation to the best offset; usually a few suffice.
 MOST_MOVES = 50
 
 
@@ -40,9 +40,10 @@ class Comparison:
     Attributes:
         align: see `alignment_of`.
         delta: length of the parts of the path over which relative errors are computed.
-        delta_unit: "m" along the estimate's path, "frames" (poses) or "s".
-        association: "nearest" pairs each pose of the shorter trajectory with the nearest in time of the
-            longer, as evo does; "interpolated" interpolates the truth at the stamps of the estimate.
+        delta_unit: unit of `delta`: "m" along the estimated path, "frames" (poses) or "s".
+        association: "nearest" pairs each pose of the shorter trajectory with the nearest pose in time of
+            the longer one, as evo does; "interpolated" interpolates the truth at the stamps of the
+            estimate.
         max_difference_s: largest difference in s of paired stamps, for "nearest".
         gap_limit_s: longest gap in s over which the truth is interpolated.
         time_offset_s: offset in s added to the estimate's stamps; "estimate" estimates it.
@@ -80,13 +81,13 @@ class Compared(NamedTuple):
     """Estimated trajectory compared with the true one, pose by pose.
 
     Attributes:
-        estimate: the poses that have truth, aligned with it.
+        estimate: the poses with a truth, aligned with the truth.
         truth: the truth at these poses.
         alignment: the alignment that was applied.
         time_offset_s: the offset that was added to the estimate's stamps.
         without_truth: number of the estimate's poses without truth.
-        absolute_m, absolute_deg: (n,) APE; degrees are None if a trajectory has no rotation.
-        last: (k,) the last poses of the pairs of RPE.
+        absolute_m, absolute_deg: (n,) APE; degrees are None if a trajectory has no orientations.
+        last: (k,) indices of the last poses of the RPE pairs.
         relative_m, relative_deg: (k,) RPE.
         doubts: sentences on the limits of the figures.
     """
@@ -117,13 +118,13 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
         shifted = compare(estimate, truth, replace(comparison, time_offset_s=offset_s))
-        with suppress(BadInput):  # such as stamps that are far apart without the offset
+        with suppress(BadInput):  # for example, stamps are far apart without the offset
             as_it_is = compare(estimate, truth, replace(comparison, time_offset_s=0.0))
             if np.mean(as_it_is.absolute_m**2) <= np.mean(shifted.absolute_m**2):
                 return as_it_is
         return shifted
     if offset_s:
-        _stamps(truth)  # without stamps, the offset would be ignored silently
+        _stamps(truth)  # without stamps, the offset would be silently ignored
         estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
     matched, true = associate(estimate, truth, comparison)
     doubts = [f"{true.name}: {UNTURNED}"] if lacks_rotations(true, matched) else []
@@ -184,7 +185,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """Find the times that have one of the others within a limit, and the nearest of these."""
+    """Find the times that have another time within a limit, and the nearest other time of each."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
@@ -195,7 +196,7 @@ def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, 
 def _interpolated(
     truth: Trajectory, time_ns: Integers, gap_limit_s: float
 ) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """Interpolate the truth at the stamps at which it is known, and return which these are."""
+    """Interpolate the truth at stamps; return it where it is known, and mark these stamps."""
     poses = truth.position_m
     if truth.rotation is not None:
         quaternion = Rotation.from_matrix(truth.rotation).as_quat(scalar_first=True)
@@ -217,7 +218,7 @@ def _stamps(trajectory: Trajectory) -> Integers:
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
-    """Find the first and last poses of consecutive parts of the path, each just over the delta."""
+    """Find the first and last poses of consecutive parts of the path, each just above the delta."""
     unit, delta = comparison.delta_unit, comparison.delta
     steps: NDArray = np.ones(len(estimate) - 1)
     if unit == "m":
@@ -241,7 +242,7 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
 
 
 def _way(trajectory: Trajectory, first: Integers, last: Integers) -> Floats:
-    """Compute the displacements (k, 3) of pairs, in the first pose's frame if it has an orientation."""
+    """Compute the displacements (k, 3) of pairs, in the frame of the first pose if it is known."""
     way = trajectory.position_m[last] - trajectory.position_m[first]
     rotation = trajectory.rotation
     return way if rotation is None else np.einsum("kji,kj->ki", rotation[first], way)
@@ -294,11 +295,12 @@ def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
 
 
 def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
-    """Estimate the offset in s to add to the estimate's stamps that minimises its distance to the truth.
+    """Estimate the offset, in s, of the estimate's stamps that minimises the distance to the truth.
 
-    The RMSE of aligned positions is minimised. The local search starts from the best of the following
-    offsets: those at which the speeds of both trajectories, which no alignment changes, correlate most;
-    a grid of all that leave half of the poses with truth; and zero.
+    The offset is added to the stamps and minimises the RMSE of aligned positions. The local search
+    starts from the best of these offsets: those with the highest correlation of the speeds of both
+    trajectories, which no alignment changes; a grid of all offsets that leave half of the poses with
+    truth; and zero.
 
     Raises BadInput if a trajectory has no stamps, or if its speed never changes.
     """
@@ -360,7 +362,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 def _best_lags(estimate: Floats, truth: Floats) -> Integers:
     """Find the lags at the highest peaks of the correlation of two signals.
 
-    It is Pearson's correlation of the overlap, which is at least half of the shorter signal.
+    The correlation is Pearson's, over an overlap of at least half of the shorter signal.
     """
     from scipy.signal import correlate, correlation_lags  # slow to import
 

@@ -1,4 +1,4 @@
-"""Conversion between trajectories and the streams of estimates and truths in a log."""
+"""Conversion between trajectories and streams of estimates or truths in a log."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,7 +53,7 @@ def _of_poses(stream: Stream) -> Trajectory:
 
 
 def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
-    """Convert a trajectory to an estimate stream with those of the truth's components that it has.
+    """Convert a trajectory to a stream of estimates with the components that the truth also has.
 
     Its covariance is zero, so it has no NEES.
 

@@ -1,7 +1,7 @@
-"""Truths, read along with the estimates so that only the messages around their stamps are in memory.
+"""Reading of truths along with the estimates, with only the messages around their stamps in memory.
 
-A truth that is stated twice, by one topic or by two, is doubtful; messages are checked for this as they
-are read.
+A truth that is stated twice, by one topic or by two, is doubtful; messages are checked for this during
+reading.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ class Doubt(NamedTuple):
 
 
 class Truths:
-    """Truths of one run, for readers that each read them in order of time."""
+    """Truths of one run, for several readers, each in order of time."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -53,8 +53,8 @@ class Truths:
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
         """Return the messages of a topic that determine the truth at some stamps.
 
-        `reader` identifies the caller. Messages before the stamps of all readers are dropped, and read
-        again for a new reader that asks for them.
+        `reader` identifies the caller. Messages before the stamps of all readers are dropped, and are
+        read again if a new reader needs them.
         """
         if len(time_ns) == 0:
             return self.source.empty(topic)
@@ -73,7 +73,7 @@ class Truths:
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """Return how a truth of estimates is stated twice: at one stamp, or by two topics."""
+        """Return the doubts about truths that are stated twice, at one stamp or by two topics."""
         found: dict[str, list[str]] = {}
         judging = {topic for topic, _ in self._reached} | self._forgotten
         for (topic, other), apart in self._apart.items():
@@ -120,7 +120,7 @@ class Truths:
             self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
 
     def _current(self, topic: str) -> Stream:
-        """Return the messages kept of a topic, from the last one that some reader may still need."""
+        """Return the stored messages of a topic, from the first that a reader may still need."""
         held = self._parts[topic]
         readers = [at_ns for (of, _), at_ns in self._reached.items() if of == topic]
         passed_ns = min(readers or self._reached.values(), default=-1)
@@ -141,7 +141,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """Compute the difference of two truths by component, at the stamps of the first within the other."""
+    """Compute the difference of two truths by component, at stamps of the first in the other's span."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

@@ -1,4 +1,4 @@
-"""Detection of components that no measurement affects: they keep their initial mean and variance."""
+"""Detection of components that no measurement affects, which keep their initial mean and variance."""
 
 from dataclasses import dataclass, field
 
@@ -10,19 +10,19 @@ from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.vectors.components import stated_components
 from fuselog.replay.engine.vectors.tangent import tangent_components
 
-FEWEST = 10  # estimates of a run; with fewer, no measurement may have been processed yet
-MOVED = 1e-9  # in standard deviations, and as a fraction of the variance
+FEWEST = 10  # number of estimates of a run; with fewer, possibly no measurement has been processed yet
+MOVED = 1e-9  # tolerances: in standard deviations, and as a fraction of the variance
 
 
 @dataclass
 class Uninformed:
-    """Components of one estimate stream whose mean never changed and whose variance never decreased.
+    """Components of a stream of estimates whose mean never changed and whose variance never decreased.
 
     Attributes:
         names: components that are linear or angles.
         still: (names,), whether each is unchanged in all runs.
         first: by run, the mean and variance (names,) of its first estimate.
-        most: the largest number of estimates of a run.
+        most: largest number of estimates of any run.
     """
 
     names: list[str] = field(default_factory=list)

@@ -1,1 +1,1 @@
-"""Metrics: the numbers computed from errors, innovations and other outputs; begin with `measuring`."""
+"""Metrics, which compute numbers from errors, innovations and other outputs; begin with `measuring`."""

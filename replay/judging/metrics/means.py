@@ -1,6 +1,7 @@
-"""Means over runs and time spans of estimators' diagnostics.
+"""Means of estimator diagnostics over runs and time spans.
 
-These are the probabilities of modes, the effective share of particles, and out-of-sequence messages.
+The diagnostics are probabilities of modes, the effective share of particles, and out-of-sequence
+messages.
 """
 
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from fuselog.replay.judging.metrics.sums import BinnedSums
 if TYPE_CHECKING:
     import pandas as pd
 
-# The most time spans, and their shortest length in ns; lengths are doubled as needed.
+# Largest number of time spans, and their shortest length in ns; lengths are doubled as needed.
 SPANS = 1024
 SPAN_NS = 1_000_000
 MODES, SMOOTHED_MODES, EFFECTIVE = "modes", "smoothed_modes", "effective_share"
@@ -32,7 +33,7 @@ class OutputDiagnostics(NamedTuple):
     """Diagnostics in one output.
 
     Attributes:
-        what: one of the names above.
+        what: kind of diagnostics, one of the names above.
         names: names of the values.
         values: (n, names), NaN in rows without a value.
     """
@@ -43,7 +44,7 @@ class OutputDiagnostics(NamedTuple):
 
 
 def diagnostics_of(output: Output) -> OutputDiagnostics | None:
-    """Extract the diagnostics in an output that have a mean over time; None if it has none."""
+    """Extract the diagnostics in an output that have a mean over time; None if there are none."""
     stream = output.rows.stream
     schema = stream.schema.full_name
     if schema == schemas.MODE_PROBABILITIES.full_name:
@@ -75,9 +76,9 @@ class Means:
     """Sums over the runs of the diagnostics in one stream.
 
     Attributes:
-        estimator, case: the estimator and what it estimates.
+        estimator, case: the estimator and the estimated object.
         what, names: see `OutputDiagnostics`.
-        sums: sums of the time since the epoch (s) and of every value, by this time.
+        sums: sums of the time since the epoch (s) and of every value, in bins of this time.
     """
 
     estimator: str
@@ -97,7 +98,7 @@ class Means:
 
     @property
     def table(self) -> "pd.DataFrame":
-        """Return one row per time span: mean time, number of messages, mean of every value."""
+        """Return a table with one row per time span: mean time, number of messages, mean values."""
         import pandas as pd  # slow to import
 
         _, count, sums = self.sums.filled()
@@ -157,7 +158,7 @@ class MeansOfAll:
     def late(self) -> "Iterator[pd.DataFrame]":
         """Yield tables of out-of-sequence messages: a row per time span and treatment.
 
-        `late_s` is their mean delay, `repeated` the mean number of other messages that were reprocessed.
+        `late_s` is the mean delay, `repeated` the mean number of other messages that were reprocessed.
         """
         for what, table in self._tables(*LATE):
             table.insert(2, "became", what)

@@ -1,7 +1,7 @@
-"""Definition of a metric, and the collection of metrics that computes the numbers of a replay.
+"""Definition of metrics, and collections of metrics that compute the numbers of a replay.
 
-Metrics are registered by name, as estimators are. A metric is fed block by block, and its states can be
-merged: over the blocks of a long log, the runs of an ensemble, or the workers of a campaign.
+Metrics are registered by name, as estimators are. A metric processes block after block, and its states
+can be merged: over the blocks of a long log, the runs of an ensemble, or the workers of a campaign.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ class Output(NamedTuple):
 
     Attributes:
         estimator: label of the estimator.
-        case: what it estimates, such as `robot1`; may be empty.
+        case: name of the estimated object, such as `robot1`; may be empty.
         leaf: last part of the topic name.
         rows: the messages, run by run.
         sources: sensor streams and truth of each run.
@@ -42,20 +42,20 @@ State = TypeVar("State", bound=Any)
 
 @dataclass(frozen=True)
 class Metric(Generic[Judged, State]):
-    """Registered metric: its description, its input, and how it is computed.
+    """Registered metric: description, input, and functions that compute it.
 
     Attributes:
         summary: one-line description.
         judges: type of the input: `Errors` for metrics of estimates and truth, `Innovations` for
             metrics of a filter's innovations, the type that an entry point `fuselog.judges` returns,
             such as `SetErrors`, or `Output` for all messages.
-        start: start() -> the state without any input.
+        start: start() -> the initial state, without any input.
         add: add(state, block) -> the state after one more block; it may modify the given state. The
-            blocks of a run come in order of time.
-        merge: merge(first, second) -> the state of both parts, which have no run in common.
+            blocks of a run are in order of time.
+        merge: merge(first, second) -> the combined state of two parts, which have no run in common.
         finish: finish(state) -> numbers by name, as `quantity_unit`; empty if there are none.
 
-    Most metrics are made of sums: see `metric_of_sums`.
+    Most metrics are computed from sums; see `metric_of_sums`.
     """
 
     summary: str
@@ -66,7 +66,7 @@ class Metric(Generic[Judged, State]):
     finish: Callable[[State], Mapping[str, float]]
 
     def of(self, judged: Judged) -> Mapping[str, float]:
-        """Compute the numbers of `judged` as a single block."""
+        """Compute the numbers for `judged` as a single block."""
         return self.finish(self.add(self.start(), judged))
 
 
@@ -84,7 +84,7 @@ def metric_of_sums(
     Args:
         summary: one-line description.
         judges: type of the input.
-        sums: sums(block) -> sums by name: numbers and arrays are added up, sets are united.
+        sums: sums(block) -> sums by name: numbers and arrays are added, sets are united.
         finish: finish(sums over all blocks) -> the numbers; without any block, the sums are {}.
 
     Returns:
@@ -104,7 +104,7 @@ def metric_of_sums(
 
 
 def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
-    """Add sums by name: numbers and arrays are added up, sets are united."""
+    """Add sums by name: add numbers and arrays, unite sets."""
     total = dict(first)
     for name, value in second.items():
         if name not in total:
@@ -127,7 +127,7 @@ def metric_key(estimator: str, quantity: str, case: str) -> str:
 class MetricCollection:
     """Collection of metrics that are computed block by block.
 
-    A key identifies what is judged together: one output topic of one estimator.
+    A key identifies one output topic of one estimator, whose blocks are judged together.
     """
 
     def __init__(self, metrics: Mapping[str, Metric[Any, Any]]) -> None:

@@ -22,14 +22,14 @@ from fuselog.replay.judging.metrics.sums import BinnedSums
 
 
 def squares(errors: Errors) -> Sums:
-    """Sum squared errors by the name of their RMSE: of the position, and of every other component."""
+    """Sum squared errors of the position and of every other component, by the name of their RMSE."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
     found |= squares_by_name(errors.squared, errors.components, errors.kinds)
     return found | {rmse_of(name): np.nan for name in errors.components_without_truth}
 
 
 def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
-    """Sum squares (n, d) by the name of their RMSE, see `squares`.
+    """Sum squared errors (n, d) by the name of their RMSE; see `squares`.
 
     Args:
         squared: (n, d), in the squares of the components' units.
@@ -51,7 +51,7 @@ def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[
 
 
 def accuracy(sums: Sums) -> dict[str, float]:
-    """Compute the RMSE of position, orientation and every other component over all runs and steps.
+    """Compute the RMSE of position, orientation and all other components over all runs and steps.
 
     The RMSE of a component without truth is NaN, which is written as null.
     """
@@ -67,14 +67,14 @@ def accuracy(sums: Sums) -> dict[str, float]:
 
 
 def rmse_of(component: str) -> str:
-    """Return the name of a component's RMSE: `turn_rmse_radps` for `turn_radps`."""
+    """Return the name of the RMSE of a component, such as `turn_rmse_radps` for `turn_radps`."""
     quantity, _, unit = component.rpartition("_")
     return f"{quantity}_rmse_{unit}".strip("_")
 
 
 @dataclass
 class Consistent:
-    """Sums of NEES: over everything, and by step over the runs.
+    """Sums of NEES: over all steps and runs, and by step over the runs.
 
     Attributes:
         count, total: number and sum of finite NEES of the state.
@@ -127,7 +127,7 @@ def _merge_nees(first: Consistent, second: Consistent) -> Consistent:
 
 
 def consistency(state: Consistent) -> dict[str, float]:
-    """Compute the mean NEES of state and position, and the fraction of steps within its bounds."""
+    """Compute the mean NEES of state and position, and the fraction of steps within the bounds."""
     if state.count == 0:
         return {}
     values = {"nees": state.total / state.count}
@@ -143,7 +143,7 @@ def consistency(state: Consistent) -> dict[str, float]:
 
 
 def step_bounds(runs: Floats, size: int) -> tuple[Floats, Floats]:
-    """Compute the 95 % bounds of mean NEES over the given numbers of runs: lower and upper, (n,) each.
+    """Compute the lower and upper 95 % bounds (n,) of the mean NEES over the given numbers of runs.
 
     Args:
         runs: (n,), number of runs at each step.
@@ -184,10 +184,10 @@ def _log_likelihoods(innovations: Innovations) -> Sums:
 
 
 def likelihood(sums: Sums) -> dict[str, float]:
-    """Compute the log-likelihood of a run's measurements under the predictions, averaged over runs.
+    """Compute the log-likelihood of the measurements of a run under the predictions, averaged over runs.
 
     Only accepted measurements count, so gates cannot be tuned by this metric. There is no result if the
-    estimator does not state the likelihood of all of them.
+    estimator does not state all likelihoods.
     """
     if not sums.get("runs") or not np.isfinite(sums["log_likelihood"]):
         return {}
@@ -206,9 +206,9 @@ def failures(sums: Sums) -> dict[str, float]:
 
 
 def covered(output: Output) -> Sums:
-    """Sum the spans of the runs, the times estimated, the unused measurements and the ages of estimates.
+    """Sum spans of runs, spans with estimates, unused measurements and ages of estimates.
 
-    The age of an estimate is the time from its stamp to when it was available.
+    The age of an estimate is the time from its stamp to its availability.
     """
     schema, stream = output.rows.stream.schema.full_name, output.rows.stream
     if schema == schemas.GAUSSIAN_ESTIMATE.full_name:
@@ -226,7 +226,7 @@ def covered(output: Output) -> Sums:
 
 
 def coverage(sums: Sums) -> dict[str, float]:
-    """Compute the share of the span that was estimated, the unused measurements, or the mean age."""
+    """Compute the share of the span with estimates, the unused measurements, or the mean age."""
     if "age_s" in sums:
         return {"estimate_age_s": sums["age_s"] / sums["estimates"]} if sums["age_s"] > 0.0 else {}
     if "skipped" in sums:
@@ -236,7 +236,7 @@ def coverage(sums: Sums) -> dict[str, float]:
 
 
 def estimated_share(sums: Sums) -> float | None:
-    """Compute the share of the runs' spans for which there are estimates; None without a span."""
+    """Compute the share of the spans of runs that estimates cover; None without a span."""
     return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
 
 
@@ -257,9 +257,9 @@ def _solved(output: Output) -> Sums:
 
 
 def solution(sums: Sums) -> dict[str, float]:
-    """Compute how batch solutions ended: the share that converged, and the largest number of iterations.
+    """Compute the share of batch solutions that converged, and the largest number of iterations.
 
-    If the start is stated, the mean cost at the end is added; for single iterations, the cost at the
+    If the start is stated, the mean final cost is included; for single iterations, the cost at the
     start.
     """
     if sums.get("starts"):

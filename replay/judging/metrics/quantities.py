@@ -1,4 +1,4 @@
-"""Mergeable sums of the errors of an estimate stream by step and time, and of innovations by run."""
+"""Mergeable sums of the errors of estimates by step and time, and of innovations by run."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -12,11 +12,11 @@ from fuselog.replay.judging.metrics.sums import BinnedSums, Integers
 
 @dataclass
 class Quantities:
-    """Sums of one estimate stream, from which tables and figures are made.
+    """Sums of one stream of estimates, from which tables and figures are made.
 
-    The columns of both sums are elapsed time, squared error of the position, of the rotation and of
-    each component, trace of the main quantity's covariance and of its square, and NEES. `constant` are
-    the sums from which a constant error is detected.
+    The columns of both sums are the elapsed time, the squared error of the position, of the rotation and
+    of each component, the trace of the main quantity's covariance and of its square, and the NEES.
+    `constant` has the sums by which a constant error is detected.
     """
 
     errors: Errors  # the last block, for its names and kinds
@@ -32,7 +32,7 @@ class Quantities:
 
 
 def columns_of(errors: Errors) -> Floats:
-    """Compute the rows (n, 6 + d) to be summed; see `Quantities`."""
+    """Compute the rows (n, 6 + d) to sum; see `Quantities`."""
     squared = errors.squared
     main = errors.main.columns
     covariance = errors.covariance[:, main][:, :, main]
@@ -50,11 +50,11 @@ def columns_of(errors: Errors) -> Floats:
 
 
 class OfRuns(NamedTuple):
-    """Statistics of innovations, of each run (runs,) or of all runs.
+    """Statistics of innovations, for each run (runs,) or for all runs.
 
     Attributes:
         messages, accepted: number of innovations, and number of those that a gate accepted.
-        degrees, accepted_degrees: number of measured components of these.
+        degrees, accepted_degrees: numbers of measured components of these innovations.
         squared: the sum of NIS.
         log_likelihood: sum over accepted innovations; NaN if it is not stated for all of them.
     """
@@ -68,7 +68,7 @@ class OfRuns(NamedTuple):
 
 
 class InnovationSums:
-    """Sums of one innovation stream by run, starting with a first run."""
+    """Sums of one stream of innovations by run, starting with a first run."""
 
     def __init__(self, first_run: int) -> None:
         self.first_run = first_run

@@ -8,12 +8,12 @@ Integers = NDArray[np.int64]
 
 
 class BinnedSums:
-    """Sums of rows of numbers (n, columns) by group and by bin of a position, an integer from 0 on.
+    """Sums of rows of numbers (n, columns) by group and by bin of a position, an integer >= 0.
 
     Bin b contains the positions from b width to (b + 1) width. If there is a `limit` of bins per group,
-    the width doubles as often as needed to keep it. `cells` limits the number of bins of all groups in
-    the same way, but only when sums are merged. `first` is the first group; nothing is stored for
-    groups before it.
+    the width is doubled until the limit is met. `cells` limits the number of bins of all groups in the
+    same way, but only when sums are merged. `first` is the first group; nothing is stored for groups
+    before it.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class BinnedSums:
         self._groups = 0
 
     def add(self, position: Integers, values: Floats, group: Integers | None = None) -> None:
-        """Add rows (n, columns) at positions (n,) to groups (n,), by default all to the first group."""
+        """Add rows (n, columns) at positions (n,) to groups (n,), or to the first group by default."""
         if len(position) == 0:
             return
         group = np.zeros(len(position), np.int64) if group is None else group - self._first
@@ -52,7 +52,7 @@ class BinnedSums:
             part[:, :, 1 + column] += sums.reshape(shape)
 
     def merge(self, other: "BinnedSums") -> None:
-        """Add other sums with the same columns, which have no group before the first one here."""
+        """Add other sums with the same columns, whose groups do not begin before the first group here."""
         theirs = other._sums[: other._groups, : other._bins]
         while self.width < other.width:
             self._double()
@@ -69,7 +69,7 @@ class BinnedSums:
             self._double()
 
     def filled(self) -> tuple[Integers, Floats, Floats]:
-        """Return the cells that have rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
+        """Return the cells with rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
         used = self._sums[: self._groups, : self._bins]
         cells = np.argwhere(used[:, :, 0] > 0)
         rows = used[cells[:, 0], cells[:, 1]]
@@ -86,7 +86,7 @@ class BinnedSums:
         self.width *= 2
 
     def _reserve(self, groups: int, bins: int) -> None:
-        """Grow the arrays if necessary, with room to spare so that they are rarely copied."""
+        """Grow the arrays if necessary, with extra room so that they are rarely copied."""
         there = self._sums.shape
         self._groups, self._bins = max(self._groups, groups), max(self._bins, bins)
         if groups > there[0] or bins > there[1]:
