@@ -139,7 +139,7 @@ def _sights(stream: Stream) -> Made:
     turned = Rotation.from_quat(seen["quaternion"], scalar_first=True)
     forward = Rotation.from_euler(
         "y", -0.5 * np.pi
-    )  # rotates x to z, which is the line of sight if both angles are zero
+    )  # rotates x to the line of sight if both angles are zero
     lines = (turned * Rotation.from_euler("YX", angles[known]) * forward).as_quat(scalar_first=True)
     for row, pose in enumerate(_in_frame(seen, seen["position_m"], lines)):
         yield "pose", pose, int(known[row])
