@@ -1,4 +1,4 @@
-"""The command `fuselog explore`: it serves the page until it is closed."""
+"""The command `fuselog explore`, which serves the page until it is closed."""
 
 from collections.abc import Sequence
 from pathlib import Path

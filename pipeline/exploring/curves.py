@@ -1,4 +1,4 @@
-"""The curves of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
+"""The curves of one replay of a filter: paths, errors, NEES, NIS, whiteness, likelihood."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,8 +22,8 @@ from fuselog.replay.judging.errors.evaluation import (
 )
 
 Floats = NDArray[np.float64]
-BIN_S = 1.0  # NIS is drawn as means over this time
-LINES = 400  # most points of a curve, so that it follows the slider
+BIN_S = 1.0  # time in s over which NIS is averaged for its curve
+LINES = 400  # largest number of points in a curve; more would delay it behind the slider
 
 
 class Path(NamedTuple):
@@ -48,14 +48,14 @@ class Case:
 
     Attributes:
         name: its name; may be empty.
-        components, kinds: those of the state's tangent space.
+        components, kinds: components of the state's tangent space, and their kinds.
         path: the path of the estimate; None if it has no position.
         covariance: (n, 2, 2) of the positions on the path.
-        sigma: (n, d) as the filter states it at `time_s` (n,).
-        errors: errors against truth; None without truth.
+        sigma: standard deviations (n, d) at `time_s` (n,), according to the filter.
+        errors: errors relative to the truth; None without truth.
         nis: NIS over time; None without innovations.
-        whiteness: by measured component.
-        log_likelihood: of all measurements; NaN if the filter states none.
+        whiteness: whiteness of the innovations, by measured component.
+        log_likelihood: that of all measurements; NaN if the filter does not state it.
         beside: the estimates (n,) of parameters in the state, and of components without truth.
     """
 
@@ -85,7 +85,7 @@ def cases_of(
     epoch_ns: int,
     estimated: Sequence[str] = (),
 ) -> dict[str, Case]:
-    """Compute the curves of a filter's outputs on one log, by the name of what is estimated.
+    """Compute the curves of a filter's outputs on one log, by the name of the estimated object.
 
     Args:
         outputs: the outputs, by topic.
@@ -105,7 +105,7 @@ def cases_of(
         if stream.schema.full_name != schemas.GAUSSIAN_ESTIMATE.full_name or not len(rows):
             continue
         case = split_topic(topic)[1]
-        if case in found:  # the first of a filter's estimates is its own, others add to it
+        if case in found:  # the first of a filter's estimates is its own; others supplement it
             continue
         one = _case(case, stream, epoch_ns, of_case.get(case), innovations.get(case))
         found[case] = replace(one, beside=_beside(one, stream, estimated))
@@ -171,16 +171,16 @@ def _of_innovations(
 
 
 def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
-    """Choose rows to draw: evenly spaced, with the first and the last."""
+    """Choose evenly spaced rows to draw, including the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
-    """Choose rows to draw: the extremes of each span, so that no outlier is lost.
+    """Choose the extremes of each span as rows to draw, so that no outlier is lost.
 
     Args:
-        values: (n,); values that are not finite count as 0.
-        most: the largest number of rows; fewer values are all chosen.
+        values: (n,); infinite and NaN values count as 0.
+        most: the largest number of rows; if there are fewer values, all are chosen.
 
     Returns:
         The rows, in ascending order.
@@ -198,11 +198,11 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Floats:
-    """Outline the region of the plane that contains the truth with a probability.
+    """Compute the outline of the region of the plane that contains the truth with a given probability.
 
     Args:
         center: (2,), the estimate.
-        covariance: (2, 2), of the estimate.
+        covariance: (2, 2), that of the estimate.
         probability: the probability with which the ellipse contains the truth.
 
     Returns:
@@ -216,9 +216,9 @@ def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Fl
 
 
 def typical_time_s(case: Case) -> float | None:
-    """Choose the second whose share of errors outside the interval is nearest that of the whole run.
+    """Choose the second whose share of errors outside the interval is closest to the overall share.
 
-    Among several, it is the one in the middle of the run; None without truth.
+    Of several such seconds, choose the one closest to the middle of the run. None without truth.
     """
     if case.errors is None or len(case.errors.nees) == 0:
         return None
@@ -234,7 +234,7 @@ def typical_time_s(case: Case) -> float | None:
 
 
 def instant_of(case: Case | None) -> float:
-    """Return the first instant of the lens: a typical second, or the middle of the run."""
+    """Return the first instant of the lens, which is in a typical second or the middle of the run."""
     if case is None or not len(case.time_s):
         return 0.0
     found = typical_time_s(case)

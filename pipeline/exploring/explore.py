@@ -1,4 +1,4 @@
-"""The function behind `fuselog explore`: a page with sliders for a filter's parameters."""
+"""The Python function for `fuselog explore`: a page with sliders for a filter's parameters."""
 
 import webbrowser
 from collections.abc import Mapping
@@ -21,21 +21,21 @@ def explore(
     gap_limit_s: float = 0.2,
     show: bool = True,
 ) -> "Explorer":
-    """Serve a page on which parameters are dragged while the log is replayed.
+    """Serve a page on which parameters can be dragged while the log is replayed.
 
-    It is served to this machine only, under an address that cannot be guessed. In a notebook, a cell
+    The page is served to this machine only, at an address that cannot be guessed. In a notebook, a cell
     whose last line calls this function shows the page.
 
     Args:
         log: a path, an opened log, or a recording.
-        estimators: one or two, as for `replay`.
-        set: parameters of the filters, and alterations of topics; as for `replay`.
+        estimators: one or two, in the form that `replay` accepts.
+        set: parameters of the filters and alterations of topics, in the form that `replay` accepts.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        show: whether to open it in the browser, except in a notebook.
+        show: whether to open the page in the browser; this has no effect in a notebook.
 
     Returns:
         The server of the page: `url` is its address, `wait()` waits until the last page is closed,
-        `close()` ends it.
+        `close()` ends the server.
 
     Raises BadInput if there are several logs or more than two filters, if a filter cannot follow the
     log, or if the extra `explore` is not installed.

@@ -1,4 +1,4 @@
-"""The page's texts as HTML: verdicts, numbers, labels of sliders. All text is escaped."""
+"""The texts of the page as escaped HTML: verdicts, numbers, labels of sliders."""
 
 from collections.abc import Iterable, Mapping
 from html import escape
@@ -12,12 +12,12 @@ from fuselog.pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
 SIDE = 300  # the width of the sliders' column, in pixels
-SLOW_S = 1.0  # a replay that takes longer is reported
+SLOW_S = 1.0  # a replay that takes longer than this, in s, is reported
 SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
 def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
-    """Write the name of a slider, its value, its ends and the position of the log's own value.
+    """Write the name, value and ends of a slider, and mark the log's own value.
 
     For a parameter in the state, the value is the initial estimate.
     """
@@ -38,7 +38,7 @@ def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str
 
 
 def pre_html(text: str, width: int | None = None) -> str:
-    """Write a text to copy, with this width in pixels if it is given."""
+    """Format a text to copy as HTML, with this width in pixels if it is given."""
     fixed = f";width:{width}px" if width else ""
     return f'<pre style="white-space:pre-wrap;margin:4px 0{fixed}">{escape(text)}</pre>'
 
@@ -51,7 +51,7 @@ def heading_html(log: str) -> str:
 def head_html(
     labels: Iterable[str], played: Mapping[int | str, Played], case: str, estimated: Mapping[str, Slider]
 ) -> str:
-    """Write the text above the plots: verdicts, numbers, parameters estimated in the state."""
+    """Write the text above the plots: verdicts, numbers, and estimates of parameters."""
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
@@ -68,7 +68,7 @@ def head_html(
 
 
 def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
-    """Describe a filter's estimates of the parameters in its state at the end of the log."""
+    """Describe the final estimates of the parameters that are in a filter's state."""
     found = []
     for name, slider in estimated.items():
         if name in case.beside and len(case.time_s):
@@ -91,7 +91,7 @@ def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
 
 
 def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
-    """Write its numbers, above the pinned ones."""
+    """Write the numbers of a filter, and below them those of the pinned result."""
     cells = []
     before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
     for name, (value, unit) in numbers_of(played.cases[case]).items():

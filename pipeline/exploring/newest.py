@@ -1,4 +1,4 @@
-"""A background worker that does only the newest of the waiting requests."""
+"""A background worker that does only the newest of the waiting tasks."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,11 +8,11 @@ Work = Callable[[Callable[[], bool]], None]
 
 
 class NewestFirst:
-    """A thread that does the newest work; older waiting work is dropped.
+    """A thread that does the newest task and drops older ones that have not begun.
 
-    Work receives a function that tells whether newer work waits, so that it can give up. One thread
-    calls `ask` and `end`. At exit, Python waits for the current work, because a thread that is
-    interrupted in NumPy's C++ aborts the process.
+    A task receives a function that tests whether a newer task is waiting, so that it can give up. One
+    thread calls `ask` and `end`. At exit, Python waits for the current task, because interrupting a
+    thread in NumPy's C++ code aborts the process.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -21,13 +21,13 @@ class NewestFirst:
         self._on_error = on_error
 
     def ask(self, work: Work) -> None:
-        """Do this work next, in place of waiting work; nothing after the end."""
+        """Do this task next instead of the waiting one; do nothing after `end`."""
         self._newest += 1
-        with suppress(RuntimeError):  # it has ended, or Python ends
+        with suppress(RuntimeError):  # the worker has ended, or Python is ending
             self._pool.submit(self._do, work, self._newest)
 
     def end(self) -> None:
-        """Stop, and let the current work end early."""
+        """Stop, and let the current task end early."""
         self._newest += 1
         self._pool.shutdown(wait=False)
 

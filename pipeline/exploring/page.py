@@ -1,4 +1,4 @@
-"""The page: sliders, plots and texts, bound to a session. Replays run in the background."""
+"""The page with its sliders, plots and texts, connected to a session. Replays run in the background."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -43,7 +43,7 @@ from fuselog.pipeline.output.words import label_of as label_of_quantity
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import schemas, topics_of
 
-WRAP = {"flex-wrap": "wrap"}  # what does not fit goes below, as on a phone
+WRAP = {"flex-wrap": "wrap"}  # contents that do not fit move below, as on a phone
 # The sliders are to the left of the plots, or below them on narrow screens.
 SIDE_LAST = WRAP | {"flex-direction": "row-reverse", "justify-content": "flex-end"}
 GROW = {"flex": "1 1 350px"}
@@ -55,18 +55,18 @@ class Page:
     Attributes:
         session: the session.
         values: values of parameters that differ from the log's own.
-        played: the last replays, by filter (0, 1, or `PINNED`).
+        played: the newest replays, by filter (0, 1, or `PINNED`).
     """
 
     def __init__(self, session: Session, document: Document) -> None:
-        """Put the page into a document, and replay for the first time."""
+        """Add the page to a document, and replay for the first time."""
         self.session, self._document = session, document
         self.values: dict[str, float] = {}
         self.played: dict[int | str, Played] = {}
         self._work = NewestFirst(self._say_error)
         self._active = session.sliders[0] if session.sliders else None
         self._at_s: float | None = None
-        self._known = dict(session.filters)  # given filters can be chosen again
+        self._known = dict(session.filters)  # filters given by the user can be chosen again
         self._is_setting = False
         self._along: Callable[..., None] = lambda **_: None
         self._make()
@@ -80,13 +80,13 @@ class Page:
 
     def _make(self) -> None:
         log = self.session.log
-        status = {"role": "status"}  # a screen reader says what changes
+        status = {"role": "status"}  # screen readers announce changes
         self._head = Div(name="verdict", sizing_mode="stretch_width", html_attributes=status)
         self._sentences = Div(name="said", sizing_mode="stretch_width", html_attributes=status)
         self._command = Div(name="command", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
-        # its ends are set with the first estimates
+        # its ends are set when the first estimates exist
         self._time = time = time_range(self.session.source.epoch_ns)
         self.truths = topics_of(log.topics, schemas.TRUTH_STATE)
         self.plots: dict[str, Plot] = {
@@ -120,7 +120,7 @@ class Page:
         self._fill_side()
 
     def _fill_side(self) -> None:
-        """Fill the left column: filters, buttons, sliders."""
+        """Fill the left column with filters, buttons and sliders."""
         session = self.session
         heading = Div(text=heading_html(session.source.name), width=SIDE)
         names = list(dict.fromkeys([*self._known, *session.methods]))
@@ -158,7 +158,7 @@ class Page:
         self._side.children = shown
 
     def _label(self, slider: Slider) -> None:
-        """Write the name of a slider, its value, its ends and the log's own value."""
+        """Write the name, value and ends of a slider, and mark the log's own value."""
         value = self.values.get(slider.name, slider.default)
         _, widget, label = self._widgets[slider.name]
         label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
@@ -173,14 +173,14 @@ class Page:
             self._along(case=self._chosen_case())
 
     def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
-        """Show other filters with the same values."""
+        """Replace the filters, with the same values of parameters."""
         first, second = (each.value for each in choices)
         labels = [first] if second in (NONE, first) else [first, second]
         try:
             chosen = {each: self._known.get(each) or self.session.like_first(each) for each in labels}
             session = self.session.with_filters(chosen)
         except BadInput as error:
-            self._fill_side()  # the choices go back to what is drawn
+            self._fill_side()  # restore the choices of the filters that are shown
             self._tell(str(error))
             return
         self._tell()
@@ -310,9 +310,9 @@ class Page:
         self._replay()
 
     def _replay(self) -> None:
-        """Replay with the current values; newer requests replace this one."""
+        """Replay with the current values; a newer request replaces this one."""
         values, session, active = dict(self.values), self.session, self._active
-        self._saved.text = ""  # it belongs to other values
+        self._saved.text = ""  # the text belongs to other values
 
         def work(is_newer: Callable[[], bool]) -> None:
             played: dict[int | str, Played] = {}
@@ -336,7 +336,7 @@ class Page:
         self._work.ask(work)
 
     def _rest(self, along: Callable[..., None]) -> None:
-        """Show the likelihood, and update the plots' accessible names, once a slider rests."""
+        """Show the likelihood and update the plots' accessible names when a slider comes to rest."""
         self._along = along
         self._along(case=self._chosen_case())
         self.plots["likelihood"].show_if_drawn()
@@ -360,7 +360,7 @@ class Page:
             self._component.value = components[0]
 
     def _show(self) -> None:
-        """Draw the last replays and the verdicts."""
+        """Draw the newest replays and the verdicts."""
         case = self._chosen_case()
         component = str(self._component.value or "")
         for place, played in self.played.items():
@@ -405,5 +405,5 @@ class Page:
         self._later(lambda: self._tell(message))
 
     def _later(self, act: Callable[[], object]) -> None:
-        """Schedule a change of the page on the thread that may make it."""
+        """Schedule a change of the page on its own thread."""
         self._document.add_next_tick_callback(act)

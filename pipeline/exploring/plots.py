@@ -1,4 +1,4 @@
-"""The plots of the page: Bokeh figures over sources that change with a drag."""
+"""The plots of the page, which are Bokeh figures with data that change during a drag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,21 +32,21 @@ from fuselog.pipeline.output.words import label_of, quantity
 from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.sources import MemorySource
 
-# The report's ink, quiet grey and crimson; each filter has its colour, and pinned results are grey.
+# The report's black, grey and crimson; each filter has its own colour, and pinned results are grey.
 INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e7eb"
 COLOURS = ("#a35c00", "#1f7a4d")
 PINNED = "pinned"
-SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # so that lags can be distinguished
+SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # wide enough to distinguish lags
 HEIGHT, HEIGHT_OVER_TIME = 220, 235
-LEAST_DROP = 10.0  # least range of log-likelihood in its plot
-ABOUT_PEAK = 3  # values on either side of the peak that are shown
+LEAST_DROP = 10.0  # smallest range of log-likelihood in its plot
+ABOUT_PEAK = 3  # number of values that are shown on each side of the peak
 LEAST_CORRELATION = 0.25
-TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # positions of a slider
+TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # number of positions of a slider
 
 
 @dataclass
 class Plot:
-    """A figure with its changing sources.
+    """A figure with the data that change.
 
     Attributes:
         figure: the Bokeh figure.
@@ -67,7 +67,7 @@ class Plot:
         self.figure.title.text = title
 
     def name(self) -> None:
-        """Set the title for screen readers; this is slow, and so done only once a slider rests."""
+        """Set the title for screen readers; this is slow, so it waits until a slider rests."""
         self.figure.html_attributes = {"role": "img", "aria-label": self.figure.title.text}
 
     def show_if_drawn(self) -> None:
@@ -81,7 +81,7 @@ class Plot:
                 self.fill(of, what, **{name: [] for name in self.sources[own, what].data})
 
     def fill(self, of: int | str, what: str, **columns: Any) -> None:
-        """Set the data of a source if the source exists and the data differs."""
+        """Set the data of a source if the source exists and the data are different."""
         if (of, what) not in self.sources:
             return
         source = self.sources[of, what]
@@ -90,7 +90,7 @@ class Plot:
 
 
 def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
-    """Make an empty figure in the page's style, without a tool bar."""
+    """Make an empty figure in the style of the page, without a tool bar."""
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
@@ -124,7 +124,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
-    """Make the plot of one component's errors, tinted over the 95 % interval that the filter states."""
+    """Make the plot of a component's errors, with the 95 % interval that the filter states tinted."""
     plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
     plot.figure.yaxis.ticker = FixedTicker(ticks=[])
     for of in (1, 0):
@@ -137,7 +137,7 @@ def error_plot(over_time: Range1d, cursor: Span) -> Plot:
 
 
 def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
-    """Make a logarithmic plot of NEES or NIS over time, grey over the interval if consistent."""
+    """Make a logarithmic plot of NEES or NIS over time, with the consistent interval in grey."""
     plot = blank(name, title, over_time=over_time, y_range=Range1d(0.1, 100.0), y_axis_type="log")
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT, fill_alpha=1.0)
@@ -149,7 +149,7 @@ def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
 
 
 def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
-    """Make the plot of the plane from above: map, truth, estimates."""
+    """Make the view from above, with map, truth and estimates."""
     plot = blank("scene", "Scene from above (m)", match_aspect=True)
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     points = map_points(log)
@@ -167,7 +167,7 @@ def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
 
 
 def lens_plot() -> Plot:
-    """Make the plot of the scene at one instant, close enough to show errors of centimetres."""
+    """Make the plot of one instant, magnified so that errors of centimetres are visible."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # its numbers have many digits
@@ -184,7 +184,7 @@ def lens_plot() -> Plot:
 
 
 def whiteness_plot() -> Plot:
-    """Make the autocorrelation plot of the whitened innovations' least white component."""
+    """Make the autocorrelation plot of the least white component of the whitened innovations."""
     plot = blank("whiteness", "Whiteness", y_range=Range1d(-0.25, 0.25))
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT)
@@ -213,7 +213,7 @@ def likelihood_plot() -> Plot:
 def show_played(
     plots: Mapping[str, Plot], of: int | str, played: Played, case: str, component: str
 ) -> None:
-    """Draw one replay: errors, NEES, NIS, whiteness, path."""
+    """Draw the errors, NEES, NIS, whiteness and path of one replay."""
     if (one := played.cases.get(case)) is None:
         for plot in plots.values():
             plot.clear(of)
@@ -228,7 +228,7 @@ def show_played(
 
 
 def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
-    """Draw the error of a component; without truth, its estimate or the filter's 95 % interval."""
+    """Draw the error of a component or, without truth, its estimate or 95 % interval."""
     errors, name = case.errors, label_of(component)
     if errors is None or component not in errors.components:
         if component not in case.components:  # for example, a filter without it in the state
@@ -301,7 +301,7 @@ def show_lens(
     truth: Path | None,
     at_s: float,
 ) -> None:
-    """Show one instant: truth, estimates and the ellipses that contain the truth with 95 %."""
+    """Show truth, estimates and 95 % ellipses at one instant."""
     first = played[0].cases.get(case) if 0 in played else None
     if first is None or first.path is None or not len(first.path.points):
         return
@@ -336,7 +336,7 @@ def show_likelihood(
     case: str,
     now: float,
 ) -> None:
-    """Draw a case's likelihood along a parameter, its peak, and the current value."""
+    """Draw the likelihood of a case along a parameter, its peak, and the current value."""
     points = [(value, each[case]) for value, each in along if np.isfinite(each.get(case, np.nan))]
     if not points:
         return
@@ -373,22 +373,22 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
         low, high = min(ends) - 1.1 * most, max(ends) + 1.1 * most
         plot.figure.y_range.update(start=low, end=high)
         ticks = ticks_between(low, high, unit_of(component))
-        # with a new ticker, Bokeh would search all models
+        # setting a new ticker makes Bokeh search all models
         plot.figure.yaxis[0].ticker.ticks = list(ticks)
         plot.figure.yaxis.major_label_overrides = ticks
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
-    """Add a line for pinned results and one for each filter, the second dashed and on top."""
+    """Add a line for pinned results and one per filter; the second filter's is dashed and on top."""
     for of in (PINNED, 0, 1):
         colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
         source = plot.source(of, "line", x, y)
-        dash = "dashed" if of == 1 else "solid"  # so that both are visible if they coincide
+        dash = "dashed" if of == 1 else "solid"  # lines that coincide are both visible
         plot.figure.line(x, y, source=source, line_color=colour, line_width=width, line_dash=dash)
 
 
 def _foot(plot: Plot) -> None:
-    """Add a strip of marks at the bottom, where the first filter is outside its interval."""
+    """Add a strip at the bottom with marks where the first filter is outside its interval."""
     plot.figure.extra_y_ranges = {"foot": Range1d(0.0, 1.0)}
     marks = plot.source(0, "outside", "t", "foot")
     plot.figure.scatter("t", "foot", source=marks, marker="dash", angle=np.pi / 2, size=7, color=RED,

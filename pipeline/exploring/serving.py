@@ -1,8 +1,7 @@
-"""The server of the page: on the loopback interface, under a secret address.
+"""The server of the page, on the loopback interface at a secret address.
 
-Requests without the token in the address are refused, and so are requests by another host name or from
-another origin; the WebSocket requires the page's own origin. When the last page is closed the server
-ends.
+Requests without the token in the address are refused, and so are requests with another host name or
+origin. The WebSocket requires the origin of the page. The server ends when the last page is closed.
 """
 
 import asyncio
@@ -47,9 +46,10 @@ TEMPLATE = """
 <script>
 """
 TEMPLATE += NAME_SLIDERS + "</script>{% endblock %}"
-CLOSED_MS = 3000  # after a page is closed; a reloaded page is back by then
+# time in ms until the server ends after a page is closed; a reloaded page returns earlier
+CLOSED_MS = 3000
 
-# Loggers that report faulty requests, with their address.
+# Loggers that report invalid requests with their address.
 _LOGGERS = ("asyncio", "bokeh", "tornado")
 _LONGEST = 300
 
@@ -59,7 +59,7 @@ class Explorer:
 
     Attributes:
         session: the session that the pages show.
-        url: its address, which only this machine reaches.
+        url: its address, which can be reached only from this machine.
     """
 
     def __init__(self, session: Session) -> None:
@@ -73,16 +73,17 @@ class Explorer:
         self._thread = Thread(target=self._serve, name="fuselog explore, server", daemon=True)
         self._thread.start()
         self._is_up.wait()
-        atexit.register(self.close)  # Python up to 3.13 would kill the thread, which can abort it
+        # Python up to 3.13 kills daemon threads at exit, which can abort the process
+        atexit.register(self.close)
 
     def close(self) -> None:
-        """End the server and its work."""
+        """Stop the server and its work."""
         atexit.unregister(self.close)
         self._stop()
         self._thread.join(timeout=5.0)
 
     def wait(self) -> None:
-        """Wait until the last page is closed; an interrupt closes all."""
+        """Wait until the last page is closed; an interrupt closes all pages."""
         try:
             self._is_ended.wait()
         finally:
@@ -139,7 +140,7 @@ class Explorer:
 
 
 class _Refused(RequestHandler):
-    """An answer to requests that are not the page's own."""
+    """A request handler that refuses requests from outside the page."""
 
     def initialize(self, code: int) -> None:
         """Store the code of the answer."""
@@ -154,7 +155,7 @@ class _Refused(RequestHandler):
 
 
 def _guard(application: Handlers, origin: str, prefix: str) -> None:
-    """Make an application answer only requests to the address that was printed for its page."""
+    """Restrict an application to requests for the printed address of its page."""
     find = application.find_handler
 
     def find_own(request: HTTPServerRequest, **given: Any) -> Any:
@@ -168,9 +169,9 @@ def _guard(application: Handlers, origin: str, prefix: str) -> None:
 
 
 def _code_of(request: HTTPServerRequest, origin: str, prefix: str) -> int | None:
-    """Return the code for a refused request, or None.
+    """Return the HTTP code for a request to refuse, or None.
 
-    It is 404 without the secret, and 403 from another host or origin.
+    The code is 404 without the secret, and 403 from another host or origin.
     """
     path = (request.path or "").encode()
     begin = f"{prefix}/".encode()
@@ -183,7 +184,7 @@ def _code_of(request: HTTPServerRequest, origin: str, prefix: str) -> int | None
 
 
 class _OneLineAKind(logging.Handler):
-    """A logging handler that emits one line per kind of fault, without the secret."""
+    """A logging handler that emits one line per kind of error, without the secret."""
 
     def __init__(self, secret: str) -> None:
         super().__init__(logging.WARNING)
@@ -191,7 +192,7 @@ class _OneLineAKind(logging.Handler):
         self._said: set[object] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a fault unless a similar one was logged before."""
+        """Log an error unless a similar one was logged before."""
         error = record.exc_info[1] if record.exc_info else None
         kind = (record.name, type(error), None if error else record.msg)
         if kind not in self._said:
@@ -203,7 +204,7 @@ class _OneLineAKind(logging.Handler):
 
 @contextmanager
 def _quiet(secret: str) -> Iterator[None]:
-    """Reduce the log messages of the server's libraries to one line per kind of fault."""
+    """Reduce the log messages of the server's libraries to one line per kind of error."""
     handler = _OneLineAKind(secret)
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     before = [(each, each.handlers, each.propagate) for each in loggers]

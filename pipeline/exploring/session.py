@@ -1,4 +1,4 @@
-"""A log in memory and the filters on it, without server or browser, and its replays."""
+"""A log in memory with filters and their replays, without server or browser."""
 
 import json
 import shlex
@@ -35,8 +35,8 @@ from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline import viewer
 
 Values = Mapping[str, float]
-MOST = 2  # filters side by side
-NO_FILTERS = ("bound",)  # methods without estimates
+MOST = 2  # largest number of filters side by side
+NO_FILTERS = ("bound",)  # methods that have no estimates
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Played:
     Attributes:
         label: the filter's label.
         values: the values of parameters that were set.
-        cases: the curves, by the name of what is estimated.
-        verdicts: the verdicts, likewise.
-        seconds: the time for replaying and judging.
+        cases: the curves, by the name of the estimated object.
+        verdicts: the verdicts, by the same names.
+        seconds: the time in s that the replay and its judgement took.
     """
 
     label: str
@@ -60,7 +60,7 @@ class Played:
 
 @dataclass
 class Session:
-    """One log with one filter or several.
+    """One log with one or more filters.
 
     Attributes:
         source: the log, with the requested alterations.
@@ -77,7 +77,7 @@ class Session:
     sliders: list[Slider] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Bind all filters, and read what they need into memory; raises BadInput as a replay does."""
+        """Bind all filters, and read their topics into memory; raise BadInput as a replay does."""
         bound = {label: self._bound(label, {}, [self.source]) for label in self.filters}
         self._run = in_memory(self.source, [one for each in bound.values() for one in each])
         self.sliders = sliders_of(self.source, {label: each[0] for label, each in bound.items()})
@@ -88,7 +88,7 @@ class Session:
         return self._run.ensemble[0]
 
     def slider(self, name: str) -> Slider:
-        """Return the slider of a parameter; raises BadInput if it has none."""
+        """Return the slider of a parameter; raise BadInput if it has none."""
         found = next((each for each in self.sliders if each.name == name), None)
         if found is None:
             raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
@@ -116,7 +116,7 @@ class Session:
         return found
 
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
-        """Make a session of the same log with other filters; raises BadInput if one cannot follow it."""
+        """Make a session of the same log with other filters; raise BadInput if one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
@@ -134,8 +134,8 @@ class Session:
     def play(self, label: str, values: Values) -> Played:
         """Replay one filter with some parameters set, and judge it.
 
-        The log-likelihood is that with an open gate, as in `likelihoods`. Raises BadInput if the filter
-        refuses the parameters, or cannot begin.
+        The log-likelihood is computed with an open gate, as in `likelihoods`. Raises BadInput if the
+        filter refuses the parameters, or cannot begin.
         """
         begin = time.perf_counter()
         bound = self._bound(label, values, self._run.ensemble)
@@ -174,7 +174,7 @@ class Session:
         return {name: case.log_likelihood for name, case in cases.items()}
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
-        """Find the best values of some parameters, with the others as set, and return the criterion too.
+        """Find the best values of some parameters, and return them with the criterion.
 
         Raises BadInput as `tune` does.
         """
@@ -185,14 +185,14 @@ class Session:
         return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}, found.objective.by
 
     def diagnosed(self, label: str, values: Values) -> list[str]:
-        """Return the sentences of a diagnosis; raises BadInput as `diagnose` does."""
+        """Return the sentences of a diagnosis; raise BadInput as `diagnose` does."""
         found = diagnose(
             self.source, {label: self.settings(label, values)}, gap_limit_s=self.gap_limit_s
         )
         return found.told
 
     def view(self, values: Values, at_s: float | None) -> None:
-        """Show the timeline of all filters in the viewer, at an instant, until the viewer is closed.
+        """Show the timeline of all filters in the viewer at an instant, until the viewer is closed.
 
         Raises BadInput if there is no screen, or if the viewer cannot run.
         """
@@ -203,7 +203,7 @@ class Session:
             viewer.view(rrd, at_s=at_s)
 
     def settings(self, label: str, values: Values) -> dict[str, Any]:
-        """Return the settings of a filter, with values for those parameters that it has."""
+        """Return the settings of a filter, including the given values of its parameters."""
         own = self.filters[label]
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
         for name, value in taken.items():
@@ -213,9 +213,9 @@ class Session:
         return dict(own)
 
     def toml(self, values: Values) -> str:
-        """Write all filters' settings as a settings file for `--settings`.
+        """Write the settings of all filters as a settings file for `--settings`.
 
-        Raises BadInput for an estimator defined in Python, which is not text.
+        Raises BadInput for an estimator defined in Python, which cannot be written as text.
         """
         tables = {}
         for label in self.filters:
@@ -228,7 +228,7 @@ class Session:
         return tomli_w.dumps(tables)
 
     def command(self, values: Values) -> str:
-        """Write the command of the same replay; raises BadInput for an estimator defined in Python."""
+        """Write a command for the same replay; raise BadInput for an estimator defined in Python."""
         place = self.source.log.path if isinstance(self.source, LogSource) else self.source.name
         words = ["fuselog replay", shlex.quote(str(place))]
         for label, own in self.filters.items():
@@ -259,7 +259,7 @@ class Session:
 
 
 def _set_to(label: str, value: Any) -> str:
-    """Write a setting as `--set` takes it: texts, numbers and lists of JSON are valid TOML."""
+    """Format a setting for `--set`; texts, numbers and lists in JSON are valid TOML."""
     if isinstance(value, Estimator):
         raise BadInput(f"{label}: an estimator defined in Python cannot be named in a command")
     return json.dumps(value)
@@ -272,12 +272,12 @@ def open_session(
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
 ) -> Session:
-    """Start exploring one log.
+    """Start to explore one log.
 
     Args:
         log: a path, an opened log, or a recording.
-        estimators: as for `replay`.
-        set: parameters of the filters, and alterations of topics; as for `replay`.
+        estimators: the filters, in the form that `replay` accepts.
+        set: parameters of the filters and alterations of topics, in the form that `replay` accepts.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
     Raises BadInput if there are several logs or too many filters, or if one cannot follow the log.

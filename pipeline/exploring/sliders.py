@@ -1,4 +1,4 @@
-"""The choice of parameters with sliders, their ranges, and the text of their values."""
+"""Sliders of parameters: the choice of parameters, their ranges, and their values as text."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,10 +14,10 @@ from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.inference.model.parameters import number_fields
 
-STEPS = 400  # between the ends of a slider
+STEPS = 400  # number of positions between the ends of a slider
 # a positive parameter ranges from its own value divided by this to its own value times this
 FACTOR = 10.0
-# Range of a parameter with an own value of zero, by unit.
+# Range of a parameter whose own value is zero, by unit.
 REACH = {"m": 1.0, "rad": 0.2, "rad/s": 0.05, "m/s": 1.0, "s": 1.0, "m/s^2": 0.5}
 STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
@@ -26,14 +26,14 @@ MOTION, GATE = "motion", "gate"
 class Slider(Parameter):
     """A parameter that can be dragged; `default` is its own value on the log.
 
-    Its group is a topic, `MOTION` or `GATE`, or the label of an estimator without a model.
+    Its group is a topic, `MOTION`, `GATE`, or the label of an estimator without a model.
     """
 
     __slots__ = ()
 
     @property
     def title(self) -> str:
-        """Return the name without its unit, as text for people.
+        """Return the name without its unit, as text for readers.
 
         >>> Slider("sigma_range_m").title
         'sigma range'
@@ -41,12 +41,12 @@ class Slider(Parameter):
         return parted(self.name)[0].replace("_", " ")
 
     def place(self, value: float) -> float:
-        """Compute the position of a value between the ends: 0 to 1, or outside that range."""
+        """Compute the position of a value: 0 to 1 between the ends, otherwise outside that range."""
         value, low, high = (self._straight(each) for each in (value, self.low, self.high))
         return (value - low) / (high - low)
 
     def value(self, place: float) -> float:
-        """Compute the value at a position from 0 to 1, to four digits; the own value at its position."""
+        """Compute the value at a position from 0 to 1, with four digits unless it is the own value."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
         value = float(f"{math.exp(there) if self.is_log else there:.4g}")
@@ -64,12 +64,12 @@ class Slider(Parameter):
         return math.log(value) if value > 0.0 else -math.inf
 
     def words(self, value: float) -> str:
-        """Return a value with its unit, as text for people."""
+        """Format a value with its unit."""
         return in_words(value, self.unit)
 
 
 def in_words(value: float, unit: str) -> str:
-    """Format a number with its unit, as text for people.
+    """Format a number with its unit.
 
     >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
     ('10 cm', '1.15°', '−0.99', '0°')
@@ -80,7 +80,7 @@ def in_words(value: float, unit: str) -> str:
 
 
 def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
-    """Choose a few round values between two ends, with their texts in one unit.
+    """Choose a few round values between two ends, and format them in one unit.
 
     >>> ticks_between(-0.03, 0.03, "m")
     {-0.02: '−2 cm', 0.0: '0', 0.02: '2 cm'}
@@ -95,10 +95,10 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
-    """List the parameters of filters that can be dragged, grouped.
+    """List the parameters of filters that can be dragged, by group.
 
-    For an estimator with a model, these are the parameters that its functions read on this log; for any
-    other one, all its positive numbers, except settings of how a program is run.
+    For an estimator with a model, these are the parameters that its functions use on this log. For other
+    estimators, they are all positive numbers, except settings of how a program is run.
 
     Args:
         source: the log.
@@ -116,7 +116,7 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
 
 
 def _groups(label: str, bound: Bound) -> dict[str, str]:
-    """Return the parameters that matter on this log, with their groups."""
+    """Return the parameters that have an effect on this log, with their groups."""
     assert bound.parameters is not None
     if not isinstance(bound, Recursive) or bound.reading is None:
         numbers = numbers_of(type(bound.parameters))
@@ -134,7 +134,7 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
 
 
 def _order(group: str, topics: Sequence[str]) -> int:
-    """Order sensors as they are read, followed by the motion."""
+    """Order sensors as they are read, with the motion at the end."""
     return topics.index(group) if group in topics else len(topics)
 
 
@@ -161,7 +161,7 @@ def _slider(name: str, group: str, source: LogSource | MemorySource, bound: Boun
 
 
 def setting_text(values: Mapping[str, float]) -> Iterable[str]:
-    """Write values as `--set` takes them.
+    """Format values for `--set`.
 
     >>> list(setting_text({"sigma_range_m": 0.043}))
     ['--set sigma_range_m=0.043']

@@ -1,4 +1,4 @@
-"""The verdict on a filter on a log: one sentence, and its evidence."""
+"""The verdict on a filter on a log, with its evidence."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ class Summary(NamedTuple):
 
 
 def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Summary:
-    """Judge one filter on one log by NEES, NIS and those warnings of its replay on this case."""
+    """Judge a filter on a log by NEES, NIS and the warnings about its replay for this case."""
     if failures:
         return Summary("failed", "It stopped.", failures[0])
     own = [each for each in alarms if each.part in ("", case.name)]

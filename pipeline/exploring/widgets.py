@@ -1,4 +1,4 @@
-"""The page's sliders, buttons, choices and time axis, as Bokeh widgets."""
+"""The sliders, buttons, choices and time axis of the page, as Bokeh widgets."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -14,10 +14,10 @@ from fuselog.pipeline.exploring.sliders import STEPS, Slider
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS
 
 NONE = "none"
-A_ROW = 2  # buttons
-YEAR_2000_NS = 946_684_800_000_000_000  # earlier clocks do not show the date
-# Bokeh's sliders have no name for screen readers, and give a position from 0 to 1: tags have both in
-# words.
+A_ROW = 2  # number of buttons in a row
+YEAR_2000_NS = 946_684_800_000_000_000  # clocks before this do not show the date
+# Bokeh's sliders have no name for screen readers, and their value is a position from 0 to 1. Tags
+# contain both as words.
 NAME_SLIDERS = """
 const view = Bokeh.Models.get("Slider").prototype.default_view.prototype;
 const render = view.render;
@@ -54,12 +54,12 @@ def widget_of(slider: Slider, value: float) -> Any:
 
 
 def tags_of(slider: Slider, value: float) -> list[str]:
-    """Return the text of a slider for screen readers: its name with its group, and its value."""
+    """Return the text of a slider for screen readers, with its group, name and value."""
     return [f"{slider.title}, {slider.group}", slider.words(value)]
 
 
 def time_range(epoch_ns: int) -> Range1d:
-    """Make the range of all plots over time, whose name states its zero."""
+    """Make the range of all plots over time, whose label states its zero."""
     if epoch_ns == SIMULATION_EPOCH_NS or epoch_ns < YEAR_2000_NS:
         return Range1d(0.0, 1.0, name="time since the log began (s)")
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)
@@ -67,7 +67,7 @@ def time_range(epoch_ns: int) -> Range1d:
 
 
 def filter_choices(filters: Iterable[str], names: Sequence[str]) -> list[Any]:
-    """Make the choices of both filters, the second of which may be "none"."""
+    """Make the menus of both filters; the second one may be "none"."""
     width = (SIDE - 20) // 2
     first, second = [*filters, NONE][:2]
     return [
@@ -77,7 +77,7 @@ def filter_choices(filters: Iterable[str], names: Sequence[str]) -> list[Any]:
 
 
 def buttons(acts: Mapping[str, Callable[[], None]]) -> list[Any]:
-    """Make rows of buttons, by label."""
+    """Make rows of buttons from actions by label."""
     made = []
     for label, act in acts.items():
         button = Button(label=label, name=label, width=(SIDE - 10 * A_ROW) // A_ROW)

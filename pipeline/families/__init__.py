@@ -1,6 +1,6 @@
-"""Studies of single families, one package each: the tables, figures and claims of an experiment.
+"""Studies of single families, in one package each, with the tables, figures and claims of experiments.
 
-Nothing outside imports these packages: they register themselves. Begin with a small one,
-`ranging.study`. `fuselog.pipeline.studies.toolkit` has the parts that several studies use. Verdicts on
-claims come from `fuselog.pipeline.output.claims`.
+The packages register themselves, and nothing outside imports them. Begin with a small one,
+`ranging.study`. `fuselog.pipeline.studies.toolkit` contains the parts that several studies use. Verdicts
+on claims come from `fuselog.pipeline.output.claims`.
 """

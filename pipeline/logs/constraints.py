@@ -1,6 +1,6 @@
 """Zero-velocity and non-holonomic pseudo-measurements from the samples of an inertial unit.
 
-They become topics that the model `inertial` uses in addition to those of sensors.
+They are topics that the model `inertial` uses in addition to those of sensors.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ class ConstraintParameters(Parameters):
 def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
     """Make the topics `standing` and `rolling` next to that of a unit.
 
-    Their value is 1 if the body is at rest, or on wheels, and 0 otherwise.
+    The value of a message is 1 if the body is at rest, or on wheels, and 0 otherwise.
 
     Args:
         inertial: the samples of the unit.

@@ -39,7 +39,7 @@ def is_prior(log: Log, topic: str) -> bool:
 
 @dataclass
 class Thinner:
-    """A filter that keeps the first stamp of every interval, a number of stamps or a time.
+    """A filter that keeps the first stamp of every interval, which is a number of stamps or a time.
 
     `stamps` is the number of stamps in earlier blocks, `last` the interval of the latest of them.
     """

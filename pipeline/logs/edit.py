@@ -1,7 +1,7 @@
 """Editing of logs: cutting, merging, renaming topics and components, adding pseudo-measurements.
 
-Logs are processed block by block, so that memory does not grow with their length. The result is a new
-log whose metadata states the operation; the original logs are not changed.
+Logs are processed block by block, so memory does not grow with their length. The result is a new log
+whose metadata states the operation; the original logs are not changed.
 """
 
 from collections import Counter
@@ -320,7 +320,7 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
 
 
 def _shifted(stream: Stream, offset_ns: int) -> Stream:
-    """Shift the stamps of a stream, and the times in its messages that are by the log's clock."""
+    """Shift the stamps of a stream, and the times in its messages that refer to the log's clock."""
     if not offset_ns:
         return stream
     is_ours = stream.schema.full_name in SCHEMAS
@@ -338,7 +338,7 @@ def _shifted(stream: Stream, offset_ns: int) -> Stream:
 
 
 def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
-    """Return the new name of each topic to rename, in the log or in metadata only, by old name."""
+    """Return the new name of each topic to rename, by old name, also for topics in metadata only."""
     stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
     known = [
         *log.topics,

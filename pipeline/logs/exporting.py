@@ -1,7 +1,7 @@
 """Export of logs to other tools: estimates and truths as trajectories, any stream as a table.
 
-A log is read once, block by block, so that memory does not grow with its length, except for tracks,
-which are exported frame by frame. Existing files are never replaced.
+A log is read once, block by block, so memory does not grow with its length. Tracks are an exception:
+they are exported frame by frame. Existing files are never replaced.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,7 +37,7 @@ FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]
 
 
 class Exported(NamedTuple):
-    """The written files by topic, and sentences on what is missing in them."""
+    """The written files by topic, and sentences on what they do not contain."""
 
     files: dict[str, Path]
     notes: list[str]
@@ -57,16 +57,16 @@ def export(
     Args:
         path: the log, or estimates log.
         to: the format. "tum" and "kitti" are trajectories of poses, and of estimates and truths with a
-            position. "mot" has a file of each tracker's tracks and one of all truths, see
+            position. "mot" has a file of tracks for each tracker and one of all truths; see
             `fuselog.pipeline.families.tracking.mot`. "csv" and "parquet" are tables. "foxglove" is one
-            log with messages that Foxglove shows, see `fuselog.pipeline.logs.foxglove`.
+            log with messages that Foxglove shows; see `fuselog.pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; the file itself for a single topic
             (except with "mot") and for "foxglove".
         topics: the topics to export; all suitable topics if empty.
         recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The written files by topic, and sentences on what is missing in them.
+        The written files by topic, and sentences on what they do not contain.
 
     Raises BadInput if a topic does not exist or does not suit the format, or the output already exists.
     """
@@ -166,7 +166,7 @@ def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: 
 
 
 def _new(to: To) -> Kind:
-    """Return the kind of an output file that must not exist yet."""
+    """Return the kind of an output file that must not exist."""
     return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 

@@ -19,5 +19,5 @@ def logs_in(path: Path) -> list[Path]:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """List the logs in a folder by name, without estimates logs; return [] if it is not a folder."""
+    """List the logs in a folder by name, without estimates logs; return [] for any other path."""
     return [each for each in sorted(folder.glob("*.mcap")) if not each.match("*.estimates.mcap")]

@@ -1,6 +1,6 @@
 """The Foxglove mirror of a log's streams: messages that Foxglove shows without fuselog.
 
-They serve only viewers: no replay reads them, and no command counts them among a log's streams. The
+Only viewers use these messages: no replay reads them, and they are not counted as a log's streams. The
 schemas are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.
 """
 
@@ -33,12 +33,12 @@ with extra("foxglove", "messages of Foxglove"):
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-# Viewers need a name for the frame of the log, which has none.
+# Viewers need a frame name, and a log has none.
 WORLD = "map"
 POINT_M = 0.3
 LABEL_PX = 12.0
 LINE_PX = 2.0
-# How long a viewer shows a track after its last message, in seconds.
+# Time in seconds for which a viewer shows a track after its last message.
 TRACK_S = 60
 
 Made = Iterator[tuple[str, Message, int]]
@@ -51,7 +51,7 @@ def mirrors(stream: Stream) -> Iterator[Mirror]:
     FrameTransforms. Orientations without a position become poses at the origin. Lines of sight of moving
     sensors become poses at the sensor whose x axis is the line. Ellipses of 95 %, tracks and landmarks
     become SceneUpdate, particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is
-    `/foxglove`, followed by the stream's topic and a word for the content. A prior has no mirror.
+    `/foxglove`, followed by the stream's topic and a word for the content. Priors have no mirror.
     """
     make = _MAKERS.get(stream.schema.full_name)
     is_stated = stream.topic.startswith("/estimates/")
@@ -69,14 +69,14 @@ def mirrors(stream: Stream) -> Iterator[Mirror]:
 
 
 def left_out(log: Log) -> str:
-    """Return a sentence on the streams of a log without a Foxglove mirror, or "" if all have one."""
+    """Describe the streams of a log without a Foxglove mirror, or return "" if all have one."""
     shown = {topic.metadata[MIRROR_OF] for topic in log.mirrors.values()}
     topics = [name for name, topic in log.topics.items() if topic.messages and name not in shown]
     return sentence_of(topics) if topics else ""
 
 
 def sentence_of(topics: Sequence[str]) -> str:
-    """Return a sentence that the topics have no Foxglove mirror."""
+    """Write the sentence that the topics have no Foxglove mirror."""
     return f"omitted, because Foxglove has no message for them: {some_of(topics)}"
 
 
@@ -139,7 +139,7 @@ def _sights(stream: Stream) -> Made:
     turned = Rotation.from_quat(seen["quaternion"], scalar_first=True)
     forward = Rotation.from_euler(
         "y", -0.5 * np.pi
-    )  # turns x to z, the line of sight if both angles are zero
+    )  # rotates x to the line of sight if both angles are zero
     lines = (turned * Rotation.from_euler("YX", angles[known]) * forward).as_quat(scalar_first=True)
     for row, pose in enumerate(_in_frame(seen, seen["position_m"], lines)):
         yield "pose", pose, int(known[row])
@@ -164,7 +164,7 @@ def _poses(
 
 
 def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
-    """Yield a pose for each position (n, 3) and quaternion (n, 4), by default the identity."""
+    """Yield a pose for each position (n, 3) and quaternion (n, 4); the default is the identity."""
     for row, place in enumerate(places):
         pose = PoseInFrame(frame_id=_frame_of(stream))
         pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
@@ -233,7 +233,7 @@ def _detections(stream: Stream) -> Made:
 
 
 def _scans(stream: Stream, places: Floats) -> Made:
-    """Make a message for each stamp with its positions, from positions (n, 3) of all stamps."""
+    """Make a message for each stamp with its positions, from the positions (n, 3) of all stamps."""
     for rows in _by_stamp(stream):
         poses = PosesInFrame(frame_id=_frame_of(stream))
         poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))

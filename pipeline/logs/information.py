@@ -29,14 +29,14 @@ from fuselog.replay.inference.model.binding import topics_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
-MOST_TOPICS = 6  # listed in one line
-ESTIMATES = "/estimates/"  # prefix of topics in estimates logs
+MOST_TOPICS = 6  # largest number of topics in a line
+ESTIMATES = "/estimates/"  # prefix of the topics in estimates logs
 
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     """Print the run, duration and topics of a log; for other data, how to import them.
 
-    Result folders and timelines are described as well.
+    Result folders and timelines are also described.
     """
     from fuselog.recorders.importers.ros.files.bags import looks_like_bag
 
@@ -98,7 +98,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 def _main_span(log: Log) -> tuple[int, int] | None:
-    """Find the first and last stamp of most messages if others are years away, otherwise None."""
+    """Find the first and last stamp of most messages if others are years away; otherwise return None."""
     try:
         return LogSource(log).main_span
     except BadInput:
@@ -115,7 +115,7 @@ def _findings(log: Log) -> list[Finding]:
 
 
 class Fitting(NamedTuple):
-    """Whether a model fits a log: the topics that it would use, suitable methods, or what is missing."""
+    """The result of fitting a model to a log: topics and methods if it fits, or what is missing."""
 
     topics: list[str]
     methods: list[str]
@@ -137,7 +137,8 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     for name, method in METHODS.items():
         if not method.lacks(model):
             try:
-                parameters = combined(model, method).model_construct()  # defaults need no validation
+                # default values are not validated
+                parameters = combined(model, method).model_construct()
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))
@@ -173,7 +174,7 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
     others = {name: each for name, each in fittings.items() if name not in fit}
     by_topics: dict[tuple[str, ...], list[str]] = {}
     used = {topic for each in fit.values() for topic in each.topics}
-    # other estimators, which are slow to load, are tested only if models do not use all topics
+    # other estimators are slow to load and tested only if models do not use all topics
     if is_all or not used.issuperset(set(log.topics) - truths_among(log.topics)):
         for name, topics in estimators_that_fit(log).items():
             by_topics.setdefault(tuple(topics), []).append(name)
@@ -201,7 +202,7 @@ def _some_topics(topics: Sequence[str]) -> str:
 
 
 def _say_what_to_do(path: Path, log: Log) -> None:
-    """Print the estimators whose estimates a log has, and commands for them."""
+    """Print which estimators have estimates in a log, and commands for them."""
     labels = dict.fromkeys(
         topic.removeprefix(ESTIMATES).partition("/")[0]
         for topic in log.topics
@@ -295,7 +296,7 @@ def _say_run(run: RunMetadata) -> None:
 
 
 def _changed(run: RunMetadata) -> dict[str, Any]:
-    """Return the parameters that differ from the recorder's defaults; all without a known recorder."""
+    """Return the parameters that differ from the recorder's defaults; all if the recorder is unknown."""
     try:
         described = describe(load("recorders", run.scenario, Recorder).parameters)
     except BadInput:
@@ -306,7 +307,7 @@ def _changed(run: RunMetadata) -> dict[str, Any]:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
-    """Return nested values by their full, dotted names."""
+    """Return nested values by their full names with dots."""
     flat: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, Mapping) and value:

@@ -1,4 +1,4 @@
-"""Rewriting of logs block by block: the choice of topics, notes on what is lost, and the new log."""
+"""Functions that rewrite logs block by block: the choice of topics, notes on losses, and the new log."""
 
 import os
 from collections import Counter
@@ -18,7 +18,7 @@ from fuselog.replay.engine.streams.sources import LogSource
 Blocks = Iterator[list[Stream]]
 
 
-# The scenario of a log that does not name one, as in estimates of such a log.
+# The scenario of a log that does not name one, and of its estimates logs.
 UNKNOWN = "unknown"
 
 
@@ -73,7 +73,7 @@ def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
 
 
 def losses_of(log: Log) -> list[str]:
-    """Describe what is missing in a log, and what it has besides its topics that is not copied."""
+    """Describe what is missing in a log, and which of its contents are not copied."""
     foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
     losses = [log.loss_statement] if log.loss_statement else []
     if log.mirrors:
@@ -128,7 +128,7 @@ def readable_log(
 
 
 def run_of(log: Log, target: Path) -> RunMetadata:
-    """Return the run of a log; in estimates, with the path of their log relative to the target."""
+    """Return the run of a log; for estimates, with the path of their log relative to the target."""
     run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
     if "log" not in run.notes:
         return run
@@ -137,7 +137,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
 
 
 def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """Return the common run of the logs if they have one, otherwise an unknown run with all notes."""
+    """Return the common run of the logs; if their runs differ, an unknown run with all notes."""
     runs = [run_of(log, target) for log in logs]
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):

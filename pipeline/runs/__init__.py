@@ -1,4 +1,4 @@
-"""Runs of experiments: ensembles are recorded, replayed and judged, in cells and sweeps.
+"""Runs of experiments: ensembles that are recorded, replayed and judged, in cells and sweeps.
 
 Begin with `ensemble`.
 """

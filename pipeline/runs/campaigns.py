@@ -1,8 +1,8 @@
 """Cells of an experiment, which are processed in any order and merged in a fixed order.
 
 A cell is a part of the runs. Its result depends only on its description and on the code, so it can be
-computed anywhere, and only once: finished cells are kept until all are done, and the same command
-continues with them after an interruption; see `fuselog.pipeline.runs.checkpoints`.
+computed anywhere, and only once. Finished cells are kept until all are done, and after an interruption
+the same command continues with them; see `fuselog.pipeline.runs.checkpoints`.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge
 from fuselog.replay.foreign.naming import program_files
 
-# A cell is abandoned after its workers died this many times.
+# A cell is abandoned after its workers have died this many times.
 ATTEMPTS = 3
 _LOG = logging.getLogger("fuselog")
 
@@ -69,12 +69,12 @@ class Cell:
 
     @property
     def files(self) -> list[Path]:
-        """Return the logs that it reads."""
+        """Return the logs that the cell reads."""
         return self.experiment.files[self.first : self.end]
 
     @cached_property
     def key(self) -> str:
-        """Return a hash of what determines the result: this description, the data, and the code."""
+        """Hash everything that determines the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
@@ -82,15 +82,15 @@ class Cell:
         return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
-        """Record or open the runs, replay and judge them; files are written to the folder."""
+        """Record or open the runs, replay and judge them, and write files to the folder."""
         if setting is None:
             logs = self.first + self.logs
             setting = Setting(folder, self.place, logs=logs, draws=self.draws, errors=self.errors)
         return Runner(self.experiment, setting).judge(slice(self.first, self.end))
 
     def packed(self, folder: Path) -> bytes:
-        """Process the cell and pickle the result; raises BadInput if a metric cannot be pickled."""
-        shutil.rmtree(folder, ignore_errors=True)  # left by a worker that was killed
+        """Process the cell and pickle the result; raise BadInput if a metric cannot be pickled."""
+        shutil.rmtree(folder, ignore_errors=True)  # files of a worker that was killed
         if self.draws or self.logs or self.errors:
             folder.mkdir()
         done = self.work_off(folder)
@@ -106,12 +106,12 @@ class Cell:
 
 @dataclass
 class Pace:
-    """The progress of a campaign.
+    """The progress of all cells.
 
     Attributes:
-        runs: of all cells.
-        done: runs of merged cells.
-        worked_off: runs of the cells that were computed now, not by an earlier campaign.
+        runs: number of runs in all cells.
+        done: number of runs in merged cells.
+        worked_off: number of runs in the cells that this command computed, not an earlier one.
         workers: number of workers.
     """
 
@@ -128,12 +128,12 @@ class Pace:
 
 
 def judge(experiment: Experiment, setting: Setting) -> Pass:
-    """Replay and judge all runs of an experiment, cell by cell; files go to the setting's folder.
+    """Replay and judge all runs of an experiment cell by cell; write files to the setting's folder.
 
     Raises BadInput if an estimator cannot replay any run, or workers die repeatedly.
     """
     cells = cells_of(experiment, setting)
-    if len(cells) == 1 or setting.checkpoints is None:  # nothing to distribute, and nothing to resume
+    if len(cells) == 1 or setting.checkpoints is None:  # nothing to distribute or to resume
         return cells[0].work_off(setting.folder, setting).check()
     (done,) = _merged([cells], setting)
     setting.checkpoints.hand_over([cell.key for cell in cells], setting.folder)
@@ -141,9 +141,9 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
 
 
 def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[Pass]:
-    """Replay and judge experiments, and yield the result of each in order; see `judge`.
+    """Replay and judge experiments, and yield their results in order; see `judge`.
 
-    Files stay in the folder of the cells.
+    The files remain in the folder of the cells.
     """
     return _merged([cells_of(experiment, setting) for experiment in experiments], setting)
 
@@ -169,7 +169,7 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
-    """Divide an experiment into cells; the division depends only on the number of runs."""
+    """Divide an experiment into cells, which depend only on the number of runs."""
     require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)
@@ -244,7 +244,7 @@ def work_off(
                     number = pending.pop(future)
                     pace.worked_off += cells[number].runs
                     checkpoints.write(keys[number], future.result())
-            if lost is not None:  # some executors then lose all others as well
+            if lost is not None:  # afterwards, some executors lose all other cells as well
                 died.update(pending.values())
                 waiting.extendleft(sorted(pending.values(), reverse=True))
                 number, times = died.most_common(1)[0]

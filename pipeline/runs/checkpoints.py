@@ -1,15 +1,15 @@
-"""Storage of the finished cells of a campaign, in a folder next to its result.
+"""Storage of finished cells, in a folder next to the result.
 
     OUT.unfinished/
-        fuselog.lock    held by the process that works on the campaign
+        fuselog.lock    held by the process that computes the cells
         KEY.bin         the result of a cell, with a checksum; KEY hashes its description and the code
         KEY/            the files of that cell: logs and estimates of the first runs, the timeline
 
-The result of a cell begins with its key and states the SHA-256 of each of its files: anything that
-differs from what the cell wrote is computed again. The folder may be in a place where others can write,
-such as a shared disk; the folder itself, and each file that is read, belongs to this user only.
+The result of a cell begins with its key and contains the SHA-256 of each of its files; a cell whose
+files have changed is computed again. Other users may be able to write to the parent folder, such as a
+shared disk, but the folder itself and each file that is read must belong to this user only.
 
-The folder is made when the campaign begins, and removed when the result is complete, or if it is empty.
+The folder is created when the work begins. It is removed when the result is complete, or if it is empty.
 """
 
 import logging
@@ -37,14 +37,14 @@ _LOG = logging.getLogger("fuselog")
 
 
 class Checkpoints:
-    """The finished cells of a campaign, in a folder that is locked."""
+    """The finished cells of an experiment, in a locked folder."""
 
     def __init__(self, folder: Path, lock: FileLock) -> None:
         self.folder = folder
         self._lock = lock
 
     def begin(self) -> None:
-        """Make the folder if it does not exist, and lock it.
+        """Create the folder if it does not exist, and lock it.
 
         Raises BadInput if another process has locked it, or it contains files that fuselog did not
         write.
@@ -97,9 +97,9 @@ class Checkpoints:
         write_checked(self.folder / f"{key}{_SUFFIX}", content, "a cell")
 
     def hand_over(self, keys: Sequence[str], folder: Path) -> None:
-        """Move the files of all cells to a folder, in order; tables of errors are joined.
+        """Move the files of all cells to a folder, in order, and join tables of errors.
 
-        Raises BadInput if they differ from what the cells wrote.
+        Raises BadInput if files differ from those that the cells wrote.
         """
         tables: dict[Path, list[Path]] = {}
         for key in keys:
@@ -120,10 +120,10 @@ class Checkpoints:
             join_tables(parts, folder / name)
 
     def end(self, *, is_done: bool) -> None:
-        """Unlock the folder; it is kept if there is something to resume."""
+        """Unlock the folder, and keep it if there are cells to resume."""
         if is_done and self.folder.is_dir():
-            with suppress(BadInput):  # locked by others, or with foreign files
-                self.begin()  # cells of an earlier command that did not finish
+            with suppress(BadInput):  # folders that are locked or contain files of other programs
+                self.begin()  # unfinished cells of an earlier command
         if not self._lock.is_locked:
             return
         done = sum(1 for path in self.folder.iterdir() if path.suffix == _SUFFIX)
@@ -150,11 +150,12 @@ class Checkpoints:
             self.folder.rmdir()
 
     def _left(self, key: str) -> "_Left | None":
-        """Read the result of a cell, if its files are unchanged."""
+        """Read the result of a cell if its files are unchanged."""
         content = read_own(self.folder / f"{key}{_SUFFIX}")
         if content is None or not content.startswith(key.encode()):
             return None
-        left: _Left = pickle.loads(content.removeprefix(key.encode()))  # only this user can write it
+        # unpickling is safe, because only this user can write the file
+        left: _Left = pickle.loads(content.removeprefix(key.encode()))
         place = self.place_of(key)
         try:
             whole = all(hash_of(place / name) == digest for name, digest in left.files.items())
@@ -172,7 +173,7 @@ class _Left(NamedTuple):
 
 @contextmanager
 def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
-    """Keep the cells of a campaign with this result folder; they are removed on success."""
+    """Store the cells of the experiment with this result folder, until they have succeeded."""
     place = settled(place)
     folder = place.with_name(f"{place.name}.unfinished")
     checkpoints = Checkpoints(folder, FileLock(folder / _LOCK, timeout=0))
@@ -186,7 +187,7 @@ def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
 
 
 def _is_ours(path: Path) -> bool:
-    """Test whether a member of the folder was written by this module."""
+    """Test whether this module wrote a file or folder."""
     if path.is_symlink():
         return False
     is_cell = _KEY.fullmatch(path.stem) is not None
@@ -196,7 +197,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _copy(path: Path, place: Path) -> None:
-    """Copy a file, by a hard link if possible."""
+    """Copy a file, as a hard link if possible."""
     try:
         os.link(path, place)
     except OSError:

@@ -1,4 +1,4 @@
-"""Recording, replay and judgement of ensembles, in one streamed pass or whole in memory.
+"""Recording, replay and judgement of ensembles, in one streamed pass or in memory.
 
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
@@ -37,12 +37,12 @@ from fuselog.replay.judging.metrics.measuring import Metric, find_metrics, plus
 if TYPE_CHECKING:
     from fuselog.replay.timeline.show import Drawing
 
-# Every run replayed from logs has up to three files open; systems allow 1024.
+# Every run that is replayed from logs has up to three open files; systems allow 1024.
 RUNS_AT_ONCE = 128
 
 Item = TypeVar("Item")
 Settings = Mapping[str, Mapping[str, Any]]
-# Takes items, a title (converted to text again for each item), and their number; yields the items.
+# A function of items, a title (converted to text for each item), and their number; yields the items.
 Progress = Callable[[Iterable[Any], object, int | None], Iterable[Any]]
 
 
@@ -59,8 +59,8 @@ class RunGroup:
         sources: the runs.
         first_run: the number of the first run.
         estimates: for the first runs, the path of the estimates and the source log.
-        origins: what runs start from if their spans begin after their priors; empty, or one per run.
-        is_all: whether the ensemble has no other runs.
+        origins: initial states of runs whose spans begin after their priors; empty, or one per run.
+        is_all: whether these are all runs of the ensemble.
     """
 
     sources: Sequence[Source]
@@ -71,7 +71,7 @@ class RunGroup:
 
 
 def parts_of(runs: int) -> Iterator[slice]:
-    """Yield slices of the runs to replay together; they depend only on the number of runs."""
+    """Yield slices of runs that are replayed together; they depend only on the number of runs."""
     for first in range(0, runs, RUNS_AT_ONCE):
         yield slice(first, min(first + RUNS_AT_ONCE, runs))
 
@@ -81,7 +81,7 @@ def cut_in_parts(
     estimates: Sequence[tuple[Path, Path]],
     origins: Sequence[Origin] = (),
 ) -> Iterator[RunGroup]:
-    """Yield groups of available runs; `estimates` and `origins` are those of all runs."""
+    """Yield groups of existing runs; `estimates` and `origins` are those of all runs."""
     for now in parts_of(len(sources)):
         yield RunGroup(
             sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
@@ -94,15 +94,15 @@ class Pass:
 
     Attributes:
         judge: of all runs.
-        parameters: of every estimator by label, including defaults.
-        stated: parameters that the first log's channels state; see `stated_of`.
+        parameters: parameters of every estimator by label, including defaults.
+        stated: parameters in the first log's channels; see `stated_of`.
         usages: how many measurements were used, by bound estimator.
         untaken: topics that estimators do not use.
-        left_out: impossible messages.
-        seconds: the time of each estimator, by label.
-        refused: by estimator, why it cannot replay any run.
+        left_out: counts of messages with impossible values.
+        seconds: the run time of each estimator in s, by label.
+        refused: the reasons why estimators cannot replay any run, by label.
         input_sha256: a hash of the input data, if requested.
-        meanings: of the parameters, in a few words, by label and name.
+        meanings: meanings of the parameters in a few words, by label and name.
     """
 
     judge: Judge
@@ -118,7 +118,7 @@ class Pass:
 
     @property
     def coverage(self) -> list[Row]:
-        """Return how many messages of every topic were used."""
+        """Return counts of used and unused messages for every topic."""
         return rows_of(self.usages, self.untaken, self.judge.doubts, self.left_out)
 
     @property
@@ -143,7 +143,7 @@ class Pass:
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
-        """Return the pass itself; raises BadInput if an estimator could not replay any run."""
+        """Return the pass itself; raise BadInput if an estimator could not replay any run."""
         for refusal in self.refused.values():
             raise refusal
         return self
@@ -164,9 +164,9 @@ def replay_parts(
     mirrors: Mirrors | None = None,
     progress: Progress = no_progress,
 ) -> Pass:
-    """Replay an ensemble part by part, and pass blocks to estimates logs, judge and timeline.
+    """Replay an ensemble in parts, and send blocks to estimates logs, judge and timeline.
 
-    Memory holds the current blocks, and the runs of a part if they are in memory at all.
+    Memory holds the current blocks, and the runs of a part if they were in memory before.
 
     Args:
         parts: the runs.
@@ -174,15 +174,15 @@ def replay_parts(
         gap_limit_s: the longest gap over which the truth is interpolated.
         metrics: their names; all if empty.
         order: the clock that orders messages.
-        late: how out-of-sequence messages are handled in order of log time.
+        late: how out-of-sequence messages are handled if messages are in order of log time.
         save: the file for the first run's timeline.
-        connect: the viewer for the timeline; see `Drawing`.
-        on_errors: called with the errors of every block.
+        connect: the viewer to which the timeline is streamed; see `Drawing`.
+        on_errors: function that is called with the errors of every block.
         block_messages: approximate number of messages of a run in memory at a time.
-        mirrors: makes the Foxglove mirror for other viewers, written next to the estimates.
-        progress: reports progress after every block.
+        mirrors: function that makes the Foxglove mirror, which is written next to the estimates.
+        progress: function that reports progress after every block.
 
-    An estimator that cannot replay any run is reported by `Pass.check`.
+    `Pass.check` reports estimators that cannot replay any run.
     """
     found, whole = find_metrics(metrics), None
     with _told(progress, "replaying") as tell:
@@ -253,7 +253,7 @@ def _judge_and_draw(judge: Judge, drawing: "Drawing | None", block: Mapping[str,
 
 @contextmanager
 def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
-    """Report progress by a function to call at every step of a loop, instead of wrapping its items."""
+    """Return a function that reports progress when it is called at every step of a loop."""
     steps = iter(progress(repeat(None), title, None))
     next(steps)
     try:
@@ -265,9 +265,9 @@ def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
 
 @contextmanager
 def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
-    """Process items in order in a background thread, one at a time; yields a function to submit them.
+    """Process items in order in a background thread; yields a function that submits an item.
 
-    An exception in the work is raised when the next item is submitted, or at the end.
+    An exception in the thread is raised when the next item is submitted, or at the end.
     """
     with ThreadPoolExecutor(1) as pool:
         working: list[Future[None]] = []
@@ -285,15 +285,15 @@ def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], Non
 def bind_from(
     sources: Sequence[Source], estimators: Settings, origins: Sequence[Origin], order: Clock
 ) -> list[Bound]:
-    """Bind estimators to runs, each started from its origin if there are origins."""
+    """Bind estimators to runs, with the initial states of the runs if there are origins."""
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
     return [start_from(each, sources, origins, order) for each in bound] if origins else bound
 
 
 def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
-    """Return the parameters of estimators by label as JSON values, without those that are None.
+    """Return the parameters of estimators by label as JSON values, without values that are None.
 
-    Parameters of individual topics are in a table of the topic.
+    Parameters of individual topics are in a table per topic.
     """
     return {
         each.name.partition("/")[0]: _as_set(each.parameters)
@@ -314,9 +314,9 @@ def _as_set(parameters: Parameters) -> dict[str, Any]:
 
 
 def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str]]:
-    """Return by label the unset parameters that a log's channels state, as "VALUE (TOPIC)".
+    """Return by label the unset parameters that a log's channels contain, as "VALUE (TOPIC)".
 
-    If several topics state the same value, the first is named.
+    If several topics contain the same value, the first is named.
     """
     found: dict[str, dict[str, dict[str, str]]] = {}
     for each in bound:
@@ -345,7 +345,7 @@ def replay_blocks(
     block_messages: int = BLOCK_MESSAGES,
     is_part: bool = False,
 ) -> Iterator[dict[str, Ragged]]:
-    """Iterate over a replay's outputs by topic, block by block; the last block states the coverage."""
+    """Iterate over a replay's outputs by topic, block by block; the last block contains the coverage."""
     blocks = replay(
         sources,
         bound,
@@ -366,7 +366,7 @@ def by_topic(block: list[Ragged]) -> dict[str, Ragged]:
 def of_run(
     block: Mapping[str, Ragged], errors: Sequence[Errors], run: int
 ) -> tuple[dict[str, Any], list[Errors]]:
-    """Select the streams and the errors of one run, for a timeline."""
+    """Select the streams and the errors of one run for a timeline."""
     streams = {topic: rows.of_run(run) for topic, rows in block.items()}
     return streams, [errors_at(each, each.run == run) for each in errors]
 
@@ -387,10 +387,10 @@ def judge_logs(
         sources: the runs, with their truths.
         metrics: the metrics to compute.
         gap_limit_s: the longest gap over which the truth is interpolated.
-        drawing: receives the data of the first run.
-        on_errors: called with the errors of every block.
+        drawing: timeline that receives the data of the first run.
+        on_errors: function that is called with the errors of every block.
 
-    Raises BadInput if a log has other estimates than the first.
+    Raises BadInput if the estimates in a log differ in kind from those in the first log.
     """
     held = [[each for each in source.topics if each.startswith("/estimates/")] for source in estimates]
     for source, topics in zip(estimates, held, strict=True):

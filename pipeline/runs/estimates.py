@@ -1,6 +1,6 @@
-"""Source logs and estimators of estimates logs, and hashes of the input of replays.
+"""Functions that find the source logs and estimators of estimates logs, and hash the input of replays.
 
-Tables of all individual errors are also written here.
+The tables of all individual errors are also written here.
 """
 
 import hashlib
@@ -19,12 +19,12 @@ from fuselog.recorders.parsing import parse_json
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.evaluation import Errors, split_topic
 
-# The folder of individual errors in a result folder.
+# Folder of the tables of individual errors, in a result folder.
 ERRORS = Path("tables", "errors")
 
 
 def log_of_estimates(estimates: Log) -> Path:
-    """Find the log that an estimates log was replayed from; raises BadInput if it is not found.
+    """Find the log from which estimates were replayed; raise BadInput if it is missing.
 
     A recording with both estimates and sensors is its own source log.
     """
@@ -46,7 +46,7 @@ def source_of_estimates(
 
     Args:
         estimates: the estimates log.
-        place: the path of the source log, if it differs from what the estimates log states.
+        place: the path of the source log, if it differs from the one in the estimates log.
         recover: read the intact part of a damaged log.
     """
     log = open_log(place or log_of_estimates(estimates), recover=recover)
@@ -54,7 +54,7 @@ def source_of_estimates(
 
 
 def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
-    """Return parameters by label, in the order of the replay; empty if the log does not state them."""
+    """Return parameters by label, in the order of the replay; empty if the log does not contain them."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get("estimators", "{}"))
@@ -64,15 +64,15 @@ def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
 
 
 def labels_of(estimates: Log | Source) -> list[str]:
-    """List the estimators whose estimates are in a log."""
+    """List the estimators that have estimates in a log."""
     topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
     return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
 
 
 def recorded_estimators(log: Log | Source) -> list[str]:
-    """List the estimators whose estimates a recording contains, such as an autopilot's.
+    """List the estimators with estimates in a recording, such as an autopilot's.
 
-    An estimates log has a source log and therefore none of these.
+    An estimates log has a source log, so the list is empty.
     """
     notes = log.run.notes if log.run else {}
     has_sensors = any(not topic.startswith("/estimates/") for topic in log.topics)
@@ -80,7 +80,7 @@ def recorded_estimators(log: Log | Source) -> list[str]:
 
 
 def hash_streams(sources: Iterable[MemorySource]) -> str:
-    """Hash every column of every run with SHA-256; equal for equal input data."""
+    """Hash every column of every run with SHA-256; the hashes of equal data are equal."""
     digest = hashlib.sha256()
     for source in sources:
         add_to_hash(digest, source)
@@ -104,9 +104,9 @@ def hash_files(paths: Sequence[Path]) -> str:
 
 
 class ErrorTables:
-    """A context that writes all individual errors: one Parquet file per estimator and case.
+    """A context that writes all individual errors to a Parquet file per estimator and case.
 
-    They are written block by block, as they come.
+    The errors are written block by block as they arrive.
     """
 
     def __init__(self, folder: Path) -> None:

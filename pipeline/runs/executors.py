@@ -1,4 +1,4 @@
-"""Workers for a campaign's cells: this process, others on this machine, a Dask cluster."""
+"""Workers for the cells of an experiment: this process, local processes, or a Dask cluster."""
 
 import hashlib
 import logging
@@ -28,7 +28,7 @@ from fuselog.recorders.compiling.compile import use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
 
-# With fewer runs, starting processes takes longer than they save.
+# Smallest number of runs for which starting processes saves time.
 PAYING_RUNS = 1000
 PACKAGES = ("fuselog.recorders", "fuselog.replay", "fuselog.pipeline")
 
@@ -37,15 +37,16 @@ class WorkerPool(NamedTuple):
     """An executor and the properties of its workers.
 
     Attributes:
-        executor: distributes the work.
-        workers: how many tasks run concurrently.
-        require: raises BadInput unless all workers see these absolute paths as this process does.
-        lost: exceptions of a future whose worker died.
+        executor: the executor that distributes the work.
+        workers: number of tasks that run concurrently.
+        require: function that raises BadInput unless all workers see these absolute paths as this
+            process does.
+        lost: exceptions of a future whose worker has died.
     """
 
     executor: Executor
     workers: int
-    require: Callable[[Sequence[Path]], None] = lambda _: None  # trivial on this machine
+    require: Callable[[Sequence[Path]], None] = lambda _: None  # always true on this machine
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
@@ -56,9 +57,9 @@ PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 def pool_for(
     workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
 ) -> PoolFactory:
-    """Choose the workers for a number of runs: those the options ask for, else all cores if worthwhile.
+    """Choose the workers for a number of runs by the options, or all cores if this saves time.
 
-    A given executor does all the work. Raises BadInput if both options are given.
+    If an executor is given, it does all the work. Raises BadInput if both options are given.
     """
     if executor is not None:
         return pool_of(executor)
@@ -75,7 +76,7 @@ def pool_for(
 
 
 def pool_of(executor: Executor) -> PoolFactory:
-    """Wrap an existing executor as a pool; it gets as many tasks at a time as there are cores."""
+    """Wrap an existing executor as a pool with as many concurrent tasks as there are cores."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -85,10 +86,10 @@ def pool_of(executor: Executor) -> PoolFactory:
 
 
 class InlineExecutor(Executor):
-    """An executor that does the work on submission, in the calling thread."""
+    """An executor that does the work immediately in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do the work immediately; the future holds its result or its exception, except interrupts."""
+        """Do the work immediately; the future has its result or its exception, except interrupts."""
         future: Future[Any] = Future()
         try:
             future.set_result(work(*args, **kwargs))
@@ -99,7 +100,7 @@ class InlineExecutor(Executor):
 
 @contextmanager
 def inline_pool() -> Iterator[WorkerPool]:
-    """Open a pool of the calling process only, whose replay uses all cores."""
+    """Open a pool that consists of the calling process, in which a replay uses all cores."""
     yield WorkerPool(InlineExecutor(), 1)
 
 
@@ -112,7 +113,7 @@ def threads() -> Iterator[WorkerPool]:
 
 
 def processes(count: int) -> PoolFactory:
-    """Make a pool of `count` processes, each on one core, which end when this process ends."""
+    """Make a pool of `count` processes with one core each, which end with this process."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -148,7 +149,7 @@ def _begin_worker() -> None:
 
 @cache
 def _use_one_core() -> None:
-    """Limit this process's kernels and linear algebra to one core, and ignore numeric warnings."""
+    """Limit the kernels and linear algebra of this process to one core, and ignore numeric warnings."""
     use_cores(1)
     import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
 
@@ -157,9 +158,9 @@ def _use_one_core() -> None:
 
 
 class DaskExecutor(Executor):
-    """An executor that submits work to a Dask client; each worker thread uses one core.
+    """An executor that submits work to a Dask client, whose worker threads use one core each.
 
-    The limit is applied with each task, so that it also holds for workers that start later or restart.
+    The limit is applied with each task, so it also holds for workers that start later or restart.
     """
 
     def __init__(self, client: Any) -> None:
@@ -172,7 +173,7 @@ class DaskExecutor(Executor):
 
 
 def _on_one_core(work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Do the work in a process that is limited to one core from now on."""
+    """Limit the process to one core from now on, and do the work in it."""
     _use_one_core()
     return work(*args, **kwargs)
 
@@ -180,8 +181,8 @@ def _on_one_core(work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
 def dask(scheduler: str) -> PoolFactory:
     """Make a pool of the workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
 
-    `local:N` starts N workers on this machine, unreachable from others. Opening the pool raises BadInput
-    if no scheduler answers, its workers have other code than this process, or Dask is missing.
+    `local:N` starts N workers on this machine, which other machines cannot reach. Raises BadInput when
+    the pool is opened if no scheduler answers, if its workers have other code, or if Dask is missing.
     """
 
     @contextmanager

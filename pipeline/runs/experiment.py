@@ -1,4 +1,4 @@
-"""Experiments: a scenario (or real data, or logs), estimators and metrics, described in TOML."""
+"""Experiments in TOML files, which define a scenario (or data, or logs), estimators and metrics."""
 
 import os
 import warnings
@@ -40,7 +40,7 @@ class Experiment(Parameters):
     Attributes:
         title: a description in one line.
         text: more text for the report, in Markdown.
-        study: name of the study that does the work.
+        study: name of the study that runs the experiment.
         seed: seed of the recorded runs.
         runs: number of recorded runs.
         record: what to simulate.
@@ -85,7 +85,7 @@ class Experiment(Parameters):
         spelt = {label: _spelt_out(label, stated) for label in stated}
         for label, values in stated.items():
             if "like" in values and spelt[label]["kind"] == label:
-                del spelt[label]["kind"]  # a label that is a name needs none
+                del spelt[label]["kind"]  # a label that is the name of an estimator needs no `kind`
         return spelt
 
     @model_validator(mode="after")
@@ -128,7 +128,7 @@ class Experiment(Parameters):
 
 
 def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
-    """Return an estimator's parameters, completed by those of the estimator named by `like`."""
+    """Return an estimator's parameters, completed with those of the estimator named by `like`."""
     values = stated[label]
     if "like" not in values:
         return values
@@ -145,15 +145,15 @@ class Setting:
     """Where and how an experiment runs.
 
     Attributes:
-        folder: receives all written files.
+        folder: folder to which all files are written.
         place: the final path of the folder.
         data: the data to import.
         logs: number of runs whose logs are kept.
         draws: whether the first run's timeline is drawn.
         errors: whether all individual errors are kept.
         options: of the study's own type.
-        progress: reports progress.
-        open_pool: opens the workers for a campaign's cells; by default this process.
+        progress: function that reports progress.
+        open_pool: function that opens the workers for the cells; by default this process.
         checkpoints: storage of finished cells until all are done.
     """
 
@@ -171,7 +171,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """A registered study, which does the work of an experiment.
+    """A registered study, which runs an experiment.
 
     Attributes:
         summary: a description in one line.
@@ -179,7 +179,7 @@ class Study:
         options: the type of the experiment's `options`.
         is_campaign: whether it replays only through `fuselog.pipeline.runs.campaigns`, so that the runs
             can be distributed.
-        runs: what the number of runs counts; empty if the study makes none.
+        runs: description of what the number of runs counts; empty if the study makes no runs.
     """
 
     summary: str
@@ -194,10 +194,10 @@ class Stated(NamedTuple):
 
     Attributes:
         name: its name.
-        source: where it was read from, for messages.
+        source: the file from which it was read, for messages.
         values: its entries.
-        folder: the base of the paths of its logs.
-        files: other files that it was read from.
+        folder: the folder to which the paths of its logs are relative.
+        files: other files from which it was read.
     """
 
     name: str
@@ -213,7 +213,7 @@ class Stated(NamedTuple):
 
     @property
     def _values(self) -> dict[str, Any]:
-        """Return its entries; programs that they name are permitted."""
+        """Return its entries, and permit the programs that they name."""
         stated = self.values.get("estimators")
         own = {"estimators": allowed_in(stated, self.folder)} if isinstance(stated, Mapping) else {}
         return {**self.values, **own}
@@ -223,7 +223,7 @@ class Stated(NamedTuple):
         return build(Experiment, self._values, f"experiment {self.source}")
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
-        """Build the experiment with settings, and then `over`, applied; see `load_experiment`."""
+        """Build the experiment with settings, and then apply `over`; see `load_experiment`."""
         where = f"experiment {self.source}"
         own = _settings_of_experiment(self._as_written, settings)
         experiment = build(Experiment, {**merge(self._values, own), **over}, where)
@@ -244,9 +244,10 @@ def load_experiment(
 ) -> tuple[str, Experiment]:
     """Load an experiment by its shipped name or TOML file, and apply settings and then `over`.
 
-    A setting goes to the entry of the experiment or to the estimator named by its first word; otherwise
-    to the scenario's or importer's parameters; otherwise to all estimators that have such a parameter:
-    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`, `/fix.delay_s=0.3`.
+    A setting applies to the entry of the experiment or to the estimator that its first word names.
+    Otherwise it applies to the parameters of the scenario or importer, or else to all estimators with
+    such a parameter: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`,
+    `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)
     return stated.name, stated.with_settings(settings, over)
@@ -262,7 +263,7 @@ def read_experiment(name: str) -> Stated:
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
-    """Make the experiment that replays logs; raises BadInput if no estimator is named."""
+    """Make the experiment that replays logs; raise BadInput if no estimator is named."""
     if not labels:
         raise BadInput(f"{logs[0]}: name the estimators to replay, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
@@ -275,7 +276,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
-    """Find the files that match patterns, without duplicates; raises BadInput if one matches none."""
+    """Find the files that match patterns, without duplicates; raise BadInput if one matches none."""
     files: dict[str, None] = {}
     for pattern in patterns:
         place = Path(os.path.normpath(folder / pattern))
@@ -296,7 +297,7 @@ def given_files(experiment: Experiment, data: Path | None) -> list[Path]:
 
 
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Assign settings to the parts of an experiment; raises BadInput for an unknown one."""
+    """Assign settings to the parts of an experiment; raise BadInput for an unknown setting."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
     part, names = _parameters_of_source(experiment)
     own = parameters_by_label(experiment.estimators) if settings else {}
@@ -327,7 +328,7 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
 
 
 def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
-    """Return the name of the table that states the source of the data, and its parameters."""
+    """Return the name of the table that describes the source of the data, and its parameters."""
     if experiment.import_:
         part, recorder = "import", experiment.import_.source
     elif experiment.record:
@@ -344,7 +345,7 @@ def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
 
 
 def require_campaign(experiment: Experiment, remedy: str) -> None:
-    """Raise BadInput if an experiment's study replays all runs together, in one process."""
+    """Raise BadInput if the experiment's study replays all runs together in one process."""
     study: Study = load("studies", experiment.study, Study)
     if not study.is_campaign:
         raise BadInput(
@@ -364,7 +365,7 @@ def run_experiment(
     open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Run an experiment and write its folder, which appears only when complete; returns result.json."""
+    """Run an experiment and write its folder, which appears only when complete; return result.json."""
     if experiment.import_ and data is None:
         raise BadInput(f"experiment {name} needs real data; give the folder with --data")
     if data is not None and experiment.record:
@@ -393,7 +394,7 @@ def run_experiment(
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
     ):
-        # if all runs failed there is no mean, which is null in the results and not a warning
+        # if all runs failed, the mean is null in the results, which needs no warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
         setting = Setting(
             folder=part,

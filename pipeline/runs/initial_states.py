@@ -1,8 +1,8 @@
-"""Starts of replays at another state than the log's own prior.
+"""Starts of replays from another state than the log's own prior.
 
-An estimator with a prior begins there. If the replayed span begins later, that prior does not apply, and
-the state must come from the truth or from the estimates of an earlier replay. The estimator receives a
-prior made from it, so it needs no special handling.
+An estimator with a prior begins at the prior's stamp. If the replayed span begins later, the prior does
+not apply, and the state must come from the truth or from the estimates of an earlier replay. The
+estimator receives this state as a prior, so it needs no special handling.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ from fuselog.replay.engine.vectors.tangent import named_now, tangent_components,
 from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
-# Computes a run's prior at a time in ns from an estimator's label and the log's own prior.
+# Function that computes a run's prior at a time in ns from an estimator's label and the log's prior.
 Origin = Callable[[str, Stream, int], Stream]
 Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
 
@@ -55,7 +55,7 @@ def order_of(
 def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:
     """Return the part of a run between two times in seconds, by the clock that orders the replay.
 
-    Raises BadInput if it contains no messages.
+    Raises BadInput if the span contains no messages.
     """
     if start_s is not None and end_s is not None and start_s >= end_s:
         raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end must be after the start")
@@ -81,16 +81,16 @@ def origins_of(
     order: Clock,
     gap_limit_s: float,
 ) -> list[Origin]:
-    """Find what each run starts from; empty if no start is requested.
+    """Find the initial state of each run; empty if no start is requested.
 
     Args:
         sources: the runs.
         origins: "truth", or the estimates log of an earlier replay of each run.
-        sigmas: standard deviations by component, for the truth; see `from_truth`.
+        sigmas: standard deviations by component, for starts from the truth; see `from_truth`.
         order: the clock of the replay.
         gap_limit_s: the longest gap over which the truth is interpolated.
 
-    Raises BadInput if the replay begins with the runs, or an estimates log is from another run.
+    Raises BadInput if the replay begins where the runs begin, or an estimates log is of another run.
     """
     if origins and sources[0].start_ns is None:
         raise BadInput(f"--start-from {origins[0]}: also give the start time with --start")
@@ -112,7 +112,7 @@ def origins_of(
 
 
 def check_same_run(estimates: Source, source: Source) -> None:
-    """Raise BadInput if estimates are from another run than a log."""
+    """Raise BadInput if estimates are not from the run of a log."""
     of, run = estimates.run, source.run
     if of and run and replace(of, notes={}) != replace(run, notes={}):
         raise BadInput(
@@ -158,16 +158,16 @@ def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clo
 def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
     """Start a run from its truth.
 
-    The covariance is that of the log's prior; `sigmas` replace standard deviations of some components,
-    which are then uncorrelated with all others.
+    The covariance is that of the log's prior. `sigmas` replace the standard deviations of some
+    components, which are then uncorrelated with all others.
     """
     return partial(_true_state, source, order, gap_limit_s, sigmas)
 
 
 def from_estimates(estimates: Source) -> Origin:
-    """Start a run from the last mean and covariance that an earlier replay estimated before the start.
+    """Start a run from the last mean and covariance in an earlier replay before the start.
 
-    The estimate with the same label is used, otherwise the only one with the prior's components.
+    The estimate with the same label is used, or else the only estimate with the prior's components.
     """
     return partial(_estimated_state, estimates)
 
@@ -230,7 +230,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
     columns = match_components(stream.metadata, components, where)
     tangent = match_tangent(stream.metadata, components, where)
     times_ns = stream.publish_time_ns
-    # messages with the stamp of the start are replayed and must not be in the prior already
+    # messages with the stamp of the start are replayed, so the prior must not contain them
     before = int(np.searchsorted(times_ns, start_ns, side="left"))
     if before == 0:
         raise BadInput(f"{where}: there is no estimate before the start; give a later --start")
@@ -247,7 +247,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
 
 
 def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
-    """Find the estimate to replace a prior: of the same case, with all its components."""
+    """Find the estimate that replaces a prior: of the same case, with all its components."""
     case = prior.topic.rpartition("/")[0].removeprefix("/")
     found = [
         name
@@ -268,7 +268,7 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
 
 
 def _components(prior: Stream, name: str) -> dict[str, Any]:
-    """Return names and kinds of a prior's components; raises BadInput if it names none."""
+    """Return names and kinds of a prior's components; raise BadInput if it names no components."""
     found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
     if not found:
         raise BadInput(

@@ -1,4 +1,4 @@
-"""Sources of the runs of an experiment: a scenario, real data, or logs."""
+"""Inputs of an experiment: a scenario, real data, or logs."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ class Record(Parameters):
 
 
 class Import(Parameters):
-    """An import of data; the path of the data is given with --data.
+    """An import of data, whose path is given with --data.
 
     Attributes:
         source: name of the importer.
@@ -38,7 +38,7 @@ class Import(Parameters):
 
 
 class Logs(Parameters):
-    """The logs to replay, one run each.
+    """The logs to replay, one run per log.
 
     Attributes:
         files: files or patterns such as `drive-*.mcap`, relative to the folder of the experiment's file;
@@ -49,19 +49,19 @@ class Logs(Parameters):
 
 
 class Recording(Parameters):
-    """A recording that claims are about, identified by the content of its files.
+    """A recording to which claims refer, identified by the content of its files.
 
     Attributes:
         files: pattern of its files, such as `*_detections.json` or `path_9/*.csv`; other files are
             ignored.
-        sha256: hash of the files together; see `digest_of`.
+        sha256: hash of all files together; see `digest_of`.
     """
 
     files: str
     sha256: str = ""
 
     def digest_of(self, files: Sequence[Path]) -> str:
-        """Hash the decompressed files that belong to this recording with SHA-256; "" for none."""
+        """Hash the decompressed files of this recording with SHA-256; "" if there are none."""
         digests = sorted(_digest(path) for path in files if path.match(self.files))
         return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 
@@ -80,9 +80,9 @@ def _digest(path: Path) -> str:
 
 
 def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: str) -> dict[str, bool]:
-    """Test for each recording by name whether these files are that recording.
+    """Test for each recording, by name, whether these files belong to it.
 
-    Raises BadInput that names `where` if one states no hash.
+    Raises BadInput with `where` if a recording has no hash.
     """
     digests = {name: recording.digest_of(files) for name, recording in recordings.items()}
     for name, digest in digests.items():

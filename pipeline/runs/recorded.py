@@ -1,4 +1,4 @@
-"""Recording, replay and judgement of ensembles whole in memory, if there is room."""
+"""Recording, replay and judgement of ensembles in memory, if there is enough."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from fuselog.replay.judging.errors.evaluation import Errors, Innovations, split_
 from fuselog.replay.judging.judge import TIME_BINS, Judge
 from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measure
 
-# Minimum number of bytes kept for a judged run: its sums over time.
+# Smallest number of bytes that are kept for a judged run, for its sums over time.
 KEPT_BYTES = 8 * TIME_BINS
 
 
@@ -30,7 +30,7 @@ KEPT_BYTES = 8 * TIME_BINS
 class Replayed:
     """An ensemble in memory, the outputs of estimators, and their errors.
 
-    `others` is what families judge: sets, regions, tracks.
+    `others` contains the outputs that families judge: sets, regions, tracks.
     """
 
     sources: Sequence[MemorySource]
@@ -41,7 +41,7 @@ class Replayed:
 
     @property
     def judged(self) -> list[Errors | Innovations | Output]:
-        """Return everything that metrics of estimates, innovations and messages judge."""
+        """Return all outputs that have metrics: estimates, innovations and messages."""
         outputs = [
             Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
             for topic, rows in self.outputs.items()
@@ -49,7 +49,7 @@ class Replayed:
         return [*self.errors, *self.innovations, *outputs]
 
     def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
-        """Compute the metrics with these names, or all if none is given; see `measure`."""
+        """Compute the metrics with these names, or all if no names are given; see `measure`."""
         return measure(self.judged, find_metrics(names))
 
 
@@ -65,7 +65,7 @@ def record_ensemble(
 ) -> Ensemble[MemorySource]:
     """Record `runs` runs of a scenario, each with its own random stream of `seed`.
 
-    Raises BadInput if the first run shows that memory cannot hold them, or the sums kept of all runs.
+    Raises BadInput if the size of the first run shows that memory cannot hold all runs, or their sums.
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
@@ -81,7 +81,7 @@ def record_ensemble(
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
-    """Raise BadInput with the required memory if it exceeds what is free."""
+    """Raise BadInput with the required memory if it exceeds the free memory."""
     time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
     import psutil  # slow to import
 
@@ -126,7 +126,7 @@ def replay_in_memory(
     late: Late | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Ragged]:
-    """Replay estimators (label -> parameters) over an ensemble; return whole streams by topic."""
+    """Replay estimators (label -> parameters) over an ensemble; return complete streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])

@@ -1,4 +1,4 @@
-"""The work common to all studies: obtain runs, replay and judge them, keep the first logs, draw a run.
+"""Functions that all studies share: obtain, replay and judge runs, keep the first logs, draw a run.
 
 A study adds its own cases, claims, tables and figures.
 """
@@ -46,7 +46,7 @@ class Runner:
         first_run: int = 0,
         runs: int | None = None,
     ) -> list[MemorySource]:
-        """Load runs into memory: simulated, imported, or from logs.
+        """Load runs into memory, from a simulation, an import or logs.
 
         Args:
             parameters: values that differ from the scenario's.
@@ -103,8 +103,9 @@ class Runner:
             sources: the runs.
             outputs: the outputs of the estimators, by topic.
             folder: the folder for logs and estimates, in the setting's folder.
-            drawn: likewise the folder for the timeline of the first run; None for no timeline.
-            first_run: the number of the first of these runs, if they are a part of all.
+            drawn: the folder for the timeline of the first run, also in the setting's folder; None for
+                no timeline.
+            first_run: the number of the first of these runs, if they are only a part of all runs.
         """
         count = max(0, min(self.setting.logs - first_run, len(sources)))
         for run in self.setting.progress(range(count), "writing logs", count) if count else ():
@@ -119,7 +120,7 @@ class Runner:
     def draw(
         self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
     ) -> None:
-        """Draw the timeline of the first of the runs `sources` with its `outputs` to `folder`."""
+        """Draw the timeline of the first of the runs `sources`, with its `outputs`, to `folder`."""
         from fuselog.replay.timeline.show import show
 
         place = self.setting.folder / folder
@@ -135,9 +136,9 @@ class Runner:
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """Run as `run` does for all `cases`, which map names to different scenario parameters.
+        """Run all `cases`, which map names to different scenario parameters, as `run` does.
 
-        Files go to a folder of the case, except that the first case's timeline is the experiment's.
+        Files are written to a folder per case; the first case's timeline is that of the experiment.
         """
         for number, (name, differing) in enumerate(cases.items()):
             replayed = self.replay(self.obtain(differing))
@@ -145,7 +146,7 @@ class Runner:
             yield name, replayed
 
     def judge(self, now: slice) -> Pass:
-        """Judge the runs `now` in one streamed pass; logs and timeline of the first runs are written."""
+        """Judge the runs `now` in one streamed pass, and write logs and timeline of the first runs."""
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
@@ -182,7 +183,7 @@ class Runner:
         return done
 
     def _as_seen_from(self, path: Path, log: Path) -> Path:
-        """Return a path to a log that is valid once the folder has been moved to its final place."""
+        """Return a path to a log that is valid after the folder has been moved to its final path."""
         there = self.setting.place / path.relative_to(self.setting.folder)
         return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
 

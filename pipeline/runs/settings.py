@@ -1,4 +1,4 @@
-"""Parameters of estimators as commands receive them: --set, a settings file, separate options."""
+"""Parameters of estimators as commands receive them, from --set, a settings file and other options."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,11 +19,11 @@ OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
 def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, Any]]:
-    """Read parameters by estimator label from the tables of a TOML file; empty without a file.
+    """Read parameters by estimator label from the tables of a TOML file; return {} without a file.
 
     Args:
         path: the file.
-        labels: the settings that the command line gives for each estimator, such as its program.
+        labels: the settings on the command line for each estimator, such as its program.
 
     Raises BadInput if the file has settings of another estimator, or names another program.
     """
@@ -40,7 +40,7 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
 
 
 def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Split KEY=VALUE texts into settings of topics, by `/TOPIC.WHAT`, and the texts of all others."""
+    """Split KEY=VALUE texts into settings of topics, by `/TOPIC.WHAT`, and all other texts."""
     of_topics = [text for text in texts if _alters(text)]
     return parse_settings(of_topics), [text for text in texts if text not in of_topics]
 
@@ -55,8 +55,8 @@ def settings_of_estimators(
 ) -> dict[str, dict[str, Any]]:
     """Combine parameters by estimator label: a settings file, then KEY=VALUE texts, then options.
 
-    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter, and so
-    do options that are not None. Raises BadInput if no estimator has the parameter.
+    `ekf.gate_probability=1` applies to ekf, `gate_probability=1` to all estimators with such a
+    parameter, and so do options that are not None. Raises BadInput if no estimator has the parameter.
     """
     named = named_by(labels)
     base = read_settings(file, named)
@@ -123,7 +123,7 @@ def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Read standard deviations by component from an option's COMPONENT=SIGMA texts."""
+    """Parse standard deviations by component from an option's COMPONENT=SIGMA texts."""
     sigmas: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")

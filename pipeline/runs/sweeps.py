@@ -1,4 +1,4 @@
-"""Sweeps: an experiment at many points of its parameters, a grid or samples."""
+"""Sweeps, which run an experiment at many points of its parameters, on a grid or at samples."""
 
 import itertools
 import math
@@ -50,9 +50,9 @@ class Over(NamedTuple):
     """A parameter that is swept.
 
     Attributes:
-        key: as in `--set`.
-        taken: its values on a grid.
-        ends: of the range from which samples are drawn; None for a list.
+        key: the parameter, as in `--set`.
+        taken: values on the grid.
+        ends: ends of the range from which samples are drawn; None for a list.
         is_log: whether the range is logarithmic.
         name: its meaning in a few words, if known.
     """
@@ -70,7 +70,7 @@ class Over(NamedTuple):
 
 
 def parse_over(text: str) -> Over:
-    """Read `KEY=LOW:HIGH:N` (linear), `KEY=LOW:HIGH:logN` (logarithmic) or `KEY=VALUE,VALUE,...`.
+    """Parse `KEY=LOW:HIGH:N` (linear), `KEY=LOW:HIGH:logN` (logarithmic) or `KEY=VALUE,VALUE,...`.
 
     Raises BadInput for anything else.
 
@@ -87,7 +87,7 @@ def parse_over(text: str) -> Over:
 
 
 def over_of(key: str, values: Sequence[Any]) -> Over:
-    """Make a list of values, logarithmic if evenly spaced so; raises BadInput for duplicates."""
+    """Make a list of values, logarithmic if evenly spaced so; raise BadInput for duplicates."""
     if len({*map(str, values)}) < len(values) or not values:
         raise BadInput(f"sweep over {key}: give at least one value, and each only once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]
@@ -122,9 +122,10 @@ def _value(text: str, key: str, stated: str) -> Any:
 def points_of(
     over: Sequence[Over], samples: int | None = None, sampling: Sampling = "sobol", seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Make the points of a grid, the last parameter changing fastest, or samples of the ranges.
+    """Make the points of a grid, on which the last parameter changes fastest, or samples of the ranges.
 
-    A sample takes one value of a list. Raises BadInput if there is nothing to sweep, or too much.
+    A sample contains one value of a list. Raises BadInput if there are no parameters, or too many
+    points.
     """
     keys = [each.key for each in over]
     if not over or len(set(keys)) < len(keys):
@@ -164,7 +165,7 @@ def _at(over: Over, share: float) -> Any:
 
 
 def settings_at(point: Mapping[str, Any]) -> dict[str, Any]:
-    """Nest values with keys such as `ekf.sigma_range_m` as tables in tables.
+    """Convert keys such as `ekf.sigma_range_m` to nested tables.
 
     >>> settings_at({"ekf.sigma_range_m": 0.1, "robots": 2})
     {'ekf': {'sigma_range_m': 0.1}, 'robots': 2}
@@ -185,10 +186,10 @@ def run_sweep(
     open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Replay and judge an experiment at every point, and write a result folder; returns result.json.
+    """Run an experiment at every point, and write a result folder; return result.json.
 
-    Its metrics are lists with a number for each point; the table has them in long form. Raises BadInput
-    if the study of the experiment does more than judge, or if the experiment cannot be run.
+    Its metrics are lists with a number for each point; the table has a row for each. Raises BadInput if
+    the study of the experiment does more than judge, or if the experiment cannot be run.
     """
     for experiment in experiments:
         if experiment.study != "localization":
@@ -226,7 +227,7 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """Tabulate the metrics at a point: the value over all runs, and the middle 90 % of the runs.
+    """Tabulate the metrics at a point, with the value over all runs and the range of the middle 90 %.
 
     NEES and NIS also have their expected value, and the 95 % range of a consistent estimator.
     """
@@ -253,7 +254,7 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
 
 
 def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
-    """Select the errors of every run at a point, for comparing points run by run."""
+    """Select the errors of every run at a point, with which points are compared run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
     kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
@@ -275,7 +276,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
-    """Collect every metric as a list by point; NaN if a point has none."""
+    """Collect every metric as a list by point; NaN if it is missing at a point."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
         values = dict(zip(rows["point"], rows["value"], strict=True))
@@ -292,7 +293,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
     for (quantity, case), rows in drawn.groupby(["quantity", "case"]):
         name = "-".join(filter(None, (str(quantity), str(case))))
         changes = rows.groupby("estimator")["value"].transform(np.ptp) > 0
-        shown = rows[changes] if changes.any() else rows  # constant curves are not worth a picture
+        shown = rows[changes] if changes.any() else rows  # constant curves are omitted
         is_map = len(over) == 2 and numbers and grid
         drawn_as = (
             heat_maps(shown, over, name) if is_map else curves(shown, over, str(quantity), str(case))
@@ -302,7 +303,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
 
 
 def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
-    """Draw the quantity over each parameter, as the mean over other swept parameters."""
+    """Draw the quantity over each parameter, averaged over the other swept parameters."""
     panels = []
     for each in over:
         numbers = all(isinstance(value, int | float) for value in each.taken)
@@ -324,7 +325,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
 
 
 def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
-    """Draw the quantity over two parameters, a map per estimator; a cross marks the smallest error."""
+    """Draw the quantity over two parameters, a map per estimator, with a cross at the smallest error."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -343,7 +344,7 @@ def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
         for axis, places in ((axes.xaxis, own.columns), (axes.yaxis, own.index)):
             shown = range(0, len(places), -(-len(places) // 9))
             axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
-        axes.tick_params(axis="x", rotation=45)  # up to nine numbers in a row
+        axes.tick_params(axis="x", rotation=45)  # at most nine numbers in a row
         axes.set(xlabel=x.label, ylabel=y.label, title=label)
     figure.colorbar(picture, ax=figure.axes, label=label_of(name.partition("-")[0]))
     return figure

@@ -1,4 +1,4 @@
-"""Estimation of sensor noise from recordings, with intervals, and its export to filters.
+"""Estimation of sensor noise from recordings, with intervals, and its output for filters.
 
-Begin with `noise`. The mathematics is in `terms`, `allan`, `likelihood` and `fitting`, over columns.
+Begin with `noise`. The mathematics is in `terms`, `allan`, `likelihood` and `fitting`.
 """

@@ -16,8 +16,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 PER_DECADE = 8
 _BLOCK = 1 << 16
-_FULL = 1 << 17  # samples, from which on only a part of the differences is used
-_A_WINDOW = 1000  # differences per window then, which are as good as all
+_FULL = 1 << 17  # number of samples above which only some of the differences are used
+_A_WINDOW = 1000  # number of differences per window in this case, which are as accurate as all
 
 
 class Curve(NamedTuple):
@@ -36,14 +36,15 @@ def multiples_of(count: int) -> Integers:
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Compute the step between differences; neighbouring differences of long windows are similar."""
+    """Compute the step between differences; neighbours of long windows are nearly the same."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 
 def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
     """Compute the overlapping Allan deviation of samples (n,) every `step_s`; NaN marks lost samples.
 
-    Only pairs of complete windows count. For many samples, a thousand differences per window are used.
+    Only pairs of complete windows are used. For many samples, a thousand differences per window are
+    used.
 
     Args:
         values: the samples, in any unit, on a grid without gaps.

@@ -1,4 +1,4 @@
-"""The command `fuselog noise`: it prints the noise of sensors, and writes the result folder."""
+"""The command `fuselog noise`, which prints the noise of sensors and writes the result folder."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ def show_noise(
     recover: bool,
     as_json: bool,
 ) -> None:
-    """Print a table of numbers with intervals and sentences, or explain a file of another tool."""
+    """Print a table of noise values with intervals and sentences, or explain a file of another tool."""
     sentences = explained(log)
     if sentences:
         if out is not None or topics or sheet or taus:

@@ -1,8 +1,8 @@
-"""Noise as settings of other programs: the numbers that each reads, in its units.
+"""Noise as settings of other programs, in the units that each program uses.
 
-A filter gets the largest of three axes, so that no noise is stated too small. Continuous densities are N
-in unit/sqrt(Hz) and K in unit/sqrt(s); for a standard deviation per step, divide by the root of the
-step.
+A filter receives the largest value of three axes, so no noise is stated too small. Continuous densities
+are N in unit/sqrt(Hz) and K in unit/sqrt(s). For a standard deviation per step, N is divided by the root
+of the step.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ class Density(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """The exported noise: densities by field, and sentences to be read first."""
+    """The exported noise densities by field, and sentences that should be read first."""
 
     topic: str
     fields: Mapping[str, Density]
@@ -36,12 +36,12 @@ class Densities(NamedTuple):
         return None if force is None or rate is None else (force, rate)
 
     def warned(self, mark: str, text: str) -> str:
-        """Prepend the sentences to a text, as comments that begin with a mark."""
+        """Prepend the sentences to a text, as comments that begin with `mark`."""
         return "".join(f"{mark} {each}\n" for each in self.doubts) + text
 
 
 def settings(found: Densities) -> str:
-    """Write fuselog's settings of the model inertial: N and K, continuous."""
+    """Format fuselog's settings for the model inertial: N and K, continuous."""
     names = {
         _FORCE: ("force_noise_density", "force_bias_density"),
         _RATE: ("gyro_noise_density", "gyro_bias_density"),
@@ -56,7 +56,7 @@ def settings(found: Densities) -> str:
 
 
 def kalibr(found: Densities) -> str:
-    """Write Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the root of the step itself."""
+    """Format Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the root of the step itself."""
     if found.unit is None:
         return ""
     force, rate = found.unit
@@ -73,7 +73,7 @@ def kalibr(found: Densities) -> str:
 
 
 def px4(found: Densities) -> str:
-    """Write PX4's EKF2 parameters: discrete, N and K divided by the root of the filter's step."""
+    """Format PX4's EKF2 parameters: discrete, N and K divided by the root of the filter's step."""
     if found.unit is None:
         return ""
     force, rate = (density.white / _PX4_STEP_S**0.5 for density in found.unit)
@@ -89,7 +89,7 @@ def px4(found: Densities) -> str:
 
 
 def gtsam(found: Densities) -> str:
-    """Write GTSAM's preintegration parameters: N^2 and K^2, continuous."""
+    """Format GTSAM's preintegration parameters: N^2 and K^2, continuous."""
     if found.unit is None:
         return ""
     force, rate = found.unit
@@ -108,7 +108,7 @@ def gtsam(found: Densities) -> str:
 
 
 def robot_localization(found: Densities) -> str:
-    """Write robot_localization's process noise, and the covariances of an inertial unit's messages."""
+    """Format robot_localization's process noise, and the covariances of an inertial unit's messages."""
     if found.unit is None:
         return ""
     force, rate = found.unit

@@ -1,7 +1,8 @@
-"""A maximum-likelihood fit of a sensor's noise: the terms, their sizes, and their intervals.
+"""A maximum-likelihood fit of a sensor's noise: its terms with sizes and intervals.
 
-A random walk of zero is at the boundary of possible values. Without any walk, its most likely density is
-zero in two of three recordings, so the result may be "none found, and it is less than".
+A random walk of zero is at the boundary of the possible values. If a sensor has no walk, its most likely
+density is zero in two of three recordings. Therefore the result may be that no walk is found, with an
+upper limit.
 """
 
 import math
@@ -18,9 +19,9 @@ from fuselog.pipeline.sensing.terms import Terms
 
 Floats = NDArray[np.float64]
 _GAIN = 1e-7  # smallest gain of a step in log-likelihood
-# accuracy of the ends of intervals, and doublings of the distance: up to 16 standard deviations
+# accuracy of interval ends, and doublings of the distance: up to 16 standard deviations
 _WITHIN, _DOUBLINGS = 1e-4, 4
-_SHORTEST = 30  # steps: a shorter Gauss-Markov time is the sensor's own filter, not a drift
+_SHORTEST = 30  # number of steps: a shorter Gauss-Markov time is the sensor's own filter, not a drift
 
 
 WORDS = {
@@ -35,10 +36,10 @@ class Fit(NamedTuple):
     """The most likely terms of one kind.
 
     Attributes:
-        free: the names of the terms' numbers.
+        free: the names of the parameters of the terms.
         terms: the most likely terms.
         log_likelihood: the log-likelihood with these terms.
-        curvature: (p, p) minus its second derivatives by the logarithms of the numbers.
+        curvature: (p, p) minus its second derivatives by the logarithms of the parameters.
         size: the number of samples.
     """
 
@@ -55,17 +56,17 @@ class Fit(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the names of the terms."""
+        """Return the names of the terms in words."""
         return ", ".join(WORDS[name] for name in self.free if name in WORDS)
 
     @property
     def sigmas(self) -> Floats:
-        """Return the standard deviations (p,) of the logarithms of the numbers."""
+        """Return the standard deviations (p,) of the logarithms of the parameters."""
         return np.sqrt(np.diag(np.linalg.pinv(self.curvature)))
 
 
 def choose(samples: Samples) -> Fit:
-    """Choose the fit with the best BIC: white noise and any other terms that improve it."""
+    """Choose the fit with the best BIC, which has white noise and any other terms that improve it."""
     white = fit(samples, ())
     walk, markov = fit(samples, ("walk",)), fit(samples, ("markov", "markov_time_s"))
     best = max(white, walk, markov, key=lambda each: each.criterion)
@@ -77,10 +78,10 @@ def choose(samples: Samples) -> Fit:
 
 
 def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
-    """Maximise the likelihood over white noise and other numbers of the terms.
+    """Maximise the likelihood over white noise and the other parameters of the terms.
 
-    All are searched as logarithms relative to the white noise, which then follows from the residuals;
-    Newton steps complete the search. A term whose most likely size is zero stays tiny.
+    All parameters are searched as logarithms relative to the white noise, which then follows from the
+    residuals. Newton steps complete the search. A term whose most likely size is zero stays tiny.
     """
     free = ("white", *beside_white)
     span_s = samples.step_s * float(samples.steps.sum())
@@ -112,10 +113,11 @@ def fit(samples: Samples, beside_white: Sequence[str]) -> Fit:
 
 
 def _limits(name: str, step_s: float, span_s: float) -> tuple[float, float]:
-    """Return the range in which the logarithm of a number is searched, relative to white noise of 1."""
+    """Return the search range of the logarithm of a parameter, relative to white noise of 1."""
     if name == "markov_time_s":
         return math.log(_SHORTEST * step_s), math.log(max(span_s / 2, 2 * _SHORTEST * step_s))
-    if name == "walk":  # from what is invisible in a recording of that length to what one sample shows
+    # from a size that is invisible in a recording of that length to one that a single sample shows
+    if name == "walk":
         return math.log(0.01 / span_s), math.log(3.0 / step_s)
     if name == "markov":
         return math.log(0.03 / math.sqrt(span_s)), math.log(3.0 / math.sqrt(step_s))
@@ -128,27 +130,27 @@ def _scaled(terms: Terms, name: str, scale: float) -> float:
 
 
 def _cost(samples: Samples, free: Sequence[str]) -> Cost:
-    """Make a function of minus the log-likelihoods (n,) of the logarithms (n, p) of numbers."""
+    """Make a function of minus the log-likelihoods (n,) of the logarithms (n, p) of parameters."""
     return lambda points: np.array(
         [-likelihood(samples, of_point(free, each)).log_likelihood for each in points]
     )
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
-    """Make the terms whose free numbers have these logarithms.
+    """Make the terms whose free parameters have these logarithms.
 
     Args:
-        free: the names of the p numbers, as fields of `Terms`.
+        free: the names of the p parameters, as fields of `Terms`.
         point: (p,), their natural logarithms.
 
     Returns:
-        The terms; all other numbers have the defaults of `Terms`.
+        The terms; all other parameters have the defaults of `Terms`.
     """
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 
 def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fit:
-    """Take Newton steps while they gain; none if a number is not determined."""
+    """Take Newton steps while they improve the fit; none if a parameter is not determined."""
     [best] = cost(point[None])
     reach = np.full(len(point), 0.01)
     bent = np.zeros((len(point), len(point)))
@@ -169,9 +171,9 @@ def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fi
 
 
 def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
-    """Compute the 95 % profile-likelihood intervals of a fit's numbers, by name.
+    """Compute the 95 % profile-likelihood intervals of a fit's parameters, by name.
 
-    An end that is beyond the search's reach is zero or infinite.
+    An end that the search does not reach is zero or infinite.
     """
     point = np.log([getattr(found.terms, each) for each in found.free])
     ends = profile_ends(
@@ -187,7 +189,7 @@ def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
 
 
 def walk_below(samples: Samples, white: Fit) -> float:
-    """Compute the 95 % upper limit of the walk for a recording in which none was found."""
+    """Compute the 95 % upper limit of the walk in a recording in which no walk was found."""
     size = len(samples.values) - 1
 
     def beside(log_ratio: float) -> tuple[float, float]:

@@ -1,7 +1,7 @@
-"""Noise files of imu_utils and allan_variance_ros: the meaning and units of their numbers.
+"""Meaning and units of the numbers in noise files of imu_utils and allan_variance_ros.
 
-imu_utils states `gyr_n` as the root of the rate times the Allan deviation at 1 s, a standard deviation
-per sample, although its README gives rad/s/sqrt(Hz); `gyr_w` is the minimum of its curve, not a walk.
+In imu_utils, `gyr_n` is the root of the rate times the Allan deviation at 1 s, a standard deviation per
+sample, although its README gives rad/s/sqrt(Hz); `gyr_w` is the minimum of its curve, not a walk.
 allan_variance_ros differences neighbouring bins that overlap, and its gyroscope curve is in deg/s.
 """
 
@@ -16,7 +16,7 @@ _NUMBER = r"\s*:\s*([-+.\deE]+)"
 
 
 def explained(path: Path) -> list[str]:
-    """Explain the numbers in a file of these tools; [] for any other file."""
+    """Explain the numbers in a file of these tools; return [] for any other file."""
     if path.suffix not in (".yaml", ".yml", ".txt") or not path.is_file():
         return []
     text = path.read_bytes()[:_MOST_BYTES].decode(errors="replace")

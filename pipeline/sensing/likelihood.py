@@ -1,8 +1,8 @@
 """The likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov noise, quantised angle.
 
 A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, which starts exactly diffuse, the
-Gauss-Markov noise g, errors e of a quantised angle and white noise v. The first sample therefore does
-not count. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
+Gauss-Markov noise g, errors e of a quantised angle and white noise v. Therefore the first sample is not
+scored. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
 squares.
 """
 
@@ -20,7 +20,7 @@ Integers = NDArray[np.int64]
 
 
 class Samples(NamedTuple):
-    """The samples of one column, as the likelihood takes them.
+    """The samples of one column, in the form that the likelihood accepts.
 
     Attributes:
         values: (n, 1 + regressors) the samples, and regressors that they may depend on.
@@ -101,7 +101,7 @@ def filter_samples(
     walk = noise[1] * noise[1] * step_s
     markov = noise[2] * noise[2]
     angle = noise[4] * noise[4]
-    into = angle / step_s  # the covariance of e_k and y_k
+    into = angle / step_s  # covariance of e_k and y_k
     each = white + into / step_s
     decay_of_one = math.exp(-step_s / noise[3])
     columns = values.shape[1]

@@ -1,6 +1,6 @@
-"""The noise of a sensor at rest: its terms with intervals, its Allan deviation, notes.
+"""The noise of a sensor at rest, with its terms, intervals, Allan deviation and notes.
 
-Begin here: `noise` processes the columns of a log's topics, `_analysed` a single column.
+Begin here. `noise` processes the columns of a log's topics, `_analysed` a single column.
 """
 
 import math
@@ -26,14 +26,14 @@ from fuselog.recorders.units import unit_of
 from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
-# probability of the interval in which a fitted curve should be, at each of thirty times
+# probability that a fitted curve is in this interval at each of thirty times
 _DOUBTFUL = 0.999
 _FEWEST_DEGREES = 3.0
 _CLOCKS = "publish_time_ns", "log_time_ns", "position"
-_BLOCK = 1 << 18  # messages that are read at a time
-# Meaning of a data sheet's number by its unit; {} is the unit of the column.
+_BLOCK = 1 << 18  # number of messages that are read together
+# Meaning of a data sheet's number by its unit; {} is replaced by the unit of the column.
 _STATED = {"white": "{}/sqrt(Hz)", "walk": "{}/sqrt(s)"}
-_USUAL = "rad/s", "m/s^2"  # units for columns whose names have none
+_USUAL = "rad/s", "m/s^2"  # units for columns whose names contain no unit
 
 
 @without_warnings_of_numbers()
@@ -44,20 +44,20 @@ def noise(
     sheet: Mapping[str, str] | None = None,
     taus: Iterable[float] = (),
 ) -> SensorNoise:
-    """Estimate the noise of sensors at rest: maximum-likelihood terms with intervals, Allan deviations.
+    """Estimate the noise of sensors at rest, as maximum-likelihood terms with intervals.
 
     Args:
         log: a path, an opened log, or a recording, of a unit at rest.
         topics: topics such as `/imu` or single fields such as `/imu.turn_rate_radps`; by default all
             inertial units, or the only topic with numbers.
-        sheet: values of a data sheet, by the name of a field: `{"turn_rate_radps": "0.007
+        sheet: values from a data sheet, by the name of a field: `{"turn_rate_radps": "0.007
             deg/s/sqrt(Hz)"}`.
         taus: times in s for which the Allan deviation is also reported.
 
     Returns:
         The noise of every column with 95 % intervals: its terms, and its Allan deviations.
 
-    Raises BadInput if a unit moves, the log is too short, a column is constant, stamps go backwards, too
+    Raises BadInput if a unit moves, the log is too short, a column is constant, stamps decrease, too
     many messages are lost, a time is longer than a third of the log, or a unit belongs to another
     quantity.
     """
@@ -84,7 +84,7 @@ def noise(
 
 
 def parse_sheet(field: str, text: str) -> tuple[str, float]:
-    """Parse a value of a data sheet to `white` or `walk` and a number in our units.
+    """Parse a value from a data sheet to `white` or `walk` and a number in our units.
 
     A one-sided density, as spectrum analysers show it, is sqrt(2) times the two-sided one.
 
@@ -116,7 +116,7 @@ def _one(sources: Sequence[Any]) -> Sequence[Any]:
 
 
 def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
-    """Choose the topics and, if given, their fields."""
+    """Choose the topics and their fields, if fields are given."""
     chosen: dict[str, list[str]] = {}
     for text in wanted:
         topic, _, name = (text, "", "") if text in source.topics else text.rpartition(".")
@@ -148,7 +148,7 @@ def _numbers(stream: Stream) -> list[str]:
 
 
 def _read(source: Any, topic: str, fields: Sequence[str]) -> Stream:
-    """Read these fields of a topic; only one column at a time is in memory twice."""
+    """Read these fields of a topic, with at most two copies of one column in memory."""
     empty = source.empty(topic)
     parts = [block[topic] for block in source.blocks([topic], "publish_time", _BLOCK) if topic in block]
     kept: dict[str, list[NDArray[Any]]] = {name: [part[name] for part in parts] for name in fields}
@@ -226,7 +226,7 @@ def _drifts(drift: Drift, unit: str) -> str:
 
 
 def _misfits(found: ColumnNoise) -> list[str]:
-    """Report where the fitted model's curve leaves the interval of the measured one."""
+    """Report where the fitted model's curve is outside the interval of the measured one."""
     low, high = interval(found.curve.deviations, found.degrees, _DOUBTFUL)
     model, taus_s = found.model_deviations, found.curve.taus_s
     is_seen = (found.degrees > _FEWEST_DEGREES) & (taus_s > 0.99 * found.block * found.step_s)

@@ -1,4 +1,4 @@
-"""The result of a noise analysis: tables, curves, sentences, a result folder."""
+"""The result of a noise analysis, with tables, curves, sentences and a result folder."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from fuselog.replay.judging.intervals import Interval
 
 Floats = NDArray[np.float64]
 MISFIT = "misfit: "  # prefix of a sentence that users of the numbers should read first
-_TERMS = {  # words for each number in a table; {} is the unit of the column
+_TERMS = {  # names of the values in a table; {} is replaced by the unit of the column
     "white": "white noise N ({}/sqrt(Hz))",
     "walk": "random walk K ({}/sqrt(s))",
     "markov": "Gauss-Markov s ({})",
@@ -42,7 +42,7 @@ class ColumnNoise:
         numbers: by the names of `Terms`, and `ramp`; 0 for a walk that was not found.
         fitted: the chosen model.
         curve: the measured Allan deviation.
-        degrees: (n,) its degrees of freedom.
+        degrees: (n,) degrees of freedom of the Allan deviation.
         notes: sentences.
     """
 
@@ -59,7 +59,7 @@ class ColumnNoise:
 
     @property
     def name(self) -> str:
-        """Return the column's name in sentences."""
+        """Return the column's name for sentences."""
         return f"{self.topic}.{self.field}" + (f".{self.component}" if self.component else "")
 
     @property
@@ -85,7 +85,7 @@ class SensorNoise:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a row per number: column, term with its unit, value, 95 % interval."""
+        """Return a table with a row per value: column, term with its unit, value, 95 % interval."""
         rows = [
             (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number[:3])
             for column in self.columns
@@ -100,7 +100,7 @@ class SensorNoise:
 
     @property
     def densities(self) -> Densities:
-        """Return what other programs read: N and K of each field, the largest of its axes.
+        """Return the densities for other programs: N and K of each field, the largest of its axes.
 
         Gauss-Markov noise without a walk is replaced by the walk with the same initial growth: s sqrt(2
         / T). If no axis has a walk, K is its upper limit, because Kalibr refuses a zero, and a
@@ -126,7 +126,7 @@ class SensorNoise:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """Return a row per column and time: the deviation, its 95 % interval, that of the model."""
+        """Return a table with a row per column and time: deviation, 95 % interval, model deviation."""
         tables = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -188,7 +188,7 @@ class SensorNoise:
         save_curves(f"noise of {self.name}", panels, rrd)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write tables, curves, and the numbers as other programs read them to the folder `folder`.
+        """Write tables, curves and the settings of other programs to the folder `folder`.
 
         Raises BadInput if the folder exists and is not a fuselog result.
         """

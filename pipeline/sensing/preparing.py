@@ -1,4 +1,4 @@
-"""The preparation of recordings at rest: samples on a grid, without motion and warm-up drift."""
+"""Preparation of recordings at rest, as samples on a grid without motion and warm-up drift."""
 
 import math
 from typing import NamedTuple
@@ -16,18 +16,19 @@ from fuselog.recorders.units import unit_of
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 FEWEST, SHORTEST_S = 500, 20.0
-MOST = 1 << 16  # samples in a likelihood; longer recordings are averaged in blocks
-_GAP = 1.75  # times the median step: a longer step is a gap
+MOST = 1 << 16  # largest number of samples in a likelihood; longer recordings are averaged in blocks
+_GAP = 1.75  # a step that is longer than this multiple of the median is a gap
 _MOST_LOST = 0.4
-# Largest spread of one-second means of a unit at rest, by unit: no sensor drifts that far.
+# Largest spread of one-second means of a unit at rest, by unit; no sensor drifts this far.
 _STILL = {"rad/s": 0.03, "m/s^2": 0.3}
-_DRIFT_GAIN = 4.6  # gain in log-likelihood of a line and an exponential that chance exceeds in 1 of 100
+# gain in log-likelihood of a line and an exponential that chance exceeds in 1 of 100 recordings
+_DRIFT_GAIN = 4.6
 _IMPROBABLE = 1e-4
 _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """A grid for the stamps of a topic: its step, and the places (n,) of messages on it."""
+    """A grid for the stamps of a topic, with its step and the places (n,) of messages on it."""
 
     step_s: float
     places: Integers
@@ -45,7 +46,7 @@ class Grid(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """The drift of a column, a rate and a decaying offset, and its gain in log-likelihood."""
+    """The drift of a column, as a rate and a decaying offset, and its gain in log-likelihood."""
 
     rate: float
     rate_sigma: float
@@ -61,7 +62,7 @@ class Drift(NamedTuple):
 def grid_of(stream: Stream) -> Grid:
     """Fit a grid to a topic's stamps; its step is the mean of all steps that are not gaps.
 
-    Raises BadInput if there are too few messages, stamps go backwards, or too many are lost.
+    Raises BadInput if there are too few messages, stamps decrease, or too many messages are lost.
     """
     stamps = stream.publish_time_ns
     span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
@@ -95,7 +96,7 @@ def on_grid(values: Floats, grid: Grid) -> Floats:
     """Put samples at their places on the grid.
 
     Args:
-        values: (n,), of all messages, in the order of the stream.
+        values: (n,), those of all messages, in the order of the stream.
         grid: the grid of the stream.
 
     Returns:
@@ -155,7 +156,7 @@ def block_means(values: Floats, block: int) -> Floats:
 
 
 def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) -> Samples:
-    """Convert samples on a grid to the form that the likelihood takes.
+    """Convert samples on a grid to the form that the likelihood accepts.
 
     Args:
         values: (n,), NaN where a sample was lost.
@@ -163,16 +164,16 @@ def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) 
         regressors: (n, k), which the samples may depend on; by default none.
 
     Returns:
-        The samples that were not lost, minus the first one.
+        The samples that were not lost, relative to the first one.
     """
     rows = np.flatnonzero(np.isfinite(values))
     columns = values[rows, None] if regressors is None else np.column_stack([values, regressors])[rows]
-    # the first value is subtracted to keep digits
+    # the first value is subtracted to reduce rounding errors
     return Samples(np.ascontiguousarray(columns - columns[0]), np.diff(rows, prepend=rows[0]), step_s)
 
 
 def find_drift(values: Floats, step_s: float) -> Drift | None:
-    """Find the drift of a sensor that warms up: a line, or a line and an exponential.
+    """Find the drift of a sensor that warms up, as a line, or as a line and an exponential.
 
     Args:
         values: (n,), on a grid, NaN where a sample was lost.
@@ -203,15 +204,15 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
 
 
 def fewest_block(count: int) -> int:
-    """Compute how many samples to average so that a likelihood has at most `MOST`."""
+    """Compute how many samples to average so that a likelihood uses at most `MOST` means."""
     return -(-count // MOST)
 
 
 def white_block(values: Floats, step_s: float) -> int:
-    """Find how many samples to average, so that the noise is white apart from drift.
+    """Find how many samples to average so that the noise is white apart from drift.
 
-    A sensor that filters its output correlates neighbouring samples, and a likelihood at its full rate
-    gives too little noise. The residuals of white noise and a walk show this.
+    A sensor that filters its output correlates neighbouring samples. A likelihood of all these samples
+    underestimates the noise. The residuals of white noise and a walk show this.
 
     Args:
         values: (n,), on a grid, NaN where a sample was lost.
@@ -235,7 +236,7 @@ def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
     """Find a line in the spectrum, for example from vibration.
 
     Args:
-        values: (n,), on a grid, NaN where a sample was lost; the first `MOST` count.
+        values: (n,), on a grid, NaN where a sample was lost; only the first `MOST` are used.
         step_s: the grid's step.
 
     Returns:
@@ -247,7 +248,7 @@ def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
     power = np.abs(np.fft.rfft(part * window)) ** 2
     width = min(201, len(power) // 4 * 2 + 1)
     usual = median_filter(power, width) / math.log(2)
-    first = width // 2  # below are drifts
+    first = width // 2  # lower frequencies are drifts
     line = first + int(np.argmax(power[first:] / usual[first:]))
     if power[line] < 1.5 * usual[line] * math.log(len(power) / _IMPROBABLE):
         return None

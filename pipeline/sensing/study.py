@@ -1,7 +1,7 @@
-"""A study of noise: how often the intervals of a sensor at rest cover the truth.
+"""A study of how often the intervals of a resting sensor's noise cover the truth.
 
-Each unit is recorded at rest, with white noise and a walk, and analysed like a user's log: with tests
-for drift, vibration and correlation, a choice of terms, and intervals.
+Each unit is recorded at rest, with white noise and a walk, and analysed like a user's log, including
+tests for drift, vibration and correlation, a choice of terms, and intervals.
 """
 
 from typing import Any
@@ -85,7 +85,7 @@ def _looked_at(seed: int) -> dict[str, Any]:
 def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
     """Draw samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
 
-    A seed gives the same random numbers for all terms, whichever are present.
+    The random numbers of a seed are the same for all terms, even if some terms are missing.
     """
     rng = np.random.Generator(np.random.Philox(key=seed))
     white, walk, markov = (rng.standard_normal(size) for _ in range(3))
@@ -104,7 +104,7 @@ def at_rest(values: Floats, step_s: float) -> MemorySource:
 
     Args:
         values: (n,), in rad/s.
-        step_s: the time between two of them.
+        step_s: the time between two values.
 
     Returns:
         The log, which begins at time 0.

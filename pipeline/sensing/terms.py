@@ -1,7 +1,8 @@
-"""The terms of a sensor's noise by IEEE Std 952-1997, annex C, whose Allan variances add.
+"""The terms of a sensor's noise in IEEE Std 952-1997, annex C, whose Allan variances add.
 
-White noise N, random walk K, Gauss-Markov noise with standard deviation s and time T, a quantised angle
-Q. With the unit u of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
+The terms are white noise N, random walk K, Gauss-Markov noise with standard deviation s and time T, and
+a quantised angle Q. With the unit u of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q
+in u s.
 """
 
 import math
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-_DECAYED = 1e-7  # relative variance at which an autocovariance has decayed; it counts by its square
+# relative variance at which an autocovariance has decayed, because only its square matters
+_DECAYED = 1e-7
 
 
 class Terms(NamedTuple):
@@ -31,9 +33,9 @@ class Terms(NamedTuple):
     def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
         """Compute the autocovariance of second differences, at lags 0, 1, ... below `count`.
 
-        They are differences of the phases, the sums of samples times `step_s`, at a distance of
+        They are differences of the phases (sums of samples times `step_s`) at a distance of
         `multiple` samples; the Allan variance is their mean square. Beyond twice that distance only the
-        Gauss-Markov term remains; the result ends where that has decayed.
+        Gauss-Markov term remains; the result ends where this term has decayed.
         """
         near = np.arange(min(count, 2 * multiple + 2), dtype=float)
         found = self._second_differences(multiple, step_s, near)

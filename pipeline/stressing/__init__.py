@@ -1,4 +1,4 @@
-"""Replays of a log under changes that should not matter, and a verdict on whether its result is robust.
+"""Tests of whether a result is robust, by replays of a log under changes that should not matter.
 
 Begin with `stressing`.
 """

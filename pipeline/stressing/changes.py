@@ -1,6 +1,6 @@
-"""Changes of a run that should not matter; each copies it with all topics changed, by a seed.
+"""Changes of a run that should not matter; each copies the run and changes its topics by a seed.
 
-Most have a size, 1 or a half, to test whether the difference shrinks with the change.
+Most changes have a size, 1 or 0.5, to test whether the difference shrinks with the change.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -35,7 +35,7 @@ Changed = Callable[[MemorySource, Inputs, float, int], MemorySource]
 
 
 class Change(NamedTuple):
-    """A change: its words, its function of a run, and whether half of it is defined."""
+    """A change, with its description, its function of a run, and whether half of it is defined."""
 
     words: str
     of_run: Changed | None
@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """Return the group of a topic: topics of one scan get the same sign, and are dropped together."""
+    """Return the group of a topic; topics of one scan get the same sign, and are dropped together."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -60,7 +60,7 @@ def _groups(source: MemorySource, inputs: Inputs) -> dict[str, list[str]]:
 
 
 def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]:
-    """Draw a share from -1 to 1 for each topic, so that no two topics keep equal stamps."""
+    """Draw a share from -1 to 1 for each topic, so that stamps of different topics are never equal."""
     groups = _groups(source, inputs)
     shares = np.linspace(1.0, -1.0, len(groups))
     drawn = np.random.default_rng(seed).permutation(shares).tolist()
@@ -69,7 +69,7 @@ def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]
 
 
 def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move stamps, but none past the run's first message, because earlier messages would be lost."""
+    """Move stamps, but not to before the run's first message, because earlier messages would be lost."""
     starts_ns = [source.streams[topic].publish_time_ns for topic in inputs.priors]
     first_ns = min((int(each[0]) for each in starts_ns if len(each)), default=SHIFT_NS)
     moved = {}
@@ -84,7 +84,7 @@ def _stamps(source: MemorySource, inputs: Inputs, size: float, seed: int) -> Mem
 
 
 def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySource:
-    """Reverse the order of topics with equal stamps, keeping those of one scan together."""
+    """Reverse the order of topics with equal stamps, but keep the topics of a scan together."""
     last = max(int(each.position.max()) for each in source.streams.values() if len(each))
     turned = {}
     for topics in _groups(source, inputs).values():
@@ -158,14 +158,14 @@ def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray
             mean[:, columns] = compose(mean[:, columns], turn)
             place += 3
             continue
-        if kind != "axis":  # an axis stays
+        if kind != "axis":  # an axis does not change
             mean[:, columns] += by[:, place : place + 1]
         place += 1
     return mean
 
 
 def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> MemorySource:
-    """Drop messages by one draw per stamp of a group, so that a scan is dropped with its detections."""
+    """Drop messages by one draw per stamp and group, so that a scan is dropped with its detections."""
     streams = {}
     for number, topics in enumerate(_groups(source, inputs).values()):
         of_group = [source.streams[topic].publish_time_ns for topic in topics]
@@ -201,7 +201,7 @@ CHANGES: Mapping[str, Change] = {
 
 
 def inputs_of(source: MemorySource, topics: Collection[str], controls: Collection[str]) -> Inputs:
-    """Choose an estimator's topics that may be changed: not the truth, nor those without a time."""
+    """Choose an estimator's topics that may be changed, without the truth and topics without stamps."""
     streams = {topic: source.streams[topic] for topic in topics if topic in source.streams}
     names = {topic: stream.schema.full_name for topic, stream in streams.items() if len(stream)}
     priors = [t for t, name in names.items() if name == schemas.GAUSSIAN_ESTIMATE.full_name]

@@ -1,4 +1,4 @@
-"""The command `fuselog stress`: it prints whether a result is robust, and what changes it."""
+"""The command `fuselog stress`, which prints whether a result is robust, and which changes affect it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +39,7 @@ def stress_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Stress, and print the verdicts, followed by a table for each run and estimator."""
+    """Stress estimators, and print the verdicts, followed by a table for each run and estimator."""
     check_outputs(None, save, {"log": [*logs, *filter(None, [settings_file])]})
     alterations, own = split_texts(settings)
     chosen = settings_of_estimators(labels, own, settings_file, model=model)

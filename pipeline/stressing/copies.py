@@ -1,4 +1,4 @@
-"""Replays of copies of a run and their comparison with it: estimates, metrics, failures."""
+"""Replays of changed copies of a run, and their comparison with it: estimates, metrics, failures."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -30,13 +30,13 @@ from fuselog.replay.judging.judge import Judge
 
 
 class How(NamedTuple):
-    """Options of how runs are replayed and stressed.
+    """Options of the replays of a run and its copies.
 
     Attributes:
-        seed: the seed of signs, coins, and dropped messages.
+        seed: the seed of random signs and of dropped messages.
         gap_limit_s: the truth is not interpolated over longer gaps.
         order: the clock that orders messages.
-        late: how out-of-sequence messages are treated, in the order of log time.
+        late: how out-of-sequence messages are treated if messages are in order of log time.
     """
 
     seed: int = 0
@@ -47,7 +47,7 @@ class How(NamedTuple):
 
 @dataclass(frozen=True)
 class Replayed:
-    """Runs and copies that one estimator replayed.
+    """Runs and copies that one estimator has replayed.
 
     sources: the runs and copies.
     bound: the estimator.
@@ -74,7 +74,7 @@ class Replayed:
         }
 
     def failure(self, run: int) -> str:
-        """Describe when and why a run ends early; "" if it does not."""
+        """Describe when and why a run ends early; "" if it is complete."""
         for rows in self.outputs.values():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 own = rows.of_run(run)
@@ -106,7 +106,7 @@ def replayed(
 ) -> Replayed:
     """Replay runs with one estimator.
 
-    Raises BadInput if it can replay none of them.
+    Raises BadInput if the estimator can replay no run.
     """
     ensemble = Ensemble(sources)
     bound, report = bind(label, ensemble, settings), Report()
@@ -127,7 +127,7 @@ def compared(
         before: the replay that contains the run, in `row`; its estimates are `base`.
         row: see `before`.
         done: the replay that contains the copy.
-        run: its index there.
+        run: index of the copy in `done`.
         base: see `before`.
     """
     within_ns = SHIFT_NS if name == "stamps" else 0
@@ -157,7 +157,7 @@ def compared(
 def _reach(found: Sequence[Parting], main: str) -> float:
     """Return the largest possible change of an RMSE: the distance of estimates with common stamps.
 
-    Stamps at which the copy has no estimate, because a message is lost, occur in only one RMSE.
+    If a message is lost, the copy has no estimate at its stamp, so the stamp is in only one RMSE.
     """
     unit = main.rpartition("_")[2]
     if unit not in ("m", "deg", "rad"):
@@ -168,14 +168,14 @@ def _reach(found: Sequence[Parting], main: str) -> float:
 
 
 def _main(quantities: Sequence[str]) -> str:
-    """Choose the metric of a verdict: the RMSE of position or orientation, or the first error."""
+    """Choose the metric of a verdict: the RMSE of position or orientation, else the first error."""
     errors = [each for each in quantities if "rmse" in each]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in errors]
     return next(iter([*main, *errors]), "")
 
 
 def _parameters(done: Replayed, label: str) -> dict[str, Any]:
-    """Return all parameters of an estimator: its own, and those that a single channel states."""
+    """Return all parameters of an estimator: its own, and those that a single channel contains."""
     stated = {}
     for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
         number, _, topics = words.partition(" (")
@@ -195,7 +195,7 @@ def with_parameters(
     settings: Mapping[str, Any],
     size: float,
 ) -> Replayed | str:
-    """Replay runs with changed parameters; returns the reason if this is not possible."""
+    """Replay runs with changed parameters; return the reason if this is not possible."""
     known = _parameters(done, label)
     changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
     changed = {name: value for name, value in changed.items() if value != known[name]}
@@ -205,7 +205,7 @@ def with_parameters(
     for name in [*changed]:
         try:
             bind(label, sources, merge(settings, {name: changed[name]}))
-        # for example, a setting that the method fixes by its name and does not use
+        # for example, a setting that the method fixes and does not use
         except BadInput as error:
             refused = str(error)
             del changed[name]

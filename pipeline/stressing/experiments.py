@@ -1,4 +1,4 @@
-"""Stress of the runs of an experiment: `fuselog run --stress`."""
+"""Stress tests of the runs of an experiment, for `fuselog run --stress`."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -65,9 +65,9 @@ def stress_result(
 
     Args:
         result: the result of the run.
-        workers: processes that share the runs; None stands for all cores if that is worthwhile.
-        scheduler: the address of a Dask scheduler whose workers share them.
-        progress: reports the progress.
+        workers: processes that share the runs; None means all cores if that saves time.
+        scheduler: the address of a Dask scheduler whose workers share the runs.
+        progress: function that reports progress.
 
     Raises BadInput if the experiment has no estimators or no runs of its own.
     """
@@ -90,10 +90,11 @@ def stress_result(
 def claims_under_stress(
     experiment: Experiment, result: Result, stress: Sequence[Stressing]
 ) -> list[Claim]:
-    """Return the claims of a result; those that stress may move across their limit are inconclusive.
+    """Return the claims of a result; a claim is inconclusive if stress may reverse it.
 
-    They are decided again with each metric's interval, or its value, widened on both sides by the
-    largest change under stress. Verdicts on metrics that do not belong to single estimators stay.
+    Claims are decided again, with each metric's interval, or its value, widened on both sides by the
+    largest change under stress. Verdicts on metrics that do not belong to single estimators do not
+    change.
     """
     moved = {f"{each.estimator}.{key}": by for each in stress for key, by in each.moved.items()}
     intervals = dict[str, Sequence[float | None]](result.intervals)
@@ -105,7 +106,7 @@ def claims_under_stress(
     study: Study = load("studies", experiment.study, Study)
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
     again = decide(experiment.claims, result.metrics, intervals, numbers_of(experiment, options))
-    first = len(result.claims) - len(again)  # claims that the study decides itself come first
+    first = len(result.claims) - len(again)  # claims that the study itself decides come first
     claims = list(result.claims)
     for place, found in enumerate(again, first):
         own = claims[place]
@@ -116,7 +117,7 @@ def claims_under_stress(
 
 
 def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[str, StressSums]]:
-    """Yield the results of the parts in their order; a few parts are submitted at a time."""
+    """Yield the results of the parts in order, with only a few parts submitted at a time."""
     working = deque[Future[Any]]()
     for part in parts:
         working.append(pool.executor.submit(part.stressed))

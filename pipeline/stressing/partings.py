@@ -1,4 +1,4 @@
-"""The distance of two replays: in sigmas of the first, in metres and degrees, and since when.
+"""The distance of two replays in sigmas of the first, in metres and degrees, and when it begins.
 
 A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
 replay. After a moved start, A never grows if the filter is linear: d' P^-1 d does not increase (Deyst
@@ -17,8 +17,8 @@ from fuselog.replay.engine.vectors.covariances import normalized_error_squared
 from fuselog.replay.engine.vectors.tangent import difference, tangent_components
 
 Floats = NDArray[np.float64]
-PARTED = 10.0  # copies diverge when A exceeds its first value by this factor
-LEAST = 1e-6  # below this share of a sigma, copies have not diverged
+PARTED = 10.0  # replays diverge when A exceeds its first value by this factor
+LEAST = 1e-6  # below this share of a sigma, replays have not diverged
 AXES = ("x_m", "y_m", "z_m")
 
 
@@ -31,7 +31,7 @@ class Parting(NamedTuple):
         amplification: (n,) A.
         metres, degrees: (n,) distances of positions and of angles; NaN if the state has none.
         spread: the largest relative difference of standard deviations; NaN if none is known.
-        explained: (n,) how large A may be by chance if the other replay had less data; 0 otherwise.
+        explained: (n,) largest A due to chance if the other replay had less data; 0 otherwise.
     """
 
     topic: str
@@ -49,13 +49,13 @@ class Parting(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """Return the ratio of the largest A to the first one that is not zero."""
+        """Return the ratio of the largest A to the first A that is not zero."""
         there = self.amplification[self.amplification > 0.0]
         return float(np.max(there) / there[0]) if len(there) else 1.0
 
     @property
     def parted(self) -> int | None:
-        """Return the row from which the copies diverge; None if they do not."""
+        """Return the row from which the replays diverge; None if they do not."""
         there = np.flatnonzero(self.amplification > 0.0)
         if not len(there):
             return None
@@ -72,8 +72,8 @@ def partings(
     Args:
         base: the estimates of the unchanged replay, by topic.
         copy: the estimates of the other replay.
-        within_ns: the largest difference in time between the two estimates of a stamp.
-        has_less: whether the other replay had less data, so that chance changes it.
+        within_ns: the largest difference in time between estimates that are compared.
+        has_less: whether the other replay had less data, so that its estimates differ by chance.
     """
     return [
         _parting(stream, copy[topic], within_ns, has_less)
@@ -114,7 +114,7 @@ def _largest_finite(spread: Floats) -> float:
 
 
 def _explained(covariance: Floats, other: Floats) -> Floats:
-    """Compute the largest A that chance explains at n stamps (n,) if one replay has less data.
+    """Compute the largest A due to chance (n,) at n stamps if one replay has less data.
 
     The difference between a consistent estimate with covariance P and one with less data and covariance
     P' has the covariance P' - P. Therefore n A^2 is at most the largest eigenvalue of (P' - P) P^-1
@@ -147,11 +147,11 @@ class Undetermined(NamedTuple):
     """A direction of the state that the measurements do not determine.
 
     Attributes:
-        components: the names of its components, which have one unit.
+        components: the names of its components, which have the same unit.
         direction: (n,) the unit vector, with a positive largest entry.
         sigma: the standard deviation along it, at the end.
-        next_sigma: the largest standard deviation across it.
-        since_ns: the last stamp at which a measurement reduced it.
+        next_sigma: the largest standard deviation perpendicular to it.
+        since_ns: the last stamp at which a measurement reduced the standard deviation.
     """
 
     components: tuple[str, ...]
@@ -162,7 +162,7 @@ class Undetermined(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
+        """Format the direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
         parts = [
             f"{'-' if value < 0 else '+'} {abs(value):.2g} {name}"
             for name, value in zip(self.components, self.direction, strict=True)
@@ -172,9 +172,9 @@ class Undetermined(NamedTuple):
 
 
 def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermined | None:
-    """Find the worst direction among components of one unit, if it is known far worse than others.
+    """Find the least certain direction among components of one unit, if it is much worse than others.
 
-    Components of different units have no common length, so only those of one unit are compared.
+    Components of different units have no common length, so they are not combined.
 
     Args:
         stream: Gaussian estimates.

@@ -1,6 +1,6 @@
-"""A test of whether a result is robust: replays under changes that should not matter; see `stress`.
+"""A test of whether a result is robust under changes that should not matter; see `stress`.
 
-Runs with the same topics are replayed together with all their copies, as further runs of one pass.
+Runs with the same topics are replayed together with all their copies in one pass.
 """
 
 from collections import defaultdict
@@ -28,7 +28,8 @@ from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_se
 from fuselog.replay.foreign.naming import allowed
 
 MOST_HALVED, MOST_REPLAYS = 3, 12
-# Runs that are stressed together: with their copies about as many as a replay processes together.
+# Number of runs that are stressed together; with their copies about as many as a replay processes at
+# once.
 TOGETHER = max(1, RUNS_AT_ONCE // (1 + len(CHANGES)))
 
 
@@ -44,15 +45,16 @@ def stress(
     """Replay under changes that should not matter, and report their effect on the result.
 
     At most twelve replays are made per run and estimator: one without changes, one for each change, one
-    with half the change for the three with the largest effect, and one with a quarter if the effect of
-    half is neither half nor the whole.
+    with half the change for the three with the largest effect, and one with a quarter if half the change
+    has neither half the effect nor the whole effect.
 
     Args:
         logs: paths, opened logs, or recordings.
-        estimators: as for `replay`.
-        seed: the seed of signs, coins, and dropped messages.
+        estimators: the estimators, in the form that `replay` accepts.
+        seed: the seed of random signs and of dropped messages.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        set: parameters of estimators, and alterations of topics that come first, as for `replay`.
+        set: parameters of estimators and alterations of topics, in the form that `replay` accepts; the
+            alterations are applied first.
 
     Returns:
         The effect of each change on the estimates of each run and estimator, and a verdict.
@@ -115,7 +117,7 @@ def _in_memory(source: LogSource | MemorySource) -> MemorySource:
 def _stressed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> list[Stressed]:
-    """Stress runs with the same topics: replay all copies, changed parameters, and halved changes."""
+    """Stress runs with the same topics, with all copies, changed parameters, and halved changes."""
     bound = bind(label, sources, settings)
     controls = [
         topic
@@ -144,7 +146,7 @@ def _stressed(
     try:
         done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
     except BadInput:
-        replayed(sources, label, settings, how)  # raises if the fault is not that of a copy
+        replayed(sources, label, settings, how)  # raises if the copy is not the cause of the fault
         for name in CHANGES:
             own = [what for what in whole if what[1] == name]
             try:
@@ -170,7 +172,7 @@ def _stressed(
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
 
     def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
-        """Try these changes of these runs at a smaller size."""
+        """Try these changes of these runs with a smaller size."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
             again = replayed(copies(own, size), label, settings, how)
@@ -206,9 +208,9 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Choose the changes to quarter: those whose half does less, but not half as much, worst first.
+    """Choose the changes to quarter, whose half has less effect, but not half of it; worst first.
 
-    A curved effect is proportional if the change is small enough. No run is replayed more than twelve
+    A nonlinear effect is proportional if the change is small enough. No run is replayed more than twelve
     times.
     """
     chosen = []
@@ -244,7 +246,7 @@ def _lacking(name: str, inputs: Inputs) -> str:
 
 
 def _doubtful(tried: Iterable[Tried]) -> list[str]:
-    """Choose the changes to halve: the three with the largest effect."""
+    """Choose the changes to halve, which are the three with the largest effect."""
     own = [
         each
         for each in tried

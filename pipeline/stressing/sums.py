@@ -1,4 +1,4 @@
-"""Sums over runs of the effects of changes that should not matter: counts and means."""
+"""Effects of changes that should not matter, summed over runs: counts and means."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ class StressSums:
         estimator: the estimator's label.
         verdicts: the number of runs with each verdict.
         worst: the largest A of each verdict, with the sentences of that run.
-        moved: by change and by (case, metric), the sum of the metric's changes, and the number of runs.
+        moved: the sum of a metric's changes and the number of runs, by change and by (case, metric).
     """
 
     estimator: str

@@ -1,4 +1,4 @@
-"""Verdicts on the effects of such changes: harmless, sensitive, discontinuous or chaotic."""
+"""Verdicts on the effects of changes that should not matter: harmless, sensitive, discontinuous."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +20,15 @@ from fuselog.replay.judging.judge import Judge
 
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
 HARMLESS = 0.1  # upper limit of A
-MARGIN = 0.02  # relative change of the metric, as in compare
-HALVES = (1.9, 2.1)  # range of the effect's ratio to that of half the change, if it is proportional
-BENT = 1.2  # half the change does less, but not half as much: a quarter is tried
-SQUARED = 4.2  # upper limit of an effect that is quadratic in the change; a larger ratio is a jump
-ONE_SIGMA = 1.0  # A of a change without a half: beyond it, the results are different
-PER_PREDICTION = 1e-4  # relative change of a sigma by moved stamps from which half the change is tried
-SHRINKS = 1.5  # ratio of a sigma's change: 1 for noise per prediction, 2 for noise per second
+MARGIN = 0.02  # relative change of a metric that is considered irrelevant, as in compare
+# range of the ratio of an effect to that of half the change, if the effect is proportional
+HALVES = (1.9, 2.1)
+BENT = 1.2  # half the change has less effect, but not half as much: a quarter is tried
+# upper limit of the ratio for an effect that is quadratic in the change; a larger ratio is a jump
+SQUARED = 4.2
+ONE_SIGMA = 1.0  # for a change without a half: results are different if A is larger than this
+PER_PREDICTION = 1e-4  # half the change is tried if moved stamps change a sigma by more than this share
+SHRINKS = 1.5  # ratio of a sigma's changes: 1 for noise per prediction, 2 for noise per second
 
 
 class Tried(NamedTuple):
@@ -37,7 +39,7 @@ class Tried(NamedTuple):
         parting: the distance of the estimate with the largest change; None if no estimate is Gaussian.
         moved: by (case, metric), the change of a metric from the unchanged replay.
         beyond: the change of the main metric, in words; "" within the margin.
-        why: why it was not tried.
+        why: the reason why it was not tried.
         failed: when and why the copy ends although the unchanged replay does not; for a change that was
             not tried, that of the unchanged replay if it ends before its first estimate.
     """
@@ -117,9 +119,9 @@ class Stressed:
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
-        """Test whether a change without a half moves the estimate no further than it may.
+        """Test whether a change without a half moves the estimate no further than allowed.
 
-        The limit is a sigma or, for lost messages, what the covariances allow by chance.
+        The limit is a sigma or, for lost messages, the largest distance due to chance.
         """
         parting = self.tried[name].parting
         if name != DROPPED or parting is None:
@@ -130,7 +132,7 @@ class Stressed:
     def ratio(self, name: str) -> float:
         """Compute the ratio of a change's effect to that of half of it, in A; NaN if it was not halved.
 
-        If half of the change was halved again, these two are compared.
+        If half of the change was halved again, the ratio of these two is returned.
         """
         half, quarter = self.halves.get(name), self.quarters.get(name)
         more, less = (half, quarter) if half and quarter else (self.tried[name], half)
@@ -163,12 +165,12 @@ class Stressed:
 
     @property
     def is_per_prediction(self) -> bool:
-        """Test whether noise is added per prediction: a microsecond changes a covariance."""
+        """Test whether noise is added per prediction, so that a microsecond changes a covariance."""
         return self.is_recursive and self._jumps
 
     @property
     def _jumps(self) -> bool:
-        """Test whether a microsecond changes a sigma, and half a microsecond equally."""
+        """Test whether a microsecond changes a sigma, and half a microsecond changes it as much."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -176,7 +178,7 @@ class Stressed:
 
     @property
     def is_redrawn(self) -> bool:
-        """Test whether an ulp of the inputs changes a covariance, so stamps are not the cause."""
+        """Test whether an ulp of the inputs changes a covariance, so that stamps are not the cause."""
         ulp = self.tried["ulp"].parting
         return ulp is not None and ulp.spread > PER_PREDICTION
 
@@ -188,7 +190,7 @@ class Stressed:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row per change."""
+        """Return table rows, one per change."""
         found = []
         for name, each in self.tried.items():
             row: dict[str, Any] = {
@@ -224,7 +226,7 @@ class Stressed:
 
     @property
     def sentence(self) -> str:
-        """Return the verdict, with the numbers of the change that decides it."""
+        """Return the verdict with the numbers of the change that decides it."""
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = self.deciding
@@ -297,7 +299,7 @@ class Stress:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a row per run, estimator and change: A, metres, degrees, growth, verdict."""
+        """Return a table with a row per run, estimator and change: A, metres, degrees, and so on."""
         return pd.DataFrame([row for each in self.stressed for row in each.rows])
 
     @property
@@ -307,11 +309,11 @@ class Stress:
         return list(dict.fromkeys(sentence for each in by_weight for sentence in each.sentences))
 
     def draw(self, save: str | Path) -> None:
-        """Draw the first run's timeline to the .rrd file `save`, with copies fanning out from estimates.
+        """Draw the first run's timeline to the .rrd file `save`, with the estimates of the copies.
 
         Raises BadInput if the file cannot be written.
         """
-        from fuselog.replay.timeline.fanning import Fan  # takes long to import
+        from fuselog.replay.timeline.fanning import Fan  # slow to import
         from fuselog.replay.timeline.show import Drawing
 
         check_files([(Path(save), TIMELINE)], {})

@@ -1,8 +1,8 @@
-"""Replays from broad starts, to compare likelihoods with other parameters or of altered logs.
+"""Replays from broad starts, for comparing likelihoods with other parameters or of altered logs.
 
 Without a prior, a filter begins where the log's first messages put it, with a covariance that depends on
-the parameters. So that all trials score the same measurements from the same start, they begin at the
-log's first stamp, in equally likely parts; the likelihood is the mean of those of the parts.
+the parameters. To score the same measurements from the same start, all trials begin at the log's first
+stamp, in equally likely parts, and the likelihood is the mean of those of the parts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,12 +19,12 @@ from fuselog.replay.engine.streams.blocks import Ragged, gather, side_by_side
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource
 
-# by the name of what is estimated; all have the same number of parts
+# by the name of the estimated object; all have the same number of parts
 Starts = Mapping[str, Sequence[Initialized]]
 
 
 def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
-    """Find equally likely starts for a log that does not state one; raises BadInput as `replay`."""
+    """Find equally likely starts for a log that does not state one; raise BadInput as `replay` does."""
     stamps = [source.streams[topic].publish_time_ns[:1] for each in bound for topic in each.streams]
     first_ns = int(np.min(np.concatenate(stamps), initial=np.iinfo(np.int64).max))
     found: dict[str, list[Initialized]] = {}
@@ -71,7 +71,7 @@ def begun_broadly(bound: Bound, begins_ns: Sequence[int], count: int) -> Bound:
     """Make an estimator for trials that are repeated `count` times each, once for each of their parts.
 
     Each trial finds its own starts from its own first messages, because measurements may be altered. The
-    starts have the stamps `begins_ns`. An estimator that finds no broad starts stays as it is.
+    starts have the stamps `begins_ns`. An estimator that finds no broad starts is not changed.
     """
     initialization = initialization_of(bound)
     if initialization is None or initialization.find_broad is None:
@@ -112,7 +112,7 @@ def initialization_of(bound: Bound) -> Initialization | None:
 
 
 def with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
-    """Replace how an estimator finds its start, if it has to find one."""
+    """Replace the function with which an estimator finds its start, if it has one."""
     if isinstance(bound, Recursive) and bound.initialization is not None:
         return replace(bound, initialization=replace(bound.initialization, find=find))
     return bound

@@ -40,10 +40,10 @@ def tune_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Tune on logs, write the result folder, and print which logs were used and what was found.
+    """Tune on logs, write the result folder, and print the used logs and the result.
 
-    A given `search` determines the free parameters and the criterion, in place of `free`, `by` and
-    `grid`.
+    If `search` is given, it determines the free parameters and the criterion, and `free`, `by` and
+    `grid` are ignored.
     """
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
@@ -97,9 +97,9 @@ def tune_logs(
 
 
 def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Refuse or warn about logs that were probably meant to be held out, but would be tuned on.
+    """Refuse or warn about logs that would be used for tuning, but were probably meant to be held out.
 
-    The shell expands `--validate test/*.mcap` to several words, and the option takes only the first.
+    The shell expands `--validate test/*.mcap` to several words, and the option receives only the first.
     """
     folders = {path.resolve().parent for path in held_out}
     beside = [path for path in logs if path.resolve().parent in folders]

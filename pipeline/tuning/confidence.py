@@ -1,7 +1,7 @@
 """Confidence in tuned parameters: intervals, correlations, profiles, and undetermined directions.
 
-All follow from the curvature of minus the log-likelihood at its minimum; its inverse is the parameters'
-covariance.
+All of them follow from the curvature of minus the log-likelihood at its minimum, whose inverse is the
+parameters' covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,15 +16,15 @@ from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known only within a factor of about 2.7
-INVOLVED = 0.3  # component of a unit direction from which a parameter counts as involved
+INVOLVED = 0.3  # component of a unit direction above which a parameter is involved
 PROFILE_POINTS = 9
-PROFILE_ERRORS = 3.0  # standard errors to either side
+PROFILE_ERRORS = 3.0  # standard errors on either side
 MEANINGLESS = 100.0  # a factor so large that the value is unknown
 WIDEST = 3.0  # in coordinates: a factor of 20
 
 
 class Confidence(NamedTuple):
-    """The confidence in m of k parameters, those that are not at a bound.
+    """The confidence in m of k parameters, which are those that are not at a bound.
 
     Attributes:
         places: (m,) the indices of these parameters.
@@ -59,10 +59,11 @@ class SearchOutcome(NamedTuple):
         evaluations: the number of points tried.
         has_converged, was_stopped: how the search ended.
         is_spike: whether a search from a second start does not find this minimum.
-        at_edge: parameters close to whose values a run fails or uses fewer measurements.
+        at_edge: parameters near whose values a run fails or uses fewer measurements.
         begins_alike: whether filters begin at the optimum where they began in the search.
-        held: calibration parameters that the motion does not determine; they stay at their start.
-        lacks: sentences that report these, and which other values depend on them.
+        held: calibration parameters that the motion does not determine, and that keep their start
+            values.
+        lacks: sentences that report these parameters, and which other values depend on them.
     """
 
     coordinates: Coordinates
@@ -101,8 +102,8 @@ def with_noise(curvature: Floats, noise: Floats) -> Floats:
 
     If slopes vary more than the curvature implies, the covariance of the estimates is that of the slopes
     multiplied by the inverse curvature from both sides: White, Maximum likelihood estimation of
-    misspecified models, Econometrica 50, 1982. The curvature already contains the noise that slopes are
-    linear in, so the larger of the two is used in each direction.
+    misspecified models, Econometrica 50, 1982. The curvature already contains noise in which slopes are
+    linear, so the larger of the two is used in each direction.
 
     Args:
         curvature: (m, m), the second derivatives of the cost.
@@ -148,8 +149,8 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
     """Yield unit directions (m,) in which the cost rises too little, with the curvature there.
 
-    They are eigenvectors of the curvature in useful units: two useful standard errors, a factor of 2.7,
-    or `UNIT` standard errors that a parameter without a useful error has if all others are fixed.
+    They are eigenvectors of the curvature in useful units. Two useful standard errors are a factor of
+    2.7, or, for a parameter without a useful error, `UNIT` standard errors if all others are fixed.
     """
     places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]
@@ -205,7 +206,7 @@ class Profile(NamedTuple):
         name: the name of the parameter.
         along: (n,) its values.
         rise: (n,) the cost relative to the minimum; infinite if it cannot be computed.
-        parabola: (n,) the same from the curvature only.
+        parabola: (n,) the same, computed from the curvature only.
     """
 
     name: str
@@ -220,7 +221,7 @@ def profiles(
     """Compute the profiles of all parameters that have a standard error.
 
     Args:
-        cost: computes minus the log-likelihood of values (n, k).
+        cost: function that computes minus the log-likelihoods of values (n, k).
         coordinates: the coordinates that were searched.
         point: (k,), the coordinates of the least cost.
         confidence: the confidence at that point.

@@ -1,15 +1,15 @@
-"""Noise added to the controls of a motion, to find what noise itself gains in likelihood.
+"""Noise that is added to a motion's controls, to measure how noise affects the likelihood.
 
 A measured control has noise (errors in variables). Stamps shifted by a part of a step average the noise
-over two messages, and a factor below one attenuates it: both increase the log-likelihood of a log
-without any fault. Added noise of the same size costs as much as the noise that is already there, and
-less if it is averaged or attenuated. The corrected log-likelihood is therefore L(u) - c, where c is the
-mean of L(u + n) and L(u - n) minus L(u); the noise then affects all alternatives equally. Nakamura,
+over two messages, and a factor below one attenuates it. Both increase the log-likelihood of a log
+without any fault. Added noise of the same size reduces the log-likelihood as much as the existing noise,
+and less if it is averaged or attenuated. The corrected log-likelihood is therefore L(u) - c, where c is
+the mean of L(u + n) and L(u - n) minus L(u); the noise then affects all alternatives equally. Nakamura,
 Corrected score function for errors-in-variables models, Biometrika 77, 1990; Cook and Stefanski,
 Simulation-extrapolation estimation, JASA 89, 1994.
 
 An error of the mean over a few copies shifts the estimates of all logs of the same length in the same
-way. The signs of the noise are therefore those of a Hadamard matrix: over all copies the products of
+way. The signs of the noise are therefore those of a Hadamard matrix. Over all copies, the products of
 nearby messages cancel, and only messages that are further apart than the number of pairs contribute an
 error. Bekas, Kokiopoulou and Saad, An estimator for the diagonal of a matrix, Applied Numerical
 Mathematics 57, 2007.
@@ -29,9 +29,9 @@ from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
-PAIRS = 8  # pairs of copies with opposite noise; a power of two
+PAIRS = 8  # number of pairs of copies with opposite noise; a power of two
 SEED = 62
-FEWEST = 20  # fewest messages from which noise is estimated
+FEWEST = 20  # fewest messages from which noise can be estimated
 MAD = 1.4826  # standard deviation of a normal distribution divided by its median absolute deviation
 
 
@@ -50,7 +50,7 @@ def disturbed(
     """Copy a log with noise added to its controls; each copy is followed by one with the opposite noise.
 
     The noise is as large as the model states, but at most as large as the noise seen in the control.
-    There are no copies if the model states no noise or no noise is seen. Each of several logs gets its
+    There are no copies if the model states no noise or no noise is visible. Each of several logs has its
     own noise, selected by the number `log`. `pairs` is a power of two.
     """
     noises = [noise for each in bound for noise in _noises(source, each)]

@@ -1,7 +1,7 @@
-"""A study of tuning without known noise: the values are judged on other vehicles.
+"""A study of tuning with unknown noise, in which the values are judged on other vehicles.
 
-Some of the log's vehicles tune the experiment's one estimator by likelihood, from its settings or from
-what the log states; held-out vehicles are replayed with the start and the tuned values.
+The experiment's only estimator is tuned by likelihood on some of the log's vehicles, from its settings
+or from values in the log. Held-out vehicles are replayed with the start values and the tuned values.
 """
 
 from collections.abc import Collection
@@ -24,8 +24,8 @@ class HeldOutOptions(Parameters):
 
     Attributes:
         free: names of the parameters that are searched for.
-        tuned_by: vehicles to tune on, by the first word of their topics.
-        held_out: vehicles to judge the values on, by the first word of their topics.
+        tuned_by: vehicles on which to tune, by the first word of their topics.
+        held_out: vehicles on which to judge the values, by the first word of their topics.
     """
 
     free: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
-    """Copy a log without some vehicles' topics; raises BadInput for a vehicle that has no topics."""
+    """Copy a log without some vehicles' topics; raise BadInput for a vehicle that has no topics."""
     found = {topic.split("/")[1] for topic in source.streams}
     for vehicle in vehicles:
         if vehicle not in found:

@@ -1,4 +1,4 @@
-"""Information that the motion in logs holds on a calibration, computed before any search.
+"""Information on a calibration in the motion of logs, computed before any search.
 
 With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives by the parameters. In useful units, a direction with an eigenvalue below one is not
@@ -21,11 +21,11 @@ from fuselog.recorders.parameters import Parameter
 from fuselog.replay.judging.consistency.whiteness import whitened
 
 Floats = NDArray[np.float64]
-STEP = 0.01  # step of differences, in useful units
-LEAST = 1.0  # an eigenvalue: the standard error equals the useful error
-INVOLVED = 0.3  # component of an undetermined direction from which a parameter is involved
-FURTHEST = float(MOVES[-1])  # error of a fixed parameter that is allowed for, in useful units
-NAMED = 0.1  # component of a direction, relative to its largest, from which a parameter is named
+STEP = 0.01  # step of the finite differences, in useful units
+LEAST = 1.0  # eigenvalue at which the standard error equals the useful error
+INVOLVED = 0.3  # component of an undetermined direction above which a parameter is involved
+FURTHEST = float(MOVES[-1])  # largest error of a fixed parameter that is considered, in useful units
+NAMED = 0.1  # component of a direction, relative to its largest, above which a parameter is named
 
 
 class Undetermined(NamedTuple):
@@ -43,12 +43,12 @@ class Undetermined(NamedTuple):
 
 
 def information(objective: Objective, values: Floats, useful: Floats, places: Sequence[int]) -> Floats:
-    """Compute the information that all logs hold on some of the parameters.
+    """Compute the information of all logs on some of the parameters.
 
     A measurement that is missing on one side of a difference contributes nothing.
 
     Args:
-        objective: replays the logs.
+        objective: the cost, which replays the logs.
         values: (k,), the point at which derivatives are taken.
         useful: (k,), each parameter's useful unit.
         places: the indices of m of the k parameters.
@@ -57,7 +57,7 @@ def information(objective: Objective, values: Floats, useful: Floats, places: Se
         The information (m, m) in useful units.
     """
     found = np.zeros((len(places), len(places)))
-    values = values + 2.0 * STEP * useful  # away from a delay of zero, at which stamps are equal
+    values = values + 2.0 * STEP * useful  # not at a delay of zero, at which stamps are equal
     for run in objective.runs:
         here = _innovations(objective, values, run)
         columns = []
@@ -116,13 +116,13 @@ def conditions(
 ) -> Iterator[str]:
     """Yield a sentence for each parameter whose interval is valid only if a fixed parameter is right.
 
-    Fixed parameters may be wrong by as much as the logs allow, at most by `FURTHEST` useful units.
+    Fixed parameters may be wrong as far as the logs allow, at most by `FURTHEST` useful units.
 
     Args:
         scaled: (m, m), the information in useful units.
         places: the indices of these m parameters among the free ones.
         free: all parameters.
-        held: the names of those that are fixed at their start.
+        held: the names of the parameters that are fixed at their start.
     """
     names, useful = np.array([(free[place].name, free[place].useful) for place in places], object).T
     stays = np.isin(names, held)

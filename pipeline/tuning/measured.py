@@ -1,4 +1,4 @@
-"""The part of a log over which measurements exist, for diagnoses and tuning."""
+"""The part of a log that contains measurements, for diagnoses and tuning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 
-# time of controls to keep, so that the last measurement is between two controls
+# time in s for which controls are kept, so that the last measurement is between two controls
 BEYOND_NS = 1_000_000_000
 
 
@@ -15,7 +15,7 @@ def until_last_measured(
 ) -> LogSource | MemorySource:
     """Cut a log a second after its last measurement if the controls continue for longer.
 
-    After that there are no estimates to compare with, which is not a failure.
+    Later there are no estimates to compare, which is not a failure.
     """
     readings = [
         (each, each.reading())

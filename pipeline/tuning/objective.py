@@ -1,8 +1,8 @@
-"""The cost that tuning minimises: replays of logs with other parameters, and their evaluation.
+"""The cost that tuning minimises, which is computed from replays of logs with other parameters.
 
-Every log is replayed separately; the cost of a point follows from the sums over all logs, in their
-order. Logs and points are shared among threads, whose kernels run in parallel, or among the workers of a
-pool.
+Every log is replayed separately, and the cost of a point is computed from the sums over all logs, in
+their order. Logs and points are shared among threads, whose kernels run in parallel, or among the
+workers of a pool.
 """
 
 import pickle
@@ -42,7 +42,7 @@ from fuselog.replay.judging.metrics.measuring import Sums, plus
 
 Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]
-NOISE = "noise"  # key of the cost of a log's control noise, next to the topics of what is estimated
+NOISE = "noise"  # key of the cost of a log's control noise, next to the topics of estimates
 INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
@@ -53,7 +53,7 @@ class Run(NamedTuple):
         ensemble: the log, as an ensemble of one.
         name: the log's name.
         begun: the initial state of each estimated object by name, if the log has none; see `begin`.
-        starts: the starts between which likelihoods are compared, in place of `begun`.
+        starts: the starts with which likelihoods are compared, instead of `begun`.
         parts: the log, repeated for each part of `starts`.
         disturbed: copies with noise added to the controls, if the cost is corrected for that noise.
     """
@@ -81,7 +81,7 @@ def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
 
 
 def for_likelihood(settings: Mapping[str, Any]) -> str:
-    """Describe how a user's own estimator can give innovations with a likelihood; "" for others."""
+    """Describe how a user's own estimator can return innovations with a likelihood; "" for others."""
     kind = settings.get("kind")
     if isinstance(kind, Estimator):
         return (
@@ -153,7 +153,7 @@ def _cost_of_ratios(sums: Sums) -> float:
 
 
 def _cost_of_squares(sums: Sums) -> float:
-    """Sum the logarithms of the RMSEs; logs with different kinds of truth have more than one."""
+    """Sum the logarithms of the RMSEs; logs with different kinds of truth have several RMSEs."""
     squares = np.array(list(sums.values()))
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(0.5 * np.sum(np.log(squares[:, 0] / squares[:, 1])))
@@ -163,8 +163,8 @@ class Criterion(NamedTuple):
     """A criterion that tuning optimises.
 
     Attributes:
-        sums: computes the quantities that are summed over logs, from one log's outputs.
-        cost: computes the cost of the sums; a run without values contributes nothing.
+        sums: function that computes the sums over one log's outputs.
+        cost: function that computes the cost from the sums; a run without values contributes nothing.
         is_smooth: whether it uses innovations. The gate is then open, because it could change which
             innovations are used.
         lacks: what is missing in a log without such sums.
@@ -185,7 +185,7 @@ CRITERIA: dict[By, Criterion] = {
 
 
 class Best(NamedTuple):
-    """The best point (k,) of a search so far, its cost, and the number of points tried."""
+    """The best point (k,) of a search so far, with its cost and the number of points tried."""
 
     evaluations: int
     point: Floats
@@ -207,8 +207,8 @@ class Objective:
         runs: the logs.
         by: the criterion.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        on_best: called with the best point after every batch.
-        pool: the workers that replay; None stands for threads of this process.
+        on_best: function that is called with the best point after every batch.
+        pool: the workers that replay; None means threads of this process.
         best: the best of all points so far.
         held: values of noise parameters, by their indices among the names (k,), that stay fixed in the
             correction of the cost; see `correct`.
@@ -315,7 +315,7 @@ class Objective:
     def begin_after(self, start: Floats, reaches_s: Mapping[str, float]) -> None:
         """Begin without the messages that delays of up to `reaches_s` move to before the start.
 
-        With such delays these messages give no innovation, so that likelihoods could not be compared.
+        With such delays, these messages have no innovation, so likelihoods could not be compared.
         """
         runs = []
         for run in self.runs:
@@ -337,10 +337,10 @@ class Objective:
         self.begin(start)
 
     def correct(self, values: Floats) -> None:
-        """Correct the cost for the noise of the controls, see `fuselog.pipeline.tuning.control_noise`.
+        """Correct the cost for the noise of the controls; see `fuselog.pipeline.tuning.control_noise`.
 
         If these noises are themselves searched for, the correction uses their values in `values` (k,).
-        Otherwise it would remove them from the likelihood by which they are found.
+        Otherwise, it would remove them from the likelihood from which they are estimated.
         """
         noises: set[str] = set()
         for run in self.runs:
@@ -353,7 +353,7 @@ class Objective:
         }
 
     def with_pairs(self, values: Floats, pairs: int) -> "Objective":
-        """Return a copy corrected by this number of pairs of copies per log, see `correct`."""
+        """Return a copy corrected with this number of pairs of copies per log; see `correct`."""
         runs = [
             run._replace(disturbed=disturbed(run.ensemble[0], self._bound(values, run), number, pairs))
             for number, run in enumerate(self.runs)
@@ -408,7 +408,7 @@ class Objective:
         )
 
     def begun(self, values: Floats, run: Run) -> Run:
-        """Find the initial states for a log with values (k,); raises BadInput as `replay`."""
+        """Find the initial states for a log with values (k,); raise BadInput as `replay` does."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):
@@ -425,7 +425,7 @@ class Objective:
         return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
-        """Replay a log with values (k,): outputs by topic; raises BadInput as `replay`."""
+        """Replay a log with values (k,): outputs by topic. Raise BadInput as `replay` does."""
         bound = [
             with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
@@ -433,7 +433,7 @@ class Objective:
         return collect(replay(run.ensemble, bound))
 
     def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
-        """Compute a log's sums at points (n, k); None if a point gives another number of messages."""
+        """Compute a log's sums at points (n, k); None if the number of messages changes at a point."""
         return [self._sums(point, run, count) for point in points]
 
     def _sums(self, values: Floats, run: Run, count: int) -> Sums | None:
@@ -463,7 +463,7 @@ class Objective:
         ]
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
-        """Sum over all parts; None if all fail or give another number of messages."""
+        """Sum over all parts; None if all fail or their number of messages changes."""
         is_used = [not _failures(outputs) and self._count(outputs) == count for outputs in parts]
         if not any(is_used):
             return None
@@ -474,7 +474,7 @@ class Objective:
         return found[0] if len(parts) == 1 else dict(mean_likelihood(found))
 
     def _count(self, outputs: Mapping[str, Ragged]) -> int:
-        """Count the innovations, or the output rows without innovations; delays add estimates."""
+        """Count the innovations, or else the output rows (which include estimates added by delays)."""
         innovations = sum(len(stream) for _, stream in innovations_in(outputs))
         return innovations or sum(len(rows) for rows in outputs.values())
 

@@ -1,4 +1,4 @@
-"""Presentation of a tuning's result: tables, figures, notes, settings to replay with, result folder."""
+"""Presentation of a tuning's result: tables, figures, notes, settings, result folder."""
 
 import json
 import math
@@ -32,9 +32,9 @@ from fuselog.replay.judging.tables import joined
 
 Floats = NDArray[np.float64]
 Source = LogSource | MemorySource
-START, TUNED = "start", "tuned"  # labels of the estimator with its start and its tuned values
+START, TUNED = "start", "tuned"  # labels of the estimator with its start values and its tuned values
 SETTINGS = "settings.toml"
-IMPROBABLE = 1e-3  # probability below which innovations are not taken for white
+IMPROBABLE = 1e-3  # probability below which innovations are not considered white
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,8 +47,8 @@ class Tuning:
         settings: the estimator's settings with the start values, and with the tuned values.
         objective: the cost that was minimised.
         found: the end of the search.
-        costs: (2,) of the logs with the start and the tuned values: minus the log-likelihood if that was
-            optimised, corrected for the noise of the controls if a note says so.
+        costs: (2,) those of the logs with the start and the tuned values: minus the log-likelihood if
+            that was optimised, corrected for the noise of the controls if a note says so.
         held_out_costs: (2,) the same for the held-out logs, if any.
         folds: a row per fold: the values found on all other logs, and the costs of its own logs.
         gate: the probability of the gate that was open in the search.
@@ -75,7 +75,7 @@ class Tuning:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """Return a row per parameter: start, value, 95 % interval (NaN if unknown)."""
+        """Return a table with a row per parameter: start, value, 95 % interval (NaN if unknown)."""
         free = self.found.coordinates.free
         point, reach = self.found.coordinates.of(self.found.optimum), QUANTILE * self.standard_errors
         low, high = map(self.found.coordinates.unbounded, (point - reach, point + reach))
@@ -107,7 +107,7 @@ class Tuning:
 
     @property
     def profile(self) -> pd.DataFrame:
-        """Return values along each parameter, with their log-likelihoods relative to the maximum."""
+        """Return a table of each parameter's values with log-likelihoods relative to the maximum."""
         tables = [
             {
                 "parameter": each.name,
@@ -129,7 +129,7 @@ class Tuning:
 
     @cached_property
     def whiteness(self) -> pd.DataFrame:
-        """Return a row per measured component with the start and the tuned values.
+        """Return a table with a row per measured component and set of values, on whiteness.
 
         The columns are the number of innovations, the mean square of the normalised innovations, their
         correlation with the next one, the Ljung-Box statistic Q, and the probability of a larger Q if
@@ -162,7 +162,7 @@ class Tuning:
 
     @cached_property
     def replay(self) -> Replay:
-        """Return the replay of the logs with both sets of values: the estimators `start` and `tuned`."""
+        """Return the replay of the logs with both sets of values, labelled `start` and `tuned`."""
         return replay(self.logs, self.settings, gap_limit_s=self.objective.gap_limit_s)
 
     @cached_property
@@ -180,12 +180,12 @@ class Tuning:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Return a row per metric with both sets of values: estimator, quantity, case, value."""
+        """Return a table with a row per metric and set of values: estimator, quantity, case, value."""
         return joined(each.metrics for each in self.replays)
 
     @cached_property
     def notes(self) -> list[str]:
-        """Return a sentence for everything that one should know about the values."""
+        """Return remarks on the reliability of the values, one sentence each."""
         return [
             *self.notes_of_search,
             *(each for each in self.replay.judge.notes_of_coverage if each.startswith(TUNED)),
@@ -305,7 +305,7 @@ class Tuning:
                 )
 
     def _notes_of_others(self) -> Iterator[str]:
-        """Report whether logs outside the search are explained better too."""
+        """Report whether the tuned values also explain logs outside the search better."""
         if self.held_out_costs is not None:
             before, after = self.held_out_costs
             what, sign = "cost", 1.0
@@ -324,7 +324,7 @@ class Tuning:
 
     @property
     def _scale(self) -> str:
-        """Describe the scale of the held-out logs' log-likelihood, in contrast to that of the tables."""
+        """Describe how the held-out logs' log-likelihood differs in scale from the tables."""
         count = len(self.held_out_logs)
         total = "of 1 log" if count == 1 else f"the sum over {count} logs"
         is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")

@@ -1,7 +1,7 @@
-"""Search for the parameters with the least cost.
+"""Search for the parameters with the lowest cost.
 
-Positive parameters, such as standard deviations, are searched by their logarithm; all others have a unit
-of their own.
+Positive parameters, such as standard deviations, are searched as logarithms. Other parameters have an
+individual unit.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,14 +17,14 @@ from fuselog.recorders.parameters import Parameter
 
 Floats = NDArray[np.float64]
 
-CURVATURE_STEP = 1e-2  # step of differences, in coordinates
-DESCENTS = 20  # the search stops when no change of a single parameter reduces the cost further
+CURVATURE_STEP = 1e-2  # step of the finite differences, in coordinates
+DESCENTS = 20  # the search stops when no change of a single parameter reduces the cost by more
 # factors by which a scan changes a positive parameter
 FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])
 # changes of a calibration parameter in a scan, in useful units
 MOVES = np.array([-10.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 10.0])
-LEAST_GAIN = 1e-3  # smallest gain of a scan's step: far less than any log can resolve
-LOOKS = 3  # attempts to find the scale of a parameter that is not positive
+LEAST_GAIN = 1e-3  # smallest gain of a scan's step, far less than any log can resolve
+LOOKS = 3  # number of attempts to find the scale of a parameter that is not positive
 UNIT = 10.0  # standard errors of the parameter if all others are fixed
 
 MOST_GRID_POINTS = 10_000
@@ -32,7 +32,7 @@ MOST_GRID_POINTS = 10_000
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of k parameters: the logarithm, or the value in a unit of the parameter's own."""
+    """Coordinates of k parameters, which are logarithms or values in individual units."""
 
     free: Sequence[Parameter]
     units: Floats
@@ -52,7 +52,7 @@ class Coordinates:
             return np.where(self._is_log, np.exp(coordinates), coordinates * self.units)
 
     def over(self, cost: Cost) -> Cost:
-        """Turn a cost of values into a cost of coordinates (n, k)."""
+        """Convert a cost of values to a cost of coordinates (n, k)."""
         return lambda points: cost(self.values(points))
 
     @property
@@ -79,7 +79,7 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
     """Choose the coordinates of a search.
 
     Args:
-        cost: computes the costs of values (n, k).
+        cost: function that computes the costs of values (n, k).
         free: the k parameters.
         about: (k,), the values around which the curvature of the cost determines the units.
 
@@ -112,9 +112,9 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
-    """Find `UNIT` standard errors of a parameter by the curvature around a value, and three costs."""
+    """Find `UNIT` standard errors of a parameter from the curvature around a value, and three costs."""
     step = 1e-3 * max(abs(value), 1.0)
-    for _ in range(LOOKS):  # the cost is not a parabola here: use a smaller or larger step
+    for _ in range(LOOKS):  # the cost is not a parabola here, so a smaller or larger step is used
         costs = near([-step, 0.0, step])
         with np.errstate(invalid="ignore"):  # infinite costs have no curvature
             bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
@@ -123,7 +123,7 @@ def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[floa
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
-    """Return the start (k,) in coordinates, or the point of a grid between the bounds that costs less.
+    """Return the start (k,) in coordinates, or the point of a grid between the bounds if it costs less.
 
     Raises BadInput if a bound is infinite or the grid has too many points.
     """
@@ -159,7 +159,7 @@ def least(
     reduces the cost.
 
     Args:
-        cost: computes the costs of values (n, k).
+        cost: function that computes the costs of values (n, k).
         coordinates: the coordinates of the search.
         start: (k,), in coordinates.
         is_smooth: whether the cost has a gradient that the search can follow.
@@ -180,12 +180,12 @@ def least(
 
 
 def scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """Move to a point from which no change of a single parameter reduces the cost, see `least`.
+    """Move to a point from which no change of a single parameter reduces the cost; see `least`.
 
     The scan ends after `ITERATIONS` changes if the cost keeps falling.
 
     Args:
-        cost: computes the costs of values (n, k).
+        cost: function that computes the costs of values (n, k).
         coordinates: the coordinates of the search.
         start: (k,), in coordinates.
 

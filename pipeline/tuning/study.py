@@ -1,7 +1,7 @@
-"""A study of tuning: how well maximum likelihood finds the values with which a scenario was recorded.
+"""A study of how well maximum likelihood finds the values with which a scenario was recorded.
 
-Every run is tuned separately, for several durations, from the settings of the experiment's one
-estimator; the tuning does not know the true values. The study measures how often 95 % intervals cover
+Every run is tuned separately, for several durations, from the settings of the experiment's only
+estimator. The tuning does not know the true values. The study measures how often 95 % intervals cover
 the truth, the errors of the values, and how often the notes report that the logs determine too little.
 """
 

@@ -58,17 +58,17 @@ from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
-# a positive parameter without bounds is searched between its start divided by this and times this
+# bounds of a positive parameter without bounds: its start value divided by this and times this
 REACH = 1e4
 OPEN = {"gate_probability": 1.0}
-MOVED = 0.5  # change of the log-likelihood from which the noise of the controls matters
+MOVED = 0.5  # change of the log-likelihood above which the noise of the controls matters
 # standard errors from the optimum at which the effect of that noise is evaluated
 REACHES = np.array([1.0, 3.0, 10.0])
-NOISY_STEP = 0.2  # step of differences of a corrected cost, in coordinates: two standard errors
-NOISY_REACH = 5.0  # largest such step in standard errors, if the step follows from a useful error
-NOISY_PAIRS = 32  # pairs of copies for the covariance of slopes; a power of two
+NOISY_STEP = 0.2  # step of the differences of a corrected cost, in coordinates: two standard errors
+NOISY_REACH = 5.0  # largest such step in standard errors, if the step is derived from a useful error
+NOISY_PAIRS = 32  # number of pairs of copies for the covariance of slopes; a power of two
 DIVERGED = 2.0  # NIS per component: twice its expected value
-ROUNDS = 4  # searches, each starting where filters begin with the values of the previous one
+ROUNDS = 4  # number of searches, each with the filters' starts at the values of the previous one
 
 
 @without_warnings_of_numbers()
@@ -93,13 +93,13 @@ def tune(
 
     Args:
         logs: one or several logs with the same topics: paths, opened logs or recordings.
-        estimator: a registered name, or a label of your own with what it stands for; see `replay`.
+        estimator: a registered name, or a label of your own mapped to an estimator; see `replay`.
         free: the full names of the parameters to search for.
-        by: what is optimised. "likelihood" is that of the measurements and needs no truth; "nis" brings
-            the mean squares of normalised innovations to one, "nees" those of normalised errors; "rmse"
-            minimises the RMSE. Default: "likelihood", or "rmse" if the estimator gives no innovations.
-        set: values of other parameters, and start values; by default what the log's channels state. It
-            can also alter topics; see `replay`.
+        by: the criterion. "likelihood" is that of the measurements and needs no truth; "nis" brings the
+            mean squares of normalised innovations to one, "nees" those of normalised errors; "rmse"
+            minimises the RMSE. Default: "likelihood", or "rmse" if the estimator has no innovations.
+        set: values of other parameters, and start values; the default is the values in the log's
+            channels. It can also alter topics; see `replay`.
         bounds: the interval of each parameter. If both bounds are positive, the parameter is positive.
         grid: number of values per parameter between its bounds; the search starts from the best point.
         validate: held-out logs on which the values are judged.
@@ -108,7 +108,7 @@ def tune(
         workers: processes that share points and logs, as for `run`; by default threads of this process.
         scheduler: as for `run`.
         executor: as for `run`.
-        on_best: called repeatedly with the best values so far.
+        on_best: function that is called repeatedly with the best values so far.
 
     Returns:
         The parameters with 95 % intervals, and replays of the logs with the start and the tuned values.
@@ -185,14 +185,14 @@ def tune(
 def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
 ) -> AbstractContextManager[WorkerPool | None]:
-    """Choose the executor of evaluations; None stands for threads of this process."""
+    """Choose the executor of evaluations; None means threads of this process."""
     if workers is None and scheduler is None and executor is None:
         return nullcontext()
     return pool_for(workers, scheduler, 1, executor)()
 
 
 def _criterion(run: Run, bound: Sequence[Bound]) -> By:
-    """Choose the criterion: likelihood, or RMSE if the estimator gives no innovations."""
+    """Choose the criterion: likelihood, or RMSE if the estimator has no innovations."""
     outputs = collect(replay(run.ensemble, bound))
     return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
 
@@ -275,7 +275,7 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
 def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
     """Return a parameter's value on a log, by its full name, and whether this value is assumed.
 
-    Raises BadInput if neither the settings nor the log's channels state it.
+    Raises BadInput if the value is neither in the settings nor in the log's channels.
     """
     value: Any = bound.parameters
     for part in [field_of(name)] if is_of_topic(name) else name.split("."):
@@ -291,7 +291,7 @@ def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool
 
 
 def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
-    """Search for the values with the least cost.
+    """Search for the values with the lowest cost.
 
     The cost is corrected if the noise of the controls matters, and a spike of the likelihood is
     rejected. Ctrl-C ends the search with the best values so far.
@@ -306,7 +306,7 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
             found = _settled(objective, free, grid)
         if _is_moved_by_noise(objective, found):
             objective.begin(start)
-            objective(np.array([found.optimum]))  # the best so far, measured by the new cost
+            objective(np.array([found.optimum]))  # the best values so far, measured by the new cost
             found = _settled(objective, free, grid)
         return _confirmed(objective, found)
     except KeyboardInterrupt as stopped:
@@ -318,7 +318,7 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
 
 
 def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
-    """Return how far calibration parameters reach that lose measurements near values (k,).
+    """Return the reach of calibration parameters that lose measurements near values (k,).
 
     This happens if a delay moves a message to before the start of the filter.
     """
@@ -334,11 +334,11 @@ def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) ->
 
 
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
-    """Correct the cost for the noise of the controls if this noise may decide where the cost is least.
+    """Correct the cost for the noise of the controls if this noise may move the minimum.
 
-    It may if, a few standard errors of a parameter away, it changes the cost by at least MOVED and by at
-    least half of the cost's rise. One standard error is too near: if stamps are shifted by half a step,
-    the noise gains most, and about equally on both sides.
+    This is the case if, a few standard errors of a parameter away, the noise changes the cost by at
+    least MOVED and by at least half of the cost's rise. One standard error is too close: if stamps are
+    shifted by half a step, the noise gains most, and about equally on both sides.
     """
     if found.confidence is None:
         return False
@@ -394,7 +394,7 @@ def _held(
 ) -> tuple[list[Parameter], dict[str, Any]]:
     """Fix calibration parameters at their start if the motion does not determine them at values (k,).
 
-    Innovations are large far from the best values, so that this is tested again near them. Parameters
+    Innovations are large far from the best values, so this is tested again near them. Parameters
     that were fixed before stay fixed.
     """
     places = [place for place, each in enumerate(free) if each.useful]
@@ -418,9 +418,9 @@ def _held(
 def _search(
     objective: Objective, free: Sequence[Parameter], grid: int, point: Floats | None = None
 ) -> SearchOutcome:
-    """Search, from a point (k,) if given, for the values with the least cost and their confidence.
+    """Search for the values with the lowest cost and their confidence, from a point (k,) if given.
 
-    A parameter on which the logs have no information stays at its start. Raises BadInput if the cost
+    A parameter on which the logs contain no information stays at its start. Raises BadInput if the cost
     does not depend on a parameter.
     """
     start = np.array([each.default for each in free])
@@ -430,7 +430,7 @@ def _search(
     if grid > 1:
         point = least_of_grid(objective, coordinates, grid)
     begin = coordinates.values(scanned(objective, coordinates, point))
-    if not np.array_equal(begin, start):  # no unit can be found where a filter diverges
+    if not np.array_equal(begin, start):  # no unit can be found near values at which a filter diverges
         coordinates = coordinates_of(objective, free, begin)
         point = coordinates.of(begin)
     is_smooth = CRITERIA[objective.by].is_smooth
@@ -456,7 +456,7 @@ def _confidence_at(
 ) -> tuple[Floats, Confidence | None, list[str]]:
     """Compute the confidence in parameters that are not at a bound.
 
-    Parameters are listed if runs fail close to their values. If the cost is corrected for the noise of
+    Parameters are listed if runs fail near their values. If the cost is corrected for the noise of
     the controls, the point is moved too; see `_levelled`.
     """
     inner = np.flatnonzero(~coordinates.at_bounds(point))
@@ -485,7 +485,7 @@ def _confidence_at(
 def _noisy_steps(
     objective: Objective, coordinates: Coordinates, point: Floats, places: Sequence[int]
 ) -> Floats:
-    """Choose the steps (m,) of differences of a cost that the noise of the controls makes jagged.
+    """Choose the steps (m,) of the differences of a cost that the noise of the controls makes jagged.
 
     The cost has an edge, randomly up or down, where shifted stamps coincide with those of a control.
     Differences for calibration parameters are therefore as wide as the useful error, but at most
@@ -511,10 +511,10 @@ def _curvature(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Compute the curvature (m, m), with twice the steps if the cost is corrected.
+    """Compute the curvature (m, m), with double steps if the cost is corrected.
 
-    An edge next to the point then has the same effect on it as on differences of slopes over these
-    steps.
+    An edge next to the point then has the same effect on the curvature as on differences of slopes over
+    these steps.
     """
     times = 2.0 if objective.is_corrected else 1.0
     return curvature(coordinates.over(objective), point, places, times * steps)[1]
@@ -527,10 +527,10 @@ def _levelled(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Move a point to where the costs one step (m,) ahead and behind are equal, if such a point is near.
+    """Move a point to where the costs one step (m,) ahead and behind are equal, if it is near.
 
-    The mean of the cost over these steps is least there, and edges of the cost do not attract this
-    point.
+    The mean of the cost over these steps has its minimum there, and edges of the cost do not attract
+    this point.
     """
     low, high = coordinates.bounds
     rows = list(places)
@@ -578,7 +578,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
     if found.confidence is None or objective.nis(found.optimum) < DIVERGED:
         return found
     coordinates = found.coordinates
-    moves = [  # not steps that the scan would reverse
+    moves = [  # these are not steps that the scan would reverse
         0.0 if each.is_fixed else np.log(2.0) if each.is_log else 2.0 * (each.useful or unit) / unit
         for each, unit in zip(coordinates.free, coordinates.units, strict=True)
     ]
@@ -597,7 +597,7 @@ def _confirmed(objective: Objective, found: SearchOutcome) -> SearchOutcome:
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Parameter], grid: int
 ) -> dict[str, Any]:
-    """Tune on all other logs and compute the cost of the logs of one fold with the result."""
+    """Tune on all other logs, and compute the cost of the logs of one fold with the result."""
     found = _found(rest, free, grid)
     start = np.array([each.default for each in free])
     costs = left_out(np.array([start, found.optimum]))

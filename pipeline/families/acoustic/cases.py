@@ -40,7 +40,7 @@ Place = tuple[float, float]
 
 
 class Maps(Parameters):
-    """The maps of figures 22 and 23.
+    """The estimators and the grid for the maps in figures 22 and 23.
 
     Attributes:
         scenario: scenario with the sensors.
@@ -137,7 +137,7 @@ class Mode:
 
     @property
     def far_per_1000(self) -> float:
-        """Return the number per thousand of solutions that are missing or more than 50 m off."""
+        """Return how many of a thousand solutions are missing or more than 50 m off."""
         return 1000.0 * float(np.mean(~(self.distance_m <= FAR_M)))
 
     @property
@@ -159,7 +159,7 @@ class Case:
 
 
 def run_case(experiment: Experiment, setting: Setting, number: int, multiplier: float) -> Case:
-    """Record a scenario, replay the modes that run at this noise level, and compute their bounds."""
+    """Record a scenario, replay the modes for this noise level, and compute their bounds."""
     options: AcousticOptions = setting.options
     name = options.scenarios[number - 1]
     stated = experiment.record.parameters if experiment.record else {}
@@ -245,7 +245,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Compute the ellipse area of bearings only over that of a mode, on a grid of shooters (x, y)."""
+    """Compute the ratio of ellipse areas, bearings only over a mode, on a grid of shooters (x, y)."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

@@ -1,7 +1,7 @@
-"""Study of sounds in recordings: arrivals by cross-correlation, positions from them, covariances.
+"""Study of sounds in recordings: arrival differences by cross-correlation, positions, covariances.
 
-Results are compared with the truth or with published differences if these are known. Stated covariances
-are tested on simulated recordings at several noise levels, with many sounds at different positions.
+Results are compared with the truth or with published differences, if these are known. The estimators'
+covariances are tested on simulated recordings at several noise levels, with sounds at many positions.
 """
 
 from typing import Annotated
@@ -51,7 +51,7 @@ class Simulated(Parameters):
 
 
 class Options(Parameters):
-    """Published differences of sounds, and simulated recordings.
+    """Published differences of sounds, and the simulated recordings.
 
     Attributes:
         published: published arrival differences, by the name of a sound.
@@ -102,7 +102,7 @@ def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> N
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:
-    """Tabulate the differences of all sounds relative to their first microphone, and their sigmas."""
+    """Tabulate the differences of all sounds relative to their first microphone, with their sigmas."""
     tables = []
     points = source.streams["/microphones"]
     places = pd.DataFrame(points["position_m"], points["landmark_id"].astype(int), ["x_m", "y_m", "z_m"])
@@ -143,7 +143,7 @@ def known_place(errors: Errors) -> dict[str, MetricValue]:
 
 
 def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
-    """Return the differences of every sound, and their deviations from the published ones."""
+    """Return the delays of every sound, and their deviations from the published ones."""
     delays = {name: rows["delay_s"].to_numpy() for name, rows in table.groupby("sound", sort=False)}
     found: dict[str, MetricValue] = {
         f"sound.delay_s.{name!s}": of.tolist() for name, of in delays.items()
@@ -162,10 +162,10 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
 
 
 def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
-    """Compute how well one position explains a sound's differences, and the number of spare differences.
+    """Compute how well one position explains a sound's differences, and the number of redundant ones.
 
-    The sum of squared innovations, except those that the start uses up, has as many degrees of freedom
-    as there are differences in excess of the coordinates.
+    The sum of squared innovations, except those that the start uses, has as many degrees of freedom as
+    there are more differences than coordinates.
     """
     heights_m = table["z_m"][table["sound"] == name]
     extra = len(squared) - (2 if np.ptp(heights_m) == 0.0 else 3)

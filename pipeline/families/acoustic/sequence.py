@@ -1,9 +1,9 @@
-"""Study of shots in sequence: the benefit of a joint estimate, and of robust estimation.
+"""Study of shots in sequence, which measures the benefits of joint and of robust estimation.
 
-Errors are those at the last report of each shot. For filters and smoothers, the truth is the shooter's
-position at that time; for single-shot solutions, which have no motion model, it is the position at which
-the shot was fired. Estimators are compared by the mean over runs of the log RMSE, so that a lost run
-counts without dominating.
+Errors are computed at the last report of each shot. For filters and smoothers, the truth is the
+shooter's position at that time; for single-shot solutions, which have no motion model, it is the
+position at which the shot was fired. Estimators are compared by the mean of the log RMSE over runs, so
+that a lost run counts without dominating.
 """
 
 from typing import Annotated, Any
@@ -91,7 +91,7 @@ def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
 
 
 def shots_of(source: MemorySource) -> tuple[Floats, Any]:
-    """Return the firing positions (shots, 2) of shots that were heard, and when each was last heard."""
+    """Return the firing positions (shots, 2) of shots that were heard, and when each was heard last."""
     detections = [stream for topic, stream in source.streams.items() if topic.endswith("/detections")]
     shot = np.concatenate([stream["shot_id"] for stream in detections]).astype(np.int64)
     heard_ns = np.concatenate([stream.publish_time_ns for stream in detections])
@@ -122,7 +122,7 @@ def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
 
 
 def log_ratio(runs: pd.DataFrame, case: str, label: str, other: str) -> Interval:
-    """Compute the mean log ratio of two estimators' RMSE, over runs that both located."""
+    """Compute the mean log ratio of two estimators' RMSEs, over runs in which both located shots."""
     rmse: Any = runs[runs["case"] == case].pivot_table("rmse_m", "run", "estimator")
     return mean_interval(np.log(rmse[label] / rmse[other]).dropna())
 

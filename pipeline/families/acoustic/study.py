@@ -57,7 +57,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
-    """Tabulate NEES, RMSE, CRLB and outlying solutions of every mode by noise level, figures 15-21."""
+    """Tabulate NEES, RMSE, CRLB and outliers of every mode by noise level, figures 15-21."""
     low, high = chi_square_interval(2, runs)
     rows = [
         (
@@ -95,7 +95,7 @@ def _nominal(cases: list[Case]) -> list[Case]:
 
 
 def _table_of_components(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate parameters at the paper's noise: RMSE against sigma_CRLB, mean error, own NEES."""
+    """Tabulate RMSE against sigma_CRLB, mean error and NEES of each parameter at the paper's noise."""
     parts = []
     for case in _nominal(cases):
         for label, mode in case.modes.items():
@@ -119,7 +119,7 @@ def _table_of_components(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_ellipses(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate areas of the 95 % ellipses of the CRLB and of the estimates, figures 6-14."""
+    """Tabulate the areas of the 95 % ellipses of the CRLB and of the estimates, figures 6-14."""
     rows = [
         (case.number, label, mode.area_m2, float(ellipse_area(mode.covariance)), mode.bound_m)
         for case in _nominal(cases)
@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Tabulate the ellipse area of bearings only divided by that of a mode, figures 22 and 23."""
+    """Tabulate the ratio of ellipse areas, bearings only over a mode, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)

@@ -1,1 +1,1 @@
-"""Studies of biometric scores: fusion, and sequential verification; begin with `study`."""
+"""Studies of biometric scores: fusion and sequential verification; begin with `study`."""

@@ -1,11 +1,11 @@
-"""Study of sequential verification: Wald's test of each probe, and Page's test of the matcher.
+"""Study of sequential verification, with Wald's test of each probe and Page's test of the matcher.
 
-Log-likelihood ratios are calibrated on other users than those they are applied to. A matcher's ratios
-are resampled by users as clusters: a replicate draws users with replacement, and all intervals are
-quantiles over the replicates. The data contain one genuine score per user and matcher, so further probes
-of a person are scores of other persons: independent, or correlated by an assumed correlation of normal
-scores. Sequences that are entirely real are one person with one matcher after another, and many
-impostors against one identity.
+Log-likelihood ratios are calibrated on other users than those to whom they are applied. A matcher's
+ratios are resampled by users as clusters: a replicate draws users with replacement, and all intervals
+are quantiles over the replicates. The data contain one genuine score per user and matcher, so further
+probes of a person are simulated by scores of other persons. They are independent, or have an assumed
+correlation of their normal scores. Only two kinds of sequences are entirely real: one person with one
+matcher after another, and many impostors against one identity.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,22 +47,23 @@ WAYS = {
     "alike": "correlated probes of one person",
     "matchers": "one person, one matcher after another",
 }
-# The person scores like an impostor, impostors score like the person, or genuine scores drop.
+# The person scores like an impostor, impostors score like the person, or genuine scores decrease.
 FAULTS = ("misses", "accepts", "drifts")
-FIXED_PROBES = 50  # more than any matcher needs
-IMPOSTORS = 100_000  # enough to represent the tail of all impostor scores
+FIXED_PROBES = 50  # more probes than any matcher needs
+IMPOSTORS = 100_000  # enough probes for the tail of all impostor scores
 
 
 class Options(Parameters):
-    """The tests' error rates, and how the tests are evaluated.
+    """The error rates of the tests, and options of their evaluation.
 
     Attributes:
         rates: pairs of specified false accept and false reject rates.
         alike: correlation of the normal scores of one person's probes.
         sequences: number of sequences of probes to draw.
         replicates: number of times that users are resampled.
-        most_probes: number of probes after which a sequence ends undecided.
-        label_ratio: ratio of the other matchers above which a probe is used to monitor a matcher.
+        most_probes: number of probes after which an undecided sequence ends.
+        label_ratio: log-likelihood ratio of the other matchers above which a probe is used to monitor a
+            matcher.
         run_length: specified mean number of such probes until a false alarm.
         watched: number of series of probes in which a matcher is monitored.
         watched_probes: probes in a series without a fault.
@@ -88,7 +89,7 @@ class Drawn(NamedTuple):
     users: Integers
 
     def others(self, gallery: Integers, rng: np.random.Generator) -> Integers:
-        """Draw a different user for each gallery entry (n,)."""
+        """Draw for each gallery entry (n,) a different user."""
         probe = rng.choice(self.users, len(gallery))
         while (same := probe == gallery).any():
             probe[same] = rng.choice(self.users, int(same.sum()))
@@ -167,7 +168,7 @@ def wald_tests(
 def probes_of(
     way: str, drawn: Drawn, options: Options, rng: np.random.Generator
 ) -> tuple[RatioOf, RatioOf]:
-    """Return functions that give the next probes' ratios of sequences: of persons, and of impostors."""
+    """Return functions that draw the next ratios of sequences of probes, for persons and impostors."""
     genuine = np.diag(drawn.ratios)[drawn.users]
     if way == "alike":
         some = drawn.ratios[drawn.impostors(IMPOSTORS, rng)]
@@ -196,13 +197,13 @@ def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioO
 
 
 def in_turn(ratios: Sequence[Floats]) -> RatioOf:
-    """Return a function that gives every sequence the ratios of one matcher after another."""
+    """Return a function that uses the ratios of one matcher after another in every sequence."""
     left = iter(ratios)
     return lambda going: next(left)[going]
 
 
 def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
-    """Compute shares of wrong and missing decisions, and the mean numbers of probes per decision."""
+    """Compute the shares of wrong and missing decisions, and the mean number of probes per decision."""
     undecided = np.concatenate([genuine.probes, impostors.probes]) == 0
     return {
         "false_accept": float(impostors.accepted.mean()),
@@ -237,7 +238,7 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
 def watched(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Count the probes until the alarm, by fault and matcher; fault "none" is a matcher without a fault.
+    """Count the probes until the alarm, by fault and matcher; fault "none" is a faultless matcher.
 
     Half of the users are the reference; the other half is monitored.
     """
@@ -275,12 +276,12 @@ def watched(
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
-    """Draw probes and label them by the other matchers; drop probes that these leave undecided.
+    """Draw probes and label them with the other matchers; drop probes that these leave undecided.
 
     Args:
         drawn: the matcher's ratios, and the users.
         label: (users, users), the summed log-likelihood ratios of the other matchers.
-        least: smallest absolute ratio that gives a label.
+        least: smallest absolute ratio for which a probe is labelled.
         count: number of probes to draw, about half of them genuine.
         rng: random numbers to draw the probes.
 

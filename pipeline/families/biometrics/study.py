@@ -1,7 +1,7 @@
-"""Study of biometric score fusion: modality, method and process, verification of all pairs.
+"""Study of biometric score fusion by modality, method and process, with verification of all pairs.
 
 Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
-seeds; those of all pairs get confidence intervals by resampling users.
+seeds. Fusions of all pairs have confidence intervals, from resampled users.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ PAPER_FUSED = {
     }.items()
 }
 RATE, SPREAD, COUNT = "verification_rate_percent", "verification_rate_sd_percent", "identified_percent"
-# False rates at the ticks of both axes of normal deviates.
+# False rates at the ticks of both axes, which are scaled by normal deviates.
 TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
@@ -96,7 +96,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _repeated(
     runner: Runner, sources: Sequence[MemorySource], first: Mapping[str, float]
 ) -> dict[str, float]:
-    """Compute means and standard deviations over seeds, for fusions of a trimmed database."""
+    """Compute means and standard deviations over seeds for fusions of a trimmed database."""
     drawn = {}
     for label, settings in runner.experiment.estimators.items():
         _, parameters = configure(label, settings)
@@ -169,7 +169,7 @@ def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
 
 
 def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
-    """Compute 95 % intervals of GAR at FAR and EER of the first run, by resampling users."""
+    """Compute 95 % intervals of GAR at FAR and EER of the first run from resampled users."""
     names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
     rows = []
     for topic, fused in _complete(replayed).items():
@@ -223,7 +223,7 @@ def distribution_figure(source: MemorySource) -> Figure:
 
 
 def curve_chart(replayed: Replayed, *, deviates: bool) -> Chart:
-    """Draw the ROC or, with normal deviates on both axes, the detection error trade-off."""
+    """Draw the ROC or, on axes of normal deviates, the detection error trade-off."""
     series = []
     for topic, fused in _complete(replayed).items():
         found = roc(fused.score, fused.genuine)

@@ -1,4 +1,4 @@
-"""Monitoring of matchers in use: labelled probes, simulated faults, and Page's test for a change."""
+"""Monitoring of matchers in use, with labelled probes, simulated faults and Page's test."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -59,7 +59,7 @@ def normal_scores(values: Floats, reference: Floats) -> Floats:
 
 
 def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
-    """Compute log-likelihood ratios of four changes, zero for probes that say nothing about a change.
+    """Compute log-likelihood ratios of four changes, zero for probes without information on a change.
 
     Args:
         seen: n probes.

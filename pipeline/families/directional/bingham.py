@@ -1,4 +1,4 @@
-"""Evaluation of the Bingham filter against modified Kalman filters: figures 4 and 5.
+"""Comparison of the Bingham filter with modified Kalman filters, figures 4 and 5.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014, section 7. Every ensemble is recorded twice, with Bingham noise and
@@ -120,7 +120,7 @@ def _errors_deg(
 
 
 def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> Floats:
-    """Compute the errors that any filter can achieve, by Bayes' rule on a grid over the half circle."""
+    """Compute the smallest possible errors, by Bayes' rule on a grid over the half circle."""
     logs = [source.read(["/truth", "/axis"]) for source in replayed.sources]
     truth = np.stack([log["/truth"]["state"] for log in logs])
     measured = np.concatenate([log["/axis"]["axis"] for log in logs])

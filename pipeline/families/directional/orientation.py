@@ -36,7 +36,7 @@ from fuselog.replay.judging.intervals import mean_interval
 KINDS = ("undisturbed", "disturbed", "slow", "fast", "rotation", "translation", "combined")
 PARTS = ("total", "heading", "inclination")
 AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
-FEWEST_TRIALS = 3  # for an interval of the mean: the experiment's recording has no more
+FEWEST_TRIALS = 3  # fewest trials for an interval of the mean; the experiment's recording has no more
 
 
 class OrientationOptions(Parameters):
@@ -81,7 +81,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         recorded = runner.replay([source])
         near = with_magnet(source, name, options)
         disturbed = runner.replay([near])
-        if not number:  # keep only the first trial; the others can be imported again
+        if not number:  # keep only the first trial, because the others can be imported again
             runner.keep([source], recorded.outputs)
             runner.draw([near], disturbed.outputs, WITH_MAGNET)
         for case, replayed in ((AS_RECORDED, recorded), (WITH_MAGNET, disturbed)):
@@ -164,7 +164,7 @@ def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, A
 
 
 def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
-    """Find the rows of wanted stamps.
+    """Find the rows with the wanted stamps.
 
     Args:
         time_ns: (m,), ascending.
@@ -183,7 +183,7 @@ def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
 
     Args:
         estimate: (n, 4), quaternions from the body's axes to the earth's.
-        truth: (n, 4), likewise.
+        truth: (n, 4), quaternions from the body's axes to the earth's.
 
     Returns:
         The total angle, and its parts heading and inclination, (n,) each in rad, all nonnegative.
@@ -199,7 +199,7 @@ def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
 def disturbed_spans(
     replayed: Replayed, trial: str, case: str, options: OrientationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Yield the spans in which estimators that know the local field find it disturbed."""
+    """Yield the spans that estimators with a model of the local field consider disturbed."""
     [source] = replayed.sources
     for label, states in states_of(replayed, trial):
         if not set(COMPONENTS) <= set(states.components):
@@ -233,7 +233,7 @@ def by_kind(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _compare(table: pd.DataFrame, own: str, outcome: Outcome) -> None:
-    """Measure the excess errors of the other estimators, and the excess error due to a magnet."""
+    """Measure the excess errors of the other estimators, and the excess errors due to a magnet."""
     totals = table.pivot_table(index="trial", columns=["case", "estimator"], values="total_deg")
     for case in (AS_RECORDED, WITH_MAGNET):
         for other in totals[case].columns.drop(own):

@@ -1,9 +1,9 @@
-"""Study of estimation on the torus: propagation of samples by a coupling (figure 3), and a filter.
+"""Study of estimation on the torus: propagation of samples through a coupling (figure 3), and a filter.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. The
-propagation is a computation without a log; its truth is the population value, from Gauss-Hermite nodes
-instead of the paper's 10,000 samples. The filter is the one that the paper announces, with a grid filter
-as reference.
+propagation is a computation without a log. Its truth is the population value, computed with
+Gauss-Hermite nodes instead of the paper's 10,000 samples. The filter is the one that the paper
+announces, with a grid filter as reference.
 """
 
 from typing import NamedTuple
@@ -63,7 +63,7 @@ class MomentErrors(NamedTuple):
 def propagation_errors(
     options: PropagationOptions, coupling_rad: float, runs: int, rng: np.random.Generator
 ) -> dict[str, MomentErrors]:
-    """Propagate samples once and fit them by mixed maximum likelihood, like the truth.
+    """Propagate samples once, and fit both samples and truth by mixed maximum likelihood.
 
     Keys of the result: `five-wW` for every central weight, W in percent, `ukf`, `random`.
     """
@@ -122,7 +122,8 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation uses no data; leave out record, import and estimators")
     drawn_bytes = experiment.runs * len(options.correlations) * options.random_samples * 2 * 8
-    require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)  # as drawn, and moved
+    # the samples as drawn, and after propagation
+    require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)
     outcome = Outcome()
     tables = []
     for coupling_rad in setting.progress(

@@ -1,7 +1,7 @@
-"""Study of real angles on the torus: densities of a protein's dihedrals, predictions of the wind.
+"""Study of real angles on the torus: densities of a protein's dihedrals, and wind predictions.
 
-Fits are evaluated on angles that they have not seen: dihedrals part by part of the chain, and winds in
-the second half with the noise and coupling that are most likely in the first half. Neighbours are
+Fits are evaluated on angles that were not used: dihedrals in other parts of the chain, and winds in the
+second half with the noise and coupling that are most likely in the first half. Neighbours are
 correlated, so intervals are Student's intervals of block means.
 """
 
@@ -64,12 +64,12 @@ SIMPLER = {
 
 
 class Options(Parameters):
-    """How dihedrals and wind are evaluated.
+    """Options of the evaluation of dihedrals and wind.
 
     Attributes:
         folds: number of parts in which dihedrals are held out.
         most_components: largest number of components of mixtures.
-        block_residues: residues in a block, whose means give intervals.
+        block_residues: number of residues in a block, whose means determine intervals.
         block_hours: hours in a block of the wind.
         grid_cells: number of cells of the grid per angle.
     """
@@ -82,7 +82,7 @@ class Options(Parameters):
 
 
 class Prediction(NamedTuple):
-    """Log density and circular error of the prediction for every hour except the first."""
+    """Log densities and circular errors of the predictions of every hour except the first."""
 
     log_density: Floats
     error_rad: Floats
@@ -114,12 +114,12 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame:
     """Compute the log density of every pair of angles by fits to the other parts of the chain.
 
-    The number of a mixture's components is the best one on parts held out of the training parts.
+    The number of components of a mixture is the best one on held-out pieces of the training parts.
 
     Args:
         angles: (n, 2), in rad, in the order of the chain.
         options: the number of parts.
-        setting: shows the progress.
+        setting: setting of the experiment, which shows the progress.
 
     Returns:
         A table with a row for each pair and a column for each density.
@@ -219,7 +219,7 @@ FILTERS: dict[str, Filter] = {
 def most_likely(
     wind: Floats, run: Callable[..., tuple[WrappedNormal, WrappedNormal]]
 ) -> dict[str, float]:
-    """Find the coupling and the sigmas that predict directions best.
+    """Find the coupling and the sigmas with which directions are predicted best.
 
     Args:
         wind: (hours,), directions in rad.
@@ -252,7 +252,7 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Return every hour except the first as measurements of the direction, without its turn."""
+    """Return every hour except the first as a measurement of the direction, without its turn."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
@@ -328,7 +328,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
         half: number of hours, from the first, to which the width is fitted.
 
     Returns:
-        Two predictions by name: with wrapped normal noise only, and with occasional arbitrary jumps.
+        Two predictions by name, with wrapped normal noise only, and with occasional arbitrary jumps.
     """
     turn = np.diff(wind)
 

@@ -1,1 +1,1 @@
-"""Studies of lines of sight: Belfadel et al. 2014, and moving sensors; begin with `study`."""
+"""Studies of lines of sight, for Belfadel et al. 2014 and for moving sensors; begin with `study`."""

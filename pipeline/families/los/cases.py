@@ -76,7 +76,7 @@ class Printed(Parameters):
 
 
 class LosOptions(Parameters):
-    """The scenarios and conditions, and the paper's results.
+    """The scenarios, the conditions, and the results in the paper.
 
     Attributes:
         scenarios: scenario files, in the paper's order.
@@ -234,7 +234,7 @@ def _judged(
 
 
 def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
-    """Return an estimator's prior knowledge of a scenario: sensors, attitudes, noise, known biases."""
+    """Return what an estimator knows about a scenario: sensors, attitudes, noise, known biases."""
     sensors = np.array(parameters.sensor_position_m)
     sigma = np.full((len(sensors), 2), parameters.sigma_rad)
     known = known_biases(range(1, len(sensors) + 1), estimator)
@@ -242,13 +242,13 @@ def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
 
 
 def bias_names(case: Case) -> list[str]:
-    """Return the names of the wanted biases in tables."""
+    """Return the names of the estimated biases for tables."""
     names = [f"{angle}{s + 1}" for s in range(len(case.scene.position_m)) for angle in ANGLES]
     return [name for name, wanted in zip(names, case.scene.wanted, strict=True) if wanted]
 
 
 def observabilities(case: Case) -> dict[str, Observability]:
-    """Return the observability in variations of a case, by name of the variation."""
+    """Return the observability for variations of a case, by name of the variation."""
     wanted = case.scene._replace(known_bias_rad=np.full_like(case.scene.known_bias_rad, np.nan))
     first, last = case.scene.position_m[[0, -1]]
     share = np.linspace(0.0, 1.0, len(case.scene.position_m))[:, None]

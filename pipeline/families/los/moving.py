@@ -1,9 +1,9 @@
-"""Study of moving lines of sight: which biases are observable, what makes them so, and how well.
+"""Study of moving lines of sight: which biases are observable, why, and how accurately.
 
-Sensors that fly straight side by side leave one direction of the state unobservable: the scene may
-rotate about the line between the sensors if they roll with it, and targets with constant velocities then
-have other velocities. A manoeuvre, a sensor off the line and a known target should make it observable,
-in one case each.
+If sensors fly straight side by side, one direction of the state is unobservable: the scene may rotate
+about the line between the sensors if they roll with it, and targets with constant velocities then have
+other velocities. A manoeuvre, a sensor off the line and a known target should make this direction
+observable, in one case each.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ ALIGNED_S, LAST_S = 10.0, 10.0
 
 
 class Options(Parameters):
-    """The cases, and the runs whose observability is computed.
+    """The cases, and the number of runs whose observability is computed.
 
     Attributes:
         cases: changes to the scenario's parameters, by the name of a case.
@@ -71,7 +71,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         table = pd.concat([seconds_of(errors) for errors in replayed.errors]).assign(case=case)
         table = table[
             table["second"] < int(scenario.duration_s)
-        ]  # later stamps are due to clocks that are ahead
+        ]  # later stamps come from clocks that are ahead
         outcome.tables[f"observability-{case}"] = weakest_of
         sigmas = prior_sigmas(scenario)
         direction = weakest({name: float(weakest_of[name].iloc[0]) for name in sigmas}, sigmas)
@@ -87,7 +87,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
-    """Return what is estimated besides the targets: all biases, and all clocks except the first."""
+    """Return the unknowns besides the targets: all biases, and all clocks except the first."""
     numbers = range(1, len(parameters.sensor_position_m) + 1)
     biases = [name for number in numbers for name in bias_components(number)]
     clocks = [clock_component(number) for number in numbers[1:]]
@@ -125,10 +125,10 @@ def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:
 
 
 def seconds_of(errors: Errors) -> pd.DataFrame:
-    """Compute mean squared errors by run and second; for a bound, the squared bound.
+    """Compute mean squared errors by run and second; for a bound, the square of the bound.
 
-    `common_roll_rad2` is for the mean roll of all sensors, a column named like a bias is for that bias,
-    and the others are means over components. Values are NaN if the estimator does not have the
+    `common_roll_rad2` describes the mean roll of all sensors, a column named like a bias describes this
+    bias, and the others are means over components. Values are NaN if the estimator does not have the
     components.
     """
     table: dict[str, Any] = {"run": errors.run, "second": errors.elapsed_s.astype(int)}
@@ -206,7 +206,7 @@ def _aligned_nees(table: pd.DataFrame, label: str) -> Floats:
 
 
 def weakest(direction: Mapping[str, float], sigmas: Mapping[str, float]) -> str:
-    """Name the components with the largest parts of a direction, in units of the prior."""
+    """Name the components with the largest entries in a direction, in units of the prior."""
     parts = {name: share / sigmas[name] for name, share in direction.items()}
     largest = max(abs(part) for part in parts.values())
     return " ".join(

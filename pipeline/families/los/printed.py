@@ -1,4 +1,4 @@
-"""Comparison of results for lines of sight with those that Belfadel et al. 2014 print."""
+"""Comparison of results for lines of sight with those printed in Belfadel et al. 2014."""
 
 from typing import Any
 
@@ -59,7 +59,7 @@ def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
-    """Return the observability in variations of a scenario, and checks of its sensor positions."""
+    """Return the observability for variations of a scenario, and checks of its sensor positions."""
     number = case.number
     values: dict[str, Any] = {}
     for what, found in observabilities(case).items():
@@ -80,7 +80,7 @@ def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def steepest_deg(case: Case) -> float:
-    """Return the elevation of the steepest line of sight; azimuth is nearly singular near 90 deg."""
+    """Return the elevation of the steepest line of sight; near 90 deg, azimuth is nearly singular."""
     elevation = np.degrees(optical.predict(case.scene, case.truth[None])[0, :, :, 1])
     return float(elevation.ravel()[np.abs(elevation).argmax()])
 
@@ -97,7 +97,7 @@ def _share_from_print(case: Case, runs: int = 200) -> float:
 
 
 def _widest_span_deg(case: Case) -> float:
-    """Compute the largest angle between two targets as a sensor sees them."""
+    """Compute the largest angle between two targets, as seen by a sensor."""
     offset = np.array(case.parameters.target_position_m) - case.scene.position_m[:, None]
     unit: Floats = offset / np.linalg.norm(offset, axis=2, keepdims=True)
     cosine = np.einsum("sik,sjk->sij", unit, unit)

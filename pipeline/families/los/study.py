@@ -1,4 +1,4 @@
-"""Study of bias estimation from lines of sight: tables I-VIII, figures of Belfadel et al. 2014.
+"""Study of bias estimation from lines of sight, tables I-VIII and figures of Belfadel et al. 2014.
 
 Every scenario is recorded with and without biases under several conditions. The paper does not state the
 conditions of its tables, so each condition is evaluated separately.
@@ -69,7 +69,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _table_of_sensors(cases: list[Case], paper: Printed) -> pd.DataFrame:
-    """Tabulate the sensors of tables I and V: as printed, and as x, y (up), z."""
+    """Tabulate the sensors of tables I and V, as printed and as x, y (up), z."""
     rows = [
         (paper.table_of_sensors, case.number, sensor + 1, *printed, *ours)
         for case in cases
@@ -161,7 +161,7 @@ def _table_of_dilution(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate ranks for scheme 3: all biases wanted, other numbers of targets, sensors in a line."""
+    """Tabulate ranks for scheme 3, with all biases, other numbers of targets, and sensors in a line."""
     rows = []
     for case in cases:
         if case.condition != cases[0].condition:

@@ -1,1 +1,1 @@
-"""Studies of networks, robots and units that share estimates; begin with `study`."""
+"""Studies of networks, robots and inertial units that share estimates; begin with `study`."""

@@ -1,6 +1,6 @@
-"""Study of cooperative localization: accuracy and consistency of robots that share estimates.
+"""Study of the accuracy and consistency of robots that localise themselves with shared estimates.
 
-The paper, Jin, Lee, Hashimoto, DIND networks, has no numbers for real robots.
+The paper (Jin, Lee, Hashimoto, DIND networks) contains no numbers for real robots.
 """
 
 from collections.abc import Mapping, Sequence

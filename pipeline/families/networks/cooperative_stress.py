@@ -1,9 +1,10 @@
 """Study of robots that share estimates under stress, on recorded logs.
 
-When a robot sees another, both get a message. The study removes some of these sightings from the log:
-all except one per interval, a random half, or those of a robot that leaves. In another case, a robot has
-an overconfident wrong prior. The estimators fuse immediately, so out-of-sequence messages are left to
-`network-stress`. Intervals are over the robots; for the wrong prior, they exclude the robot that has it.
+When a robot sees another, both receive a message. The study removes some of these sightings from the
+log: all except one per interval, a random half, or those of a robot that leaves. In another case, a
+robot has a wrong and overconfident prior. The estimators fuse immediately, so `network-stress` tests
+out-of-sequence messages. Intervals are over the robots; for the wrong prior, they exclude the robot that
+has it.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,14 +32,15 @@ Booleans = NDArray[np.bool_]
 
 MESSAGE_BYTES = 8 * (1 + 3 + 6)  # stamp, pose, triangle of its covariance
 SEED = 1
-FEWEST_ROBOTS = 4  # for an interval of the mean NEES: a recording has no more correct robots
+# fewest robots for an interval of the mean NEES; a recording has no more correct robots
+FEWEST_ROBOTS = 4
 
 
 class CooperativeStressOptions(Parameters):
     """The stress on the robots.
 
     Attributes:
-        intervals_s: shortest times between two sightings in which two robots share estimates, in s.
+        intervals_s: minimum times in s between sightings in which two robots share estimates.
         leaving: number of the robot that is absent in the middle third.
         liar: number of the robot whose prior is wrong.
         lie_m: error of its prior along x.
@@ -90,7 +92,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int]:
-    """List a log's robots; raise BadInput if the robot to leave or to lie is not among them."""
+    """List a log's robots; raise BadInput if the robot to leave or to lie is missing."""
     topics = [topic.removeprefix("/robot").partition("/") for topic in source.streams]
     numbers = sorted(int(number) for number, _, leaf in topics if leaf == "range_bearing")
     for name in ("leaving", "liar"):
@@ -129,7 +131,7 @@ def _half(generator: np.random.Generator, stream: Stream, _: int, __: Booleans) 
 
 
 def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Booleans:
-    """Select the sightings without the leaving robot in the middle third of the log, and all others."""
+    """Select all sightings except those with the leaving robot in the middle third of the log."""
     times = stream.publish_time_ns
     first, second = times[0] + (times[-1] - times[0]) * np.array([1, 2]) // 3
     is_away = (times >= first) & (times < second)

@@ -1,8 +1,8 @@
-"""Study of several inertial units with clock offsets on one body: the benefit of more units.
+"""Study of several inertial units with clock offsets on one body, to find the benefit of more units.
 
-Each recording is replayed with one unit, with the mean of all units, and with one filter per unit, whose
-estimates are fused by covariance intersection, since all filters use the same fixes. The stamps of the
-units are corrected by a known offset, by the most likely offset, or not at all.
+Each recording is replayed with one unit, with the mean of all units, and with one filter per unit. The
+estimates of these filters are fused by covariance intersection, because they all use the same fixes. The
+stamps of the units are corrected with a known offset, with the most likely offset, or not at all.
 """
 
 import re
@@ -39,10 +39,10 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.engine.vectors.tangent import difference
 from fuselog.replay.families.networks.covariance_intersection import fuse
 
-# Position, velocity and orientation, which all filters have in common; biases belong to their units.
+# Position, velocity and orientation, which all filters share; biases belong to their units.
 POSE, POSE_TANGENT = 10, 9
 POSE_KINDS = ("linear",) * 6 + ("quaternion",) * 4
-# Largest remaining gain of the logarithm of the generalized variance.
+# Largest gain of the logarithm of the generalized variance that may remain.
 _CI_TOLERANCE = 1e-3
 FARTHEST_S = 5.0  # width at which the search for an offset ends
 ONE, MEAN, INTERSECTION = "one", "mean", "intersection"
@@ -142,7 +142,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _flights(experiment: Experiment, setting: Setting) -> list[Flight]:
-    """Read all recordings at or below --data; the seed of fixes is the number in the folder's name."""
+    """Read all recordings at or below --data; the number in a folder's name is the seed of its fixes."""
     assert setting.data is not None
     assert experiment.import_ is not None
     source, values = experiment.import_.source, experiment.import_.parameters
@@ -190,7 +190,7 @@ def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None 
 
 
 def mean_of(units: Sequence[Stream]) -> Stream:
-    """Average all units at the times of the first, after averaging samples with equal stamps."""
+    """Average all units at the stamps of the first, after averaging samples with equal stamps."""
     first = units[0]
     columns = {}
     for name in ("specific_force_mps2", "turn_rate_radps"):
@@ -213,9 +213,9 @@ def _offsets(
     *,
     of_truth: bool,
 ) -> dict[str, float]:
-    """Find the offset of the first unit of each recording that explains positions best.
+    """Find the offset of each recording's first unit that explains positions best.
 
-    The positions are those of the truth at all its stamps, or the fixes.
+    The positions are those of the truth at all its stamps, or those of the fixes.
     """
     return {
         flight.name: _offset(
@@ -310,7 +310,7 @@ def _poses(states: Stream) -> tuple[Integers, Floats]:
 def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
     """Fuse poses (n, 10) of several filters by covariance intersection, at their common stamps.
 
-    The orientations are so close to each other that the tangent space of the first serves for all.
+    The orientations are so similar that the tangent space of the first can be used for all.
     """
     time_ns = units[0].publish_time_ns
     for each in units[1:]:
@@ -323,7 +323,7 @@ def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
         for each, row in zip(units, rows, strict=True)
     ]
     apart = np.stack([difference(pose, poses[0], POSE_KINDS) for pose in poses], axis=1)
-    # nearly equal weights give the same result, and a fine tolerance takes long
+    # the same result for nearly equal weights; a finer tolerance takes long
     change = fuse("ci-determinant", apart, np.stack(covariances, axis=1), tolerance=_CI_TOLERANCE).mean
     turn = Rotation.from_rotvec(change[:, 6:]).as_quat(scalar_first=True)
     return time_ns, np.hstack([poses[0][:, :6] + change[:, :6], compose(poses[0][:, 6:], turn)])
@@ -355,7 +355,7 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
 
 
 def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
-    """Draw position and heading errors by recording, for the units and offsets of the smoother."""
+    """Draw position and heading errors by recording, for the smoother's units and offsets."""
     rows = table[table["estimator"] == options.smoother]
     panels = []
     for name, label in (

@@ -1,9 +1,8 @@
-"""Study of networks under stress: the cost of delays, absence, false estimates and silence for CI.
+"""Study of covariance intersection with delays, absent nodes, false estimates or rare messages.
 
-Each run gives one mean NEES and one mean squared error over its nodes after `settle_s`; intervals are
-over the runs. The claims are ours and were made before their numbers were known: a filter with n states
-is consistent if its mean NEES exceeds n by at most 10 %, with 95 % confidence, as in the study of
-networks.
+Each run has one mean NEES and one mean squared error over its nodes after `settle_s`; intervals are over
+the runs. The claims are ours and were made before the results were known. As in the study of networks, a
+filter with n states is consistent if its mean NEES exceeds n by at most 10 %, with 95 % confidence.
 """
 
 from collections.abc import Mapping
@@ -35,8 +34,8 @@ class StressOptions(Parameters):
     Attributes:
         settle_s: time from the beginning after which errors are evaluated.
         cases: changes to the scenario's parameters, by the name of a case.
-        intervals_s: shortest times between two messages of a node to try, in s.
-        divergences: differences from its last message, in nats, at which a node sends, to try.
+        intervals_s: minimum times in s between two messages of a node to try.
+        divergences: differences in nats from its last message at which a node sends, to try.
         liar: number of the node that sends false estimates.
         lie_after_s: time after which it sends false estimates.
         lies_m: offsets that it adds to its estimates to try, in m.
@@ -191,7 +190,7 @@ def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFra
 
 
 def _refused(replayed: Replayed, options: StressOptions) -> dict[str, dict[int, float]]:
-    """Compute the shares of the liar's and of the other nodes' messages that are rejected, by run."""
+    """Compute the shares of rejected messages of the liar and of the other nodes, by run."""
     [refused] = _of(replayed.outputs, "gated", "/refused")
     shares: dict[str, dict[int, float]] = {"liar_refused": {}, "honest_refused": {}}
     for run, source in enumerate(replayed.sources):

@@ -1,9 +1,9 @@
-"""Study of sensor networks: the cost of each fusion rule in accuracy, consistency and bytes.
+"""Study of sensor networks: the accuracy, consistency and bytes of each fusion rule.
 
-Claims: Jin, Lee, Hashimoto, DIND networks. RMSE (over all runs and steps) and NEES are those after
-`settle_s`, when every node has measured. Ratios are the nodes' mean RMSE over the RMSE of one filter
-with all sensors. Over all steps, ratios are larger, because a node initially knows little more than its
-own measurement.
+Claims: Jin, Lee, Hashimoto, DIND networks. RMSE (over all runs and steps) and NEES are computed after
+`settle_s`, when every node has measured. A ratio is the nodes' mean RMSE divided by the RMSE of one
+filter with all sensors. Over all steps, ratios are larger, because a node initially knows little more
+than its own measurement.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ class NetworkOptions(Parameters):
     Attributes:
         settle_s: time from the beginning after which errors are evaluated.
         losses: probabilities of message loss to try.
-        loss_rules: labels of the estimators to try at each of them.
+        loss_rules: labels of the estimators that are tried at each loss probability.
     """
 
     settle_s: NonNegativeFloat = 1.0
@@ -160,7 +160,7 @@ def _loss_chart(table: pd.DataFrame) -> Chart:
 
 
 def traces_of_equation_17() -> dict[str, float]:
-    """Compute the trace of (17) as printed and of the fused error's covariance, for independent errors.
+    """Compute the trace of (17) as printed and of the fused covariance, for independent errors.
 
     The paper equates P_c^-1 with the bracket, which belongs between two factors P.
     """

@@ -1,4 +1,4 @@
-"""Common parts of studies of ranges: recordings in a folder, their replay, errors against the truth."""
+"""Common parts of studies of ranges: recordings in a folder, their replay, and errors."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,18 +22,17 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """Delays that the data do not state.
+    """Delays that the data do not contain.
 
     Attributes:
-        range_delay_s: age of ranges at their stamps, in addition to an estimator's own
-            `range_delay_s`.
+        range_delay_s: age of a range at its stamp, in addition to an estimator's own `range_delay_s`.
     """
 
     range_delay_s: float = 0.0
 
 
 class Recording(NamedTuple):
-    """One recording: its name, its path, and additional files that belong to it."""
+    """A recording, with its name, its path, and additional files that belong to it."""
 
     name: str
     path: Path

@@ -1,7 +1,7 @@
 """Study of positions from ranges outdoors: uwb_outdoor, compared with published tracks.
 
 Published errors are for a part of each path, which begins and ends when the path enters given regions.
-The truth is interpolated linearly between its rows, without rows whose height differs by half a metre.
+The truth is interpolated linearly between its rows, except rows whose height differs by half a metre.
 Published tracks are evaluated at their stamps, ours at the rows of the truth.
 """
 
@@ -69,11 +69,11 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """The windows, and the selection of the truth.
+    """The windows, and the selection of rows of the truth.
 
     Attributes:
         windows: the part of a path to evaluate, by the name of a folder that contains the recording;
-            the whole path if there is none.
+            the whole path if there is no window.
         level_m: largest distance of a row of the truth from the path's median height.
     """
 
@@ -117,7 +117,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         name = each.recording.name
         paper = (
             printed(each.recording.path) if window else {}
-        )  # errors of other paths are of unknown parts
+        )  # published errors of other paths are for unknown parts
         rows += [{"estimator": label, "recording": name, **figures} for label, figures in own.items()]
         for track, (plane, space) in published.items():
             figures = {"position_rmse_m": plane, "space_rmse_m": space}
@@ -132,7 +132,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[Reference, int, int]:
-    """Return the truth x, y, z, and the stamps to evaluate between; raise BadInput if there are none."""
+    """Return the truth x, y, z, and the first and last stamp to evaluate.
+
+    Raises BadInput if the path does not cross the window.
+    """
     stream = of.source.streams["/truth"]
     time_ns, state = stream.publish_time_ns, stream["state"][:, :3]
     begin, end = 0, len(time_ns) - 1
@@ -153,7 +156,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
 def published_rmse(
     of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
 ) -> tuple[float, float]:
-    """Compute the errors in the plane and in space of a published track within the window."""
+    """Compute the errors of a published track within the window, in the plane and in space."""
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
@@ -161,7 +164,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """Read the errors that come with a recording, by name; empty if there is no such file."""
+    """Read the errors that are published with a recording, by name; empty if there is no such file."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

@@ -1,9 +1,9 @@
-"""Study of the S2KF paper's extended target: an update with multiplicative noise.
+"""Study of the S2KF paper's extended target, whose update has multiplicative noise.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B, Figs. 9 and 10. In addition to the paper's filters, the study runs the S2KF with randomly
-rotated sample sets: a set in eight dimensions is unique only up to a rotation, and the results depend on
-it.
+rotated sample sets: in eight dimensions, a set is unique only up to a rotation, and the results depend
+on this rotation.
 """
 
 from typing import Any
@@ -65,9 +65,9 @@ def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
     """Tabulate errors by estimator and step.
 
-    RMSE of area and position relative to the filter with exact moments (as in the paper) and to the
-    truth; the median area. A half side of -l is the same rectangle as l but flips the area's sign: such
-    runs are counted, and `size` is the absolute area. Failed runs are counted too.
+    The columns are the RMSE of area and position relative to the filter with exact moments (as in the
+    paper) and to the truth, and the median area. A half side of -l is the same rectangle as l but has a
+    negative area. Such runs are counted, and `size` is the absolute area. Failed runs are also counted.
     """
     exact = ensemble.tracks[REFERENCE].mean
     parts = []
@@ -106,7 +106,7 @@ def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
-    """Return every column at every key step; for rotated sets a list, one entry per rotation."""
+    """Return every column at every key step; for rotated sets as a list with an entry per rotation."""
     found: dict[str, MetricValue] = {}
     columns = [name for name in at_keys.columns if name not in ("estimator", "step")]
     own = at_keys[~at_keys["estimator"].str.contains(TURNED)]

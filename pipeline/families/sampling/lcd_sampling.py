@@ -1,4 +1,4 @@
-"""Study of samplings of N(0, I): their distance to it, the cost of LCD sets, and their look.
+"""Study of samplings of N(0, I): their distance to it, the cost of LCD sets, and pictures of them.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V, Figs. 1 and 5. No filter runs here; the logs contain the sample sets.
@@ -54,7 +54,8 @@ class LcdOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `fuselog.pipeline.runs.experiment.Study`."""
     options: LcdOptions = setting.options
-    optimised(2, 3, 1, experiment.seed)  # compile first, so that the first set's time has no compilation
+    # compile first, so that the time of the first set does not include the compilation
+    optimised(2, 3, 1, experiment.seed)
     rows = [
         optimised(dimension, count, options.starts, experiment.seed)
         for dimension, count in setting.progress(options.sizes, "optimising", len(options.sizes))
@@ -77,7 +78,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
-    """Find the best set of several starts: D / pi^(N/2), eigenvalues of the covariance, and cost."""
+    """Find the best set of several starts, with D / pi^(N/2), covariance eigenvalues, and run time."""
     begin = process_time()
     points = lcd_samples(dimension, count, np.random.default_rng(seed), starts=starts)
     seconds = process_time() - begin
@@ -99,10 +100,10 @@ def draw(name: str, seed: int) -> Samples:
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """Compute how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
+    """Compute the distance of 2N+1 LCD samples, raw and moment-corrected, from the UKF's samples.
 
-    This is the largest difference between their sorted distances from each other and from the origin,
-    which no rotation changes.
+    The distance is the largest difference between the sorted distances of samples from each other and
+    from the origin, which a rotation does not change.
     """
     points = lcd_samples(dimension, 2 * dimension + 1, np.random.default_rng(seed), starts=starts)
     wanted = _invariants(unscented(dimension).points)

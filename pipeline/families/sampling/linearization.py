@@ -1,4 +1,4 @@
-"""Common parts of the S2KF paper's studies: filters compared with the one with exact moments.
+"""Common parts of the S2KF paper's studies, which compare filters with the one with exact moments.
 
 An experiment's runs are replayed for several seeds, because errors differ more between seeds than
 between sample sets of one kind; each seed is a separate ensemble.
@@ -52,7 +52,7 @@ class Track(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """Runs of one seed: truth (runs, steps, n) after the start, and each filter's track."""
+    """The runs of a seed, with the truth (runs, steps, n) after the start and each filter's track."""
 
     sources: list[MemorySource]
     truth: Floats
@@ -69,8 +69,8 @@ def ensembles(
 ) -> Iterator[Ensemble]:
     """Record and replay the experiment for every seed; keep the logs of the first seed.
 
-    `extra` estimators are replayed too, but not written; nothing is written unless `written`. Raises
-    BadInput if the reference is not among the estimators.
+    The `extra` estimators are replayed too, but their estimates are not written; nothing is written
+    unless `written`. Raises BadInput if the reference is not among the estimators.
     """
     if REFERENCE not in experiment.estimators:
         raise BadInput(

@@ -1,11 +1,11 @@
-"""Study of the benefit of more samples in a linear regression Kalman filter: 2 to 20 dimensions, drives.
+"""Study of linear regression Kalman filters in 2 to 20 dimensions: the benefit of more samples.
 
-Moments are tested first, without a filter: waves y = sin(k'x + phase) of x ~ N(0, I) have exact ones,
-since
+Moments are tested first, without a filter. The moments of waves y = sin(k'x + phase) of x ~ N(0, I) are
+known exactly, because
 
     E exp(i k'x) = exp(-|k|^2 / 2).
 
-The vectors k point in all directions, or along the axes, as for a sine of the heading. The samplings are
+The vectors k point in all directions or, as for a sine of the heading, along the axes. The samplings are
 those of the experiment's estimators, which then estimate robots and vehicles.
 """
 
@@ -35,7 +35,7 @@ from fuselog.replay.inference.sampling import Sampler, Samples, parse_sampling
 from fuselog.replay.judging.intervals import mean_interval
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
-RATED = "s2kf-100"  # the sampling whose errors are compared with those of the others
+RATED = "s2kf-100"  # the sampling with which the errors of the others are compared
 X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
@@ -123,7 +123,7 @@ def exact(waves: Waves) -> Moments:
 
 
 def sampled(waves: Waves, samples: Samples) -> Moments:
-    """Compute the moments of waves by a sample set (L, n)."""
+    """Compute the moments of waves from a sample set (L, n)."""
     points, weights = samples
     values = np.sin(points @ waves.vectors.T + waves.phases)
     mean = weights @ values
@@ -134,7 +134,7 @@ def sampled(waves: Waves, samples: Samples) -> Moments:
 def moment_errors(
     samplings: Mapping[str, Callable[[int], Sampler]], options: Options, seed: int
 ) -> pd.DataFrame:
-    """Tabulate relative errors of moments by sampling, dimension, direction and function.
+    """Tabulate the relative errors of moments by sampling, dimension, direction and function.
 
     The error of the mean is a root mean square in standard deviations of the function's values; the
     errors of covariances are relative in the Frobenius norm.
@@ -173,7 +173,7 @@ def _relative(found: Floats, wanted: Floats) -> float:
 def driven(
     experiment: Experiment, setting: Setting, name: str, drive: Record
 ) -> tuple[list[MemorySource], pd.DataFrame]:
-    """Record a scenario and keep its runs in a folder of its name; tabulate by estimator and run.
+    """Record a scenario, keep its runs in a folder of its name, and tabulate by estimator and run.
 
     A row has the state's dimension, the RMSE of the position, the mean NEES per component, and the CPU
     time of all cores per second of a run, in ms, averaged over all runs.
@@ -216,7 +216,7 @@ def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
-    """Measure errors by drive, and the change (%) of the position error with other samples."""
+    """Measure errors by drive, and the change of the position error in % with other samples."""
     found = outcome.metrics
     for drive, of_drive in runs.groupby("drive", sort=False):
         quantities = ["position_rmse_m", "nees_per_component", "samples"]
@@ -253,7 +253,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """Draw a line for each family of samplings, and the EKF, which has no samples, as a level."""
+    """Draw a line for each family of samplings, and a level for the EKF, which has no samples."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

@@ -1,8 +1,8 @@
-"""Study of the S2KF paper's batch reactor: nonlinear prediction compared with the exact moments.
+"""Study of the S2KF paper's batch reactor, a nonlinear prediction compared with exact moments.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A, Fig. 7. The paper's statements are tested for the prior mean as printed, (0.5, 3.5), and
-for the two numbers swapped: only the swapped numbers reproduce the figure's curves.
+for the swapped numbers. Only the swapped numbers reproduce the curves of the figure.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ from fuselog.pipeline.runs.inputs import Record
 from fuselog.recorders.errors import BadInput
 
 CASES = {"printed": "prior as printed", "swapped": "prior swapped"}
-EARLY = 5  # steps that count as the beginning
+EARLY = 5  # number of steps that count as the beginning
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -62,8 +62,9 @@ def _in_case(experiment: Experiment, case: str) -> Experiment:
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
     """Tabulate errors by estimator and step.
 
-    RMSE of mean and covariance relative to the filter with exact moments (as in the paper), RMSE of the
-    mean relative to the truth, and the filter's own variance relative to the exact one.
+    The columns are the RMSE of mean and covariance relative to the filter with exact moments (as in the
+    paper), the RMSE of the mean relative to the truth, and the ratio of the filter's variance to the
+    exact one.
     """
     exact = ensemble.tracks[REFERENCE]
     own = np.nanmean(np.trace(exact.covariance, axis1=2, axis2=3), axis=0)

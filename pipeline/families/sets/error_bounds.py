@@ -1,6 +1,6 @@
-"""Bounds of a robot's errors from the other robots of its log, whose truth gives their errors.
+"""Bounds of a robot's errors, computed from the errors of the other robots in its log.
 
-So no bound depends on the truth of the evaluated robot. The bounds are written to the channels.
+Therefore no bound depends on the truth of the evaluated robot. The bounds are written to the channels.
 """
 
 from collections.abc import Sequence
@@ -23,19 +23,19 @@ from fuselog.replay.families.sets.regions.moving_sets import Growth, odometry_of
 
 Floats = NDArray[np.float64]
 
-# Time spans over which odometry is compared with the truth; those up to SHORT_S give the bound's offset.
+# Time spans over which odometry is compared with the truth; spans up to SHORT_S determine the offset.
 SPANS_S = (0.25, 1.0, 2.0, 5.0, 10.0, 20.0)
 SHORT_S = 2.0
 SPAN_STEP_S = 0.5
 
 
 class BoundOptions(Parameters):
-    """How bounds follow from errors.
+    """The rules by which bounds are computed from errors.
 
     Attributes:
-        margin: factor from odometry's largest error to its bound.
-        bearing_quantile: quantile of bearing errors that is the bound, since a misidentified landmark
-            may give any error.
+        margin: ratio of the bound to odometry's largest error.
+        bearing_quantile: quantile of bearing errors that is the bound, because a misidentified landmark
+            may cause any error.
     """
 
     margin: PositiveFloat = 1.2
@@ -44,7 +44,7 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """One robot's errors: bearings and differences (n,); odometry, largest by time span (spans, 2)."""
+    """The errors of a robot: of bearings and differences (n,); largest of odometry (spans, 2)."""
 
     bearing_rad: Floats
     relative_rad: Floats
@@ -54,7 +54,7 @@ class RobotErrors:
 def state_bounds(
     sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
 ) -> list[MemorySource]:
-    """Write the bounds of the other robots' errors, over all runs, to each robot's channels.
+    """Write bounds of the other robots' errors, over all runs, to each robot's channels.
 
     Raises BadInput if fewer than two robots have odometry, bearings and truth.
     """

@@ -1,6 +1,6 @@
-"""Study of guaranteed sets over time: area, containment, benefit of the past, isolated faults.
+"""Study of guaranteed sets over time: area, containment, benefit of the past, isolation of faults.
 
-Estimators are compared on the frames in which all of them have a set or an ellipse; intervals are over
+Estimators are compared on the frames in which all of them have a set or an ellipse. Intervals are over
 the robots.
 """
 
@@ -32,7 +32,8 @@ from fuselog.replay.judging.intervals import mean_interval
 ELLIPSE = 0.99
 FRAMES, FILTER, L8, EKF, BEARINGS = "frames", "filter", "filter-l8", "ekf", "ekf-bearings"
 KEYS = ["case", "run", "time_ns"]
-FEWEST_ROBOTS = 3  # for an interval of the mean share: `set-filter` has no more over all its runs
+# fewest robots for an interval of the mean share; `set-filter` has no more over all its runs
+FEWEST_ROBOTS = 3
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -153,7 +154,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Count how often the faulty one of a frame and the past is isolated correctly, by filter."""
+    """Count how often the filter correctly decides whether a frame or the past is faulty."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())

@@ -1,7 +1,7 @@
-"""Study of set-valued fixes: areas, containment of the truth, faults.
+"""Study of set-valued fixes, by their areas, containment of the truth, and faults.
 
-The paper, Briechle, Hanebeck (2004), has figures without numbers. If the experiment is simulated,
-section V is recorded in addition to the experiment's own runs.
+The paper, Briechle, Hanebeck (2004), has figures without numbers. If the experiment is simulated, the
+scene of section V is recorded in addition to the experiment's own runs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
-    """Tabulate by estimator, case, run and frame."""
+    """Tabulate areas and containment by estimator, case, run and frame."""
     parts = [
         pd.DataFrame(
             {
@@ -93,7 +93,7 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
 
 
 def _without_errors(runner: Runner) -> dict[str, MetricValue]:
-    """Compute the ratios of the same scenes without errors, for which the exact sets are largest."""
+    """Compute the ratios for the same scenes without errors, in which the exact sets are largest."""
     replayed = runner.replay(runner.obtain({"error_share": 0.0}))
     gap_limit_s = runner.experiment.gap_limit_s
     return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)

@@ -1,7 +1,7 @@
-"""Study of tracks of reports without identities: which vessels kept one track of their own.
+"""Study of tracks of reports without identities: which vessels kept a track of their own.
 
-The identities in the log are used only for evaluation. A vessel's own track is the one assigned to it if
-tracks and vessels are paired one to one: see `fuselog.replay.families.tracking.judging.tracks`.
+The identities in the log are used only for evaluation. A vessel's own track is the one that a one-to-one
+assignment of tracks to vessels selects; see `fuselog.replay.families.tracking.judging.tracks`.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ from fuselog.replay.judging.metrics.measuring import Output
 
 
 class AisOptions(Parameters):
-    """How tracks are counted.
+    """Options for counting tracks.
 
     Attributes:
         live_s: time after a report for which a track counts as live.

@@ -1,8 +1,8 @@
-"""Study of Autoferry scenarios: the benefit of each sensor for tracks of vessels, and of associations.
+"""Study of Autoferry scenarios: the benefit of each sensor and of data association for vessel tracks.
 
-Quays, marks and other craft have no reference: GOSPA ignores everything farther than 50 m from both
-vessels. Trackers are replayed in stamp order, and some also in order of arrival, with each policy for
-late scans.
+Quays, marks and other craft have no reference, so GOSPA ignores everything more than 50 m from both
+vessels. Trackers are replayed in stamp order. Some are also replayed in order of arrival, with each
+policy for late scans.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ class AutoferryOptions(Parameters):
     Attributes:
         compared: pairs of estimators to compare, the first with the second.
         late: policies for late scans to try in order of arrival.
-        late_estimators: labels of the estimators that are replayed with these; estimators that the
+        late_estimators: labels of the estimators that are replayed with these policies; estimators that
             experiment does not run are ignored.
     """
 
@@ -123,7 +123,7 @@ def _late_table(
 
 
 def _last_late_ns(source: MemorySource) -> int:
-    """Return when the last late scan of a run arrived; 0 if none is late."""
+    """Return when the last late scan of a run arrived; 0 if there are no late scans."""
     arrivals = [
         stream.log_time_ns[stream.log_time_ns > stream.publish_time_ns]
         for topic, stream in source.streams.items()
@@ -135,7 +135,7 @@ def _last_late_ns(source: MemorySource) -> int:
 def _farthest(
     in_order: Mapping[str, Ragged], outputs: Mapping[str, Ragged], label: str, run: int, from_ns: int
 ) -> float:
-    """Compute the largest distance between the tracks of two replays, from a time on."""
+    """Compute the largest distance between the tracks of two replays after a time."""
     sizes, tracks = sets_of(in_order, label, run)
     stamps = np.unique(sizes.publish_time_ns)
     stamps = stamps[stamps >= from_ns]

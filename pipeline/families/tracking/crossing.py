@@ -1,4 +1,4 @@
-"""Study of simulated crossing targets: the benefit of associations in clutter.
+"""Study of simulated crossing targets: the benefit of data association in clutter.
 
 Every case has a clutter rate and a detection probability; the targets of a run and their true
 trajectories are the same in all cases.

@@ -1,11 +1,12 @@
 """Export of tracks and truths in the format of the MOT Challenge, which TrackEval reads.
 
-Frames are every half second from the run's epoch on; the first has number 1. Tracks are predicted to a
-frame, truths interpolated. A target has no extent: its box begins at its position, in metres, and has
-zero width and height. Use TrackEval's similarity by Euclidean distance of points, not by overlap.
+Frames are every half second from the run's epoch on; the first has number 1. Tracks are predicted to the
+frames, and truths are interpolated. A target has no extent: its box begins at its position, in metres,
+and has zero width and height. In TrackEval, use similarity by Euclidean distance of points, not by
+overlap.
 
     frame,id,x,y,0,0,1,-1,-1,-1      a track
-    frame,id,x,y,0,0,1,1,1           a truth; the last three: it counts, class 1, fully visible
+    frame,id,x,y,0,0,1,1,1           a truth; the last three mean counted, class 1, fully visible
 
 Dendorfer et al., "MOTChallenge: a benchmark for single-camera multiple target tracking", IJCV 129, 2021.
 """
@@ -26,10 +27,10 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """Return topics and lines by file name: a file of each tracker's tracks, and one of all truths.
+    """Return topics and lines by file name, with a file of tracks per tracker and one of all truths.
 
-    `topics` are the wanted topics, or empty for all. Raises BadInput if a topic does not exist or has
-    neither tracks nor truths in the plane, or if there are none.
+    `topics` contains the wanted topics, or is empty for all. Raises BadInput if a topic does not exist
+    or has neither tracks nor truths in the plane, or if no topic has them.
     """
     unknown = [topic for topic in topics if topic not in log.topics]
     if unknown:

@@ -1,4 +1,4 @@
-"""Common parts of studies of trackers: tracks evaluated by run, and differences between trackers.
+"""Common parts of studies of trackers: evaluation of tracks by run, and comparison of trackers.
 
 Tracks are evaluated as in `fuselog.replay.families.tracking.judging.errors`, at instants that are the
 same for all trackers.
@@ -31,7 +31,7 @@ from fuselog.replay.families.tracking.judging.errors import (
 from fuselog.replay.judging.errors.evaluation import Innovations
 from fuselog.replay.judging.intervals import Interval, mean_interval
 
-# The quantities whose differences are measured.
+# The quantities in which trackers are compared.
 COMPARED = (
     *("gospa_m", "localisation_m2", "switches", "target1_rmse_m", "target1_coverage"),
     *("target2_rmse_m", "target2_coverage", "target5_rmse_m"),
@@ -63,7 +63,8 @@ def figures_of(
 
     Args:
         tracked: the tracks at k instants.
-        truths: (targets, k, 2), positions of the targets at these, in m; NaN if a target is absent.
+        truths: (targets, k, 2), positions of the targets at these instants, in m; NaN if a target is
+            absent.
         unreferenced_m: see `Judged`.
 
     Returns:
@@ -115,7 +116,7 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
 def measure_changes(
     table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
 ) -> None:
-    """Measure by how much quantities of one estimator exceed those of another, for the given pairs."""
+    """Measure the differences in quantities between the given pairs of estimators."""
     for label, other in pairs:
         if {label, other} <= set(table["estimator"]):
             for quantity in [name for name in COMPARED if name in table]:
@@ -125,6 +126,6 @@ def measure_changes(
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
-    """Compute by how much a quantity of one estimator exceeds that of another, over the runs."""
+    """Compute the difference in a quantity between two estimators, over the runs."""
     by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
     return mean_interval(by_run[label] - by_run[other])

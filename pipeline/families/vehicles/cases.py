@@ -1,4 +1,4 @@
-"""Cases of cooperative vehicles: each estimator's errors, by run and by step."""
+"""Cases of cooperative vehicles, with each estimator's errors by run and by step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """The cases and the estimators to compare with.
+    """The cases, and the estimators for comparison.
 
     Attributes:
         cases: changes to the scenario's parameters, by the name of a case.
@@ -47,10 +47,10 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+    """Total errors (20) of every run (runs,), with fixed labels and with the best labels.
 
-    By step: the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps). `failed` counts runs that
-    did not reach the end. For sets, which have no labels, errors with fixed labels are NaN.
+    By step, these are the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps). `failed` counts
+    runs that did not reach the end. Sets have no labels, so their errors with fixed labels are NaN.
     """
 
     fixed: Floats
@@ -67,7 +67,7 @@ class Scores(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One case: its runs, each estimator's scores by label, and the bytes that each sends per step."""
+    """A case with its runs, and each estimator's scores and bytes per step, by label."""
 
     name: str
     sources: Sequence[MemorySource]
@@ -137,7 +137,7 @@ def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
 def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
     """Compute the total errors of a set estimate.
 
-    A vehicle without its own element is assigned the nearest one.
+    A vehicle without an element of its own is assigned the nearest element.
 
     Args:
         outputs: outputs by topic.
@@ -165,7 +165,7 @@ def scores_of(
     labels: Iterable[str],
     others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
-    """Compute the scores of all estimators; for sets, those of the network's fixes."""
+    """Compute the scores of all estimators; for sets, use the scores of the network's fixes."""
     times_ns, truths = truths_of(sources)
     sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
@@ -182,7 +182,7 @@ def bytes_per_step(
 ) -> dict[str, float]:
     """Compute the mean number of bytes sent per scan of the network, by estimator.
 
-    Fixes have an identity only if the association must be known. The infrastructure sensor sends
+    Fixes contain an identity only if the association must be known. The infrastructure sensor sends
     nothing, its one number, or its detections.
     """
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]

@@ -1,8 +1,8 @@
 """Study of how time and error of vehicles' filters grow with the number of vehicles.
 
-Vehicles start anywhere in a square: one that grows with their number, so that their density is constant,
-or one so small that any fix may be of any vehicle. Growth is described by a factor per vehicle for
-exponential methods, and by a power otherwise.
+Vehicles start at random in a square. Its area grows with their number, so that their density is
+constant, or it is so small that any fix may belong to any vehicle. Growth is described by a factor per
+vehicle for exponential methods, and by a power otherwise.
 """
 
 import time
@@ -28,12 +28,12 @@ TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
-    """The largest number of vehicles of a method, and the expected growth of its work.
+    """The largest number of vehicles for a method, and the expected growth of its computing time.
 
     Attributes:
         most: largest number of vehicles.
         place: whether vehicles start apart, or together in one square.
-        growth: expected growth of its work with the number of vehicles.
+        growth: expected growth of the computing time with the number of vehicles.
     """
 
     most: PositiveInt
@@ -42,7 +42,7 @@ class Swept(Parameters):
 
 
 class ScalingOptions(Parameters):
-    """The numbers of vehicles, and where they start.
+    """The numbers of vehicles, and the areas in which they start.
 
     Attributes:
         vehicles: numbers of vehicles.
@@ -110,7 +110,7 @@ def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> 
 def _timed(
     sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
 ) -> tuple[float, float, int]:
-    """Measure a step's CPU time in ms, the assigned RMSE of a vehicle in m, and the failed runs."""
+    """Measure CPU time per step in ms, assigned RMSE of a vehicle in m, and number of failed runs."""
     chosen = {label: estimators[label]}
     replay_in_memory(sources[:1], chosen)  # compile first
     begin = time.process_time()
@@ -128,7 +128,7 @@ def _timed(
 def growth_of(table: pd.DataFrame) -> Growth:
     """Fit the growth to the larger half of the numbers of vehicles, for which constant costs are small.
 
-    Steps too short for the clock, with a measured time of 0, are ignored.
+    Steps that are too short for the clock, with a measured time of 0, are ignored.
     """
     own = table[(table["vehicles"] >= table["vehicles"].median()) & (table["step_ms"] > 0)]
     if len(own) < 2:

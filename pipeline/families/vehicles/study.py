@@ -1,4 +1,4 @@
-"""Study of cooperative vehicles: total errors by method, bounds and bandwidth.
+"""Study of cooperative vehicles, by total error, error bounds and bandwidth of each method.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016.
@@ -133,7 +133,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_bytes(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate the bytes that each method sends per step, and those of exchanging all tracks."""
+    """Tabulate the bytes that each method sends per step, and those of sending all tracks."""
     rows = [(case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()]
     for case in cases:
         tracks = TRACK_BYTES * _vehicles(case)

@@ -1,4 +1,4 @@
-"""A study of a GNSS receiver with an inertial unit: how well they bridge outages in a recording.
+"""A study of how well a GNSS receiver with an inertial unit bridges outages in a recording.
 
 Fixes with errors of centimetres are withheld in many windows of a recording. The estimates of a filter
 and a smoother are compared with the withheld fixes, and with two methods without an inertial unit:
@@ -45,7 +45,7 @@ from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # for three degrees of freedom
-RUNS_AT_ONCE = 2  # limits memory
+RUNS_AT_ONCE = 2  # limit on memory
 
 
 class GnssInsOptions(Parameters):
@@ -58,9 +58,9 @@ class GnssInsOptions(Parameters):
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.
-        apart: windows in the same run start `apart` times `every_s` after one another.
+        apart: multiple of `every_s` between the starts of windows that share a run.
         settle_s: time after the first inertial sample from which fixes are used.
-        innovations_from_s: time after the receiver's first row from which innovations count.
+        innovations_from_s: time after the receiver's first row from which innovations are counted.
     """
 
     filter: str = "ekf"
@@ -75,7 +75,7 @@ class GnssInsOptions(Parameters):
 
 
 class Innovations(NamedTuple):
-    """NIS of one kind of measurement at good fixes: mean, share above the 95 % limit, mean by axis."""
+    """NIS of a kind of measurement at good fixes: mean, share above the 95 % limit, mean by axis."""
 
     nis: float
     share_above: float
@@ -149,9 +149,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """Find the folder at or below --data that has all files of the mapping.
+    """Find the only folder at or below --data that has all files of the mapping.
 
-    Raises BadInput if there are several.
+    Raises BadInput if there are several such folders.
     """
     assert setting.data is not None
     assert experiment.import_ is not None

@@ -1,4 +1,4 @@
-"""A study of grades of inertial units: how position errors grow during an outage of the receiver.
+"""A study of the growth of position errors during an outage, by grade of the inertial unit.
 
 The same drives, with an outage in the middle, are recorded with units of several grades. The largest
 error of n runs exceeds the q-quantile of the errors with the probability 1 - q^n: 0.95 for 59 runs and
@@ -21,7 +21,7 @@ from fuselog.recorders.simulators.navigation_parameters import NavigationParamet
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.errors.evaluation import Errors
 
-AFTER_S = (10.0, 20.0, 30.0)  # times since the last fix whose errors become metrics
+AFTER_S = (10.0, 20.0, 30.0)  # times in s since the last fix at which errors are metrics
 
 
 class Options(Parameters):

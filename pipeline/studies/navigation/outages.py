@@ -1,4 +1,4 @@
-"""Artificial outages of a receiver: withheld fixes of a recording, and errors at them.
+"""Artificial outages of a receiver, in which the fixes of a recording are withheld.
 
 A window is a span in which all fixes and velocities are withheld, by the times of the receiver's rows.
 Windows that are far enough apart share a run. Errors are horizontal, at the withheld rows.
@@ -28,7 +28,7 @@ _GAP_S = 1.0
 
 
 class Rows(NamedTuple):
-    """The output of the receiver, a row per fix, with east and north components.
+    """The output of the receiver with a row per fix, and with east and north components.
 
     Attributes:
         time_ns: stamps as written by the receiver, (n,).
@@ -68,7 +68,7 @@ def rows_of(source: MemorySource) -> Rows:
                 f"{source.name}: has no messages of {topic}{why}; this study needs {', '.join(NEEDED)}"
             )
     fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
-    # log times are used, since a delay in the mapping changes only publish times
+    # log times are used, because a delay in the mapping changes only publish times
     time_ns = fix.log_time_ns
     place, speed = np.full((len(fix), 2), np.nan), np.full((len(fix), 2), np.nan)
     for into, stream, values in (

@@ -1,6 +1,6 @@
 """A study of consistency: whether errors agree with the covariances after an estimator is aligned.
 
-In addition to the metrics of `localization`, it gives the share of stamps from `aligned_s` on at which
+In addition to the metrics of `localization`, it has the share of stamps from `aligned_s` on at which
 the mean NEES of the runs is within its 95 % interval, and the mean of these NEES. Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
 """
@@ -14,7 +14,7 @@ from fuselog.recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
-    """When estimators count as aligned.
+    """The time from which estimators count as aligned.
 
     Attributes:
         aligned_s: time since the run's epoch from which estimates are judged.

@@ -1,4 +1,4 @@
-"""Repetitions of a paper's Monte Carlo experiment: step k of all runs of an ensemble is one repetition.
+"""Repetitions of a paper's Monte Carlo experiment, where step k of all runs is one repetition.
 
 A log can contain the same experiment several times, with new noise and one estimate each time. An
 ensemble of 100 runs with 10 steps thus repeats a paper's 100 runs ten times, and a rule that the paper
@@ -79,7 +79,7 @@ def rmse_of_runs(errors: Errors, runs: int) -> Floats:
 
 
 def table_of_runs(quantity: str, cases: Mapping[str, Mapping[str, Floats]]) -> pd.DataFrame:
-    """Make the table by which reports compare estimators, with a row per estimator, case and run.
+    """Make a table with a row per estimator, case and run, with which reports compare estimators.
 
     Args:
         quantity: name of the listed quantity, as in the metrics.
