@@ -14,13 +14,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fuselog.pipeline.calibrating.car import NAMES, WIDE, drive, recorded
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.information import information
-from fuselog.pipeline.tuning.objective import Run, in_memory
+from fuselog.pipeline.tuning.objective import Run
 from fuselog.pipeline.tuning.outcome import TUNED, Tuning
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Schema, Stream, schemas, topics_of
 from fuselog.recorders.simulators.car import MOTIONS
-from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import Source
 
@@ -88,7 +88,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
     gains = {"none": gain(known, 0.0 * known)}
     for name in MOTIONS:
         run = _simulated(found, log, name)
-        simulated = replace(objective, settings=found.settings[TUNED], runs=[run], pool=None)
+        simulated = replace(objective, runs=[run], pool=None)
         simulated.begin(values)
         gains[name] = gain(known, information(simulated, values, useful, places))
     rows = [(name, each.nats, each.widest, *each.sigmas * scale) for name, each in gains.items()]
@@ -142,8 +142,7 @@ def _simulated(found: Tuning, log: Source, motion: str) -> Run:
             name = topic if prior is None else prior.topic
             made[name] = replace(stream, topic=name)
     simulated = replace(source, streams=made)
-    bound = bind(found.label, Ensemble([simulated]), found.settings[TUNED])
-    return in_memory(simulated, bound)
+    return Run(Trial(found.label, Ensemble([simulated]), found.settings[TUNED]))
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:

@@ -21,12 +21,12 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Fit, Supposed, corrected, fit, promised
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.search import NUMBER_COST, Peak, peak, rival
 from fuselog.pipeline.optimise import DROP_95, QUANTILE, curvature, end, side_by_side
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats
-from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.intervals import Interval
 
@@ -732,13 +732,12 @@ def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: in
 
     Raises BadInput if the estimator cannot be replayed.
     """
-    likelihood, base = Likelihood(label), Trial(source, settings)
+    likelihood, base = Likelihood(), Trial(label, [source], settings)
     seen = likelihood.begin(base)
     [before] = likelihood([base])
     if not np.isfinite(before):
         return Sought()
-    bound = bind(label, [source], settings)
     causes, tried, in_doubt = find_causes(
-        likelihood, base, hypotheses(bound, base, seen, likelihood.readings), most
+        likelihood, base, hypotheses(base.bound, base, seen, likelihood.readings), most
     )
     return Sought(_over_halves(likelihood, base, causes), tried, in_doubt, before)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.search import WIDE, Peak
 from fuselog.pipeline.optimise import curvature, profile_ends
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.confidence import confidence
 from fuselog.pipeline.tuning.search import (
     CURVATURE_STEP,

@@ -15,11 +15,12 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
@@ -31,7 +32,7 @@ from fuselog.pipeline.tuning.broad_starts import (
 from fuselog.pipeline.tuning.control_noise import disturbed
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
-from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
+from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource
@@ -42,18 +43,6 @@ MOST_MESSAGES = 300_000  # largest number of messages of the runs that are repla
 EVER_NS = 2**62
 ROOM_NS = 86_400 * 10**9  # room for earlier stamps
 LEAST_SCORED = 0.5  # share of the measurements; a trial that scores fewer cannot be compared
-
-
-class Trial(NamedTuple):
-    """A run and settings of the estimator that are assumed to be possible.
-
-    `stretched` is, by topic, the logarithm of the volume of measurements relative to the log's, because
-    other units change the density of the numbers.
-    """
-
-    source: MemorySource
-    settings: Mapping[str, Any]
-    stretched: Mapping[str, float] = {}
 
 
 class Scored(NamedTuple):
@@ -95,7 +84,6 @@ class Likelihood:
     Trials whose estimators differ only in numbers are replayed together, like the runs of an ensemble.
 
     Attributes:
-        label: the estimator's label.
         volumes: by topic, the ranges (m,) of the innovations' components, in which outliers are uniform.
         count: by estimate, the number of innovations, including those of the broad model.
         starts: the common start of all trials, if the log contains none.
@@ -104,7 +92,6 @@ class Likelihood:
         later_ns: shift of all stamps, so that no alteration moves them to before 1970.
     """
 
-    label: str
     volumes: Mapping[str, Floats] = field(default_factory=dict)
     count: Mapping[str, int] = field(default_factory=dict)
     starts: Starts = field(default_factory=dict)
@@ -173,9 +160,10 @@ class Likelihood:
                     found[place] = self._totals(part, of_run, count)
         return found
 
-    def disturbed(self, trial: Trial) -> list[MemorySource]:
-        """Copy a trial's log with noise added to the controls."""
-        return disturbed(trial.source, self._bound_to(trial))
+    def disturbed(self, trial: Trial) -> list[Trial]:
+        """Copy a trial with noise added to the controls of its log."""
+        copies = disturbed(trial.source, self._bound_to(trial))
+        return [replace(trial, runs=[each]) for each in copies]
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
         """Divide trials into groups that fit in memory."""
@@ -186,7 +174,7 @@ class Likelihood:
     def _bound_to(self, trial: Trial, key: Hashable = None) -> list[Bound]:
         key = key or (_key(trial), _stated_by(trial))
         if key not in self._bound:
-            self._bound[key] = bind(self.label, [trial.source], trial.settings)
+            self._bound[key] = trial.bound
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:

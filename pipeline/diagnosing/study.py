@@ -16,12 +16,13 @@ from pydantic import NonNegativeInt
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.battery import battery
 from fuselog.pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.sentences import cause_of, names_of
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters, merge
@@ -269,10 +270,10 @@ def _recorded(
 
 def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: MemorySource) -> float:
     """Compute the gain in log-likelihood from removing the fault; 0 if measurements are lost."""
-    likelihood = Likelihood(scenario.estimator)
-    settings = {"kind": scenario.estimator, **OPEN}
-    likelihood.begin(Trial(faulty, merge(settings, fault.settings)))
-    before, after = likelihood([Trial(faulty, merge(settings, fault.settings)), Trial(source, settings)])
+    likelihood, settings = Likelihood(), {"kind": scenario.estimator, **OPEN}
+    with_fault = Trial(scenario.estimator, [faulty], merge(settings, fault.settings))
+    likelihood.begin(with_fault)
+    before, after = likelihood([with_fault, Trial(scenario.estimator, [source], settings)])
     return max(after - before, 0.0)
 
 

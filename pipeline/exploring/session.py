@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import tomli_w
@@ -20,13 +21,14 @@ from fuselog.pipeline.exploring.sliders import Slider, setting_text, sliders_of
 from fuselog.pipeline.exploring.verdict import Summary, verdict_of
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.runs.settings import parameters_by_label, with_settings
-from fuselog.pipeline.tuning.objective import Run, in_memory
+from fuselog.pipeline.runs.trials import Trial, with_values
+from fuselog.pipeline.tuning.objective import log_in_memory
 from fuselog.pipeline.tuning.tuning import OPEN, gate_of, tune
 from fuselog.recorders.atomic import scratch_folder
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.recorders.parameters import field_of, flat, merge, nested
-from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bind
-from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.recorders.parameters import field_of, flat, merge
+from fuselog.replay.engine.replaying.estimator import Estimator, bind
+from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.foreign.naming import allowed, name_of
 from fuselog.replay.inference.all_methods import METHODS, modelled
@@ -73,19 +75,22 @@ class Session:
     filters: dict[str, dict[str, Any]]
     gap_limit_s: float = 0.2
     estimated: Mapping[str, float] = field(default_factory=dict)
-    _run: Run = field(init=False)
+    _log: Ensemble[MemorySource] = field(init=False)
     sliders: list[Slider] = field(init=False)
 
     def __post_init__(self) -> None:
         """Bind all filters, and read their topics into memory; raise BadInput as a replay does."""
-        bound = {label: self._bound(label, {}, [self.source]) for label in self.filters}
-        self._run = in_memory(self.source, [one for each in bound.values() for one in each])
+        bound = {
+            label: bind(label, [self.source], {"kind": label, **self.settings(label, {})})
+            for label in self.filters
+        }
+        self._log = log_in_memory(self.source, chain.from_iterable(bound.values()))
         self.sliders = sliders_of(self.source, {label: each[0] for label, each in bound.items()})
 
     @property
     def log(self) -> MemorySource:
         """Return the part of the log that is in memory."""
-        return self._run.ensemble[0]
+        return self._log[0]
 
     def slider(self, name: str) -> Slider:
         """Return the slider of a parameter; raise BadInput if it has none."""
@@ -138,9 +143,9 @@ class Session:
         filter refuses the parameters, or cannot begin.
         """
         begin = time.perf_counter()
-        bound = self._bound(label, values, self._run.ensemble)
-        outputs = collect(replay(self._run.ensemble, bound))
-        judge = Judge(self._run.ensemble, gap_limit_s=self.gap_limit_s)
+        trial = self._trial(label, values)
+        bound, outputs = trial.bound, trial.outputs()
+        judge = Judge(self._log, gap_limit_s=self.gap_limit_s)
         judged = judge.add(outputs)
         estimated = self.settings(label, values).get("estimate", ())
         cases = cases_of(outputs, judged.errors, self.source.epoch_ns, estimated)
@@ -169,8 +174,7 @@ class Session:
 
     def _likelihoods(self, label: str, values: Values) -> dict[str, float]:
         """Compute the log-likelihood of each case with a replay that is not judged."""
-        outputs = collect(replay(self._run.ensemble, self._bound(label, values, self._run.ensemble)))
-        cases = cases_of(outputs, [], self.source.epoch_ns)
+        cases = cases_of(self._trial(label, values).outputs(), [], self.source.epoch_ns)
         return {name: case.log_likelihood for name, case in cases.items()}
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
@@ -203,14 +207,12 @@ class Session:
             viewer.view(rrd, at_s=at_s)
 
     def settings(self, label: str, values: Values) -> dict[str, Any]:
-        """Return the settings of a filter, including the given values of its parameters."""
-        own = self.filters[label]
+        """Return the settings of a filter, with values for those parameters that it has."""
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
-        for name, value in taken.items():
-            own = merge(own, nested(name, value))
+        own = with_values(self.filters[label], taken)
         if self.estimated:
             own = merge(own, {"estimate": [*self.estimated], "estimate_sigma": dict(self.estimated)})
-        return dict(own)
+        return own
 
     def toml(self, values: Values) -> str:
         """Write the settings of all filters as a settings file for `--settings`.
@@ -248,10 +250,8 @@ class Session:
             words += [f"--set estimate_sigma.{name}={sigma!r}" for name, sigma in sigmas.items()]
         return " ".join([*words, *setting_text(values)])
 
-    def _bound(
-        self, label: str, values: Values, sources: Sequence[LogSource | MemorySource]
-    ) -> list[Bound]:
-        return bind(label, sources, {"kind": label, **self.settings(label, values)})
+    def _trial(self, label: str, values: Values) -> Trial:
+        return Trial(label, self._log, {"kind": label, **self.settings(label, values)})
 
     def _takes(self, label: str, name: str) -> bool:
         [names] = parameters_by_label({label: self.filters[label]}).values()

@@ -18,11 +18,11 @@ from fuselog.pipeline.runs.initial_states import order_of
 from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import LogWriter, RunMetadata, open_log
+from fuselog.recorders.log import LogWriter, open_log
 from fuselog.recorders.parameters import merge
 from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.streams.blocks import Ragged, gather
-from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed, memory_source
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory, memory_source
 from fuselog.replay.judging.judge import Judge
 
 
@@ -62,7 +62,7 @@ class Runner:
             return [memory_source(*import_run(source.source, setting.data, source.parameters))]
         if experiment.logs:
             files = experiment.files[first_run:][:runs]
-            return [_in_memory(LogSource(open_log(file))) for file in files]
+            return [in_memory(LogSource(open_log(file))) for file in files]
         if not experiment.record:
             raise BadInput(
                 f"experiment '{experiment.title}': there is no data; add one of the tables [record], "
@@ -191,13 +191,6 @@ class Runner:
         """Return the paths of a run's log and estimates."""
         name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
         return place / "logs" / name, place / "estimates" / name
-
-
-def _in_memory(source: LogSource) -> MemorySource:
-    """Read a log's streams, except estimates and messages without columns."""
-    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    topics = [topic for topic in source.topics if is_sensed(source, topic)]
-    return MemorySource(source.read(topics), run, source.name, rejections=source.rejections)
 
 
 def _write_log(source: MemorySource, path: Path) -> None:

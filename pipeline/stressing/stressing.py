@@ -22,9 +22,8 @@ from fuselog.pipeline.stressing.changes import (
 from fuselog.pipeline.stressing.copies import How, compared, replayed, with_parameters
 from fuselog.pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
-from fuselog.replay.engine.streams.sources import LogSource, MemorySource, is_sensed
+from fuselog.replay.engine.streams.sources import MemorySource, in_memory
 from fuselog.replay.foreign.naming import allowed
 
 MOST_HALVED, MOST_REPLAYS = 3, 12
@@ -70,7 +69,7 @@ def stress(
     settings = settings_of(estimators)
     if given:
         settings = with_settings(settings, allowed(given))
-    sources = [_in_memory(source) for source in sources_of(logs, alterations)]
+    sources = [in_memory(source) for source in sources_of(logs, alterations)]
     found = stress_runs(sources, settings, How(seed, gap_limit_s))
     for label in settings:
         own = [each for each in found if each.estimator == label]
@@ -104,14 +103,6 @@ def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -
                 stressed = _stressed([sources[run] for run in own], label, values, how)
                 found |= {(run, label): each for run, each in zip(own, stressed, strict=True)}
     return [found[run, label] for run in range(len(sources)) for label in settings]
-
-
-def _in_memory(source: LogSource | MemorySource) -> MemorySource:
-    if isinstance(source, MemorySource):
-        return MemorySource(source.streams, source.run, source.name, source.start_ns, source.end_ns)
-    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    topics = [topic for topic in source.topics if is_sensed(source, topic)]
-    return MemorySource(source.read(topics), run, source.name, source.start_ns, source.end_ns)
 
 
 def _stressed(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.pipeline.runs.executors import WorkerPool, threads
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
@@ -28,14 +29,13 @@ from fuselog.pipeline.tuning.broad_starts import (
 )
 from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import RunMetadata, Stream, schemas, topics_of
-from fuselog.recorders.parameters import merge, nested
-from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive, bind
+from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.failures import sentences_of
-from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory
 from fuselog.replay.judging.consistency.whiteness import whitened
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.measuring import Sums, plus
@@ -47,37 +47,29 @@ INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
 class Run(NamedTuple):
-    """A log in memory that is replayed repeatedly.
+    """A log that is replayed repeatedly.
 
     Attributes:
-        ensemble: the log, as an ensemble of one.
-        name: the log's name.
+        trial: the log in memory, with the settings of the estimator that are not searched for.
         begun: the initial state of each estimated object by name, if the log has none; see `begin`.
         starts: the starts with which likelihoods are compared, instead of `begun`.
         parts: the log, repeated for each part of `starts`.
         disturbed: copies with noise added to the controls, if the cost is corrected for that noise.
     """
 
-    ensemble: Ensemble[MemorySource]
-    name: str
+    trial: Trial
     begun: Mapping[str, Initialized] = {}
     starts: Starts = {}
     parts: Ensemble[MemorySource] = Ensemble([])
     disturbed: Sequence[MemorySource] = ()
 
 
-def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
-    """Read into memory the topics that estimators read, and the log's truths."""
+def log_in_memory(source: LogSource | MemorySource, bound: Iterable[Bound]) -> Ensemble[MemorySource]:
+    """Read into memory the topics that estimators read, and the log's truths: an ensemble of one."""
     topics = {topic for each in bound for topic in (*each.static, *each.streams)}
     truths = topics_of(source.topics, schemas.TRUTH_STATE)
     topics |= {name for name in truths if not name.startswith("/estimates/")}
-    if isinstance(source, MemorySource):
-        return Run(Ensemble([source]), source.name)
-    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    streams = source.read(sorted(topics))
-    end_ns = source.end_ns if isinstance(source, LogSource) else None
-    held = MemorySource(streams, run, source.name, source.start_ns, end_ns)
-    return Run(Ensemble([held]), source.name)
+    return Ensemble([in_memory(source, sorted(topics))])
 
 
 def for_likelihood(settings: Mapping[str, Any]) -> str:
@@ -125,7 +117,7 @@ def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  
 def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
     """Sum NEES by case, and count its components."""
     found: Sums = {}
-    for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
+    for errors in Judge(run.trial.runs, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         known = errors.nees[np.isfinite(errors.nees)]
         found[errors.case] = np.array([np.sum(known), len(known) * len(errors.components)])
     return found
@@ -134,7 +126,7 @@ def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
 def _rmse(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
     """Sum and count squared errors of the position, or of the first quantity that is judged."""
     found: Sums = {}
-    for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
+    for errors in Judge(run.trial.runs, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
         squared = errors.error[:, errors.main.columns] ** 2
         found = plus(found, {errors.main.rmse: np.array([np.sum(squared), len(squared)])})
     return found
@@ -202,9 +194,8 @@ class Objective:
     """The cost of parameter values over logs.
 
     Attributes:
-        label, settings: the estimator, and its parameters except those that are searched for.
         names: the names of the parameters that are searched for.
-        runs: the logs.
+        runs: the logs, with one estimator.
         by: the criterion.
         gap_limit_s: the truth is not interpolated over longer gaps.
         on_best: function that is called with the best point after every batch.
@@ -215,8 +206,6 @@ class Objective:
         left_out: number of messages that `begin_after` left out, by topic.
     """
 
-    label: str
-    settings: Mapping[str, Any]
     names: Sequence[str]
     runs: Sequence[Run]
     by: By
@@ -278,7 +267,7 @@ class Objective:
         """
         if self.pool is not None:
             try:
-                pickle.dumps(self._without_runs())
+                pickle.dumps([run.trial.settings for run in self.runs])
             except (pickle.PicklingError, AttributeError, TypeError) as error:
                 raise BadInput(
                     f"{self.label}: the estimator cannot be sent to another process ({error}); tune it "
@@ -286,11 +275,12 @@ class Objective:
                 ) from error
         counts, runs = [], [self.begun(start, run) for run in self.runs]
         for run in runs:
+            name = run.trial.source.name
             outputs = self.outputs(start, run)
             failures = _failures(outputs)
             if failures:
                 raise BadInput(
-                    f"{run.name}: {self.label} fails with the start values of the search "
+                    f"{name}: {self.label} fails with the start values of the search "
                     f"({failures[0]}); give other values with --set"
                 )
             parts = self._parts(start, run)
@@ -298,13 +288,13 @@ class Objective:
             total = self._total(parts, run, count)
             if self.by == "likelihood" and total and -np.inf in total.values():
                 raise BadInput(
-                    f"{run.name}: {self.label} diverges with the start values of the search: its "
+                    f"{name}: {self.label} diverges with the start values of the search: its "
                     "log-likelihood is -inf; give other values with --set"
                 )
             if not np.isfinite(self._cost([total])):
-                remedy = for_likelihood(self.settings) if self.by == "likelihood" else ""
+                remedy = for_likelihood(run.trial.settings) if self.by == "likelihood" else ""
                 raise BadInput(
-                    f"{run.name}: {self.label} has no {CRITERIA[self.by].lacks} on this log; tune by "
+                    f"{name}: {self.label} has no {CRITERIA[self.by].lacks} on this log; tune by "
                     f"one of {', '.join(each for each in CRITERIA if each != self.by)} instead"
                     f"{', or ' if remedy else ''}{remedy}"
                 )
@@ -319,7 +309,7 @@ class Objective:
         """
         runs = []
         for run in self.runs:
-            [source] = run.ensemble
+            source = run.trial.source
             streams = dict(source.streams)
             for each in self._bound(start, run):
                 if not isinstance(each, Recursive) or each.reading is None:
@@ -332,7 +322,8 @@ class Objective:
                     if is_after.any() and not is_after.all():
                         streams[topic] = stream.take(is_after)
                         self.left_out[topic] = self.left_out.get(topic, 0) + int(np.sum(~is_after))
-            runs.append(run._replace(ensemble=Ensemble([replace(source, streams=streams)])))
+            later = Ensemble([replace(source, streams=streams)])
+            runs.append(run._replace(trial=replace(run.trial, runs=later)))
         self.runs = runs
         self.begin(start)
 
@@ -355,7 +346,7 @@ class Objective:
     def with_pairs(self, values: Floats, pairs: int) -> "Objective":
         """Return a copy corrected with this number of pairs of copies per log; see `correct`."""
         runs = [
-            run._replace(disturbed=disturbed(run.ensemble[0], self._bound(values, run), number, pairs))
+            run._replace(disturbed=disturbed(run.trial.source, self._bound(values, run), number, pairs))
             for number, run in enumerate(self.runs)
         ]
         return replace(self, runs=runs)
@@ -370,6 +361,11 @@ class Objective:
         components = sum(int(np.isfinite(stream["innovation"]).sum()) for stream in found)
         squares = sum(float(np.nansum(stream["normalised_innovation_squared"])) for stream in found)
         return squares / max(components, 1)
+
+    @property
+    def label(self) -> str:
+        """Return the estimator's label."""
+        return self.runs[0].trial.label
 
     @property
     def is_corrected(self) -> bool:
@@ -392,7 +388,7 @@ class Objective:
         values = values.copy()
         values[list(self.held)] = list(self.held.values())
         size = part_count(run.starts)
-        runs = Ensemble([each for each in (*run.ensemble, *run.disturbed) for _ in range(size)])
+        runs = Ensemble([each for each in (*run.trial.runs, *run.disturbed) for _ in range(size)])
         outputs = self._outputs_of_parts(values, run, runs)
         totals = [
             self._total(outputs[first : first + size], run, count)
@@ -413,16 +409,15 @@ class Objective:
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):
             noting = [with_find(each, partial(_note, begun, each)) for each in bound]
-            next(replay(run.ensemble, noting), None)
+            next(replay(run.trial.runs, noting), None)
         if self.by != "likelihood" or not begun:
             return run._replace(begun=begun)
-        starts = broad_starts(run.ensemble[0], bound)
-        return run._replace(
-            begun=begun, starts=starts, parts=Ensemble(list(run.ensemble) * part_count(starts))
-        )
+        starts = broad_starts(run.trial.source, bound)
+        parts = Ensemble([run.trial.source] * part_count(starts))
+        return run._replace(begun=begun, starts=starts, parts=parts)
 
     def _bound(self, values: Floats, run: Run) -> list[Bound]:
-        return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
+        return run.trial.with_settings(dict(zip(self.names, values.tolist(), strict=True))).bound
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """Replay a log with values (k,): outputs by topic. Raise BadInput as `replay` does."""
@@ -430,7 +425,7 @@ class Objective:
             with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
         ]
-        return collect(replay(run.ensemble, bound))
+        return collect(replay(run.trial.runs, bound))
 
     def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
         """Compute a log's sums at points (n, k); None if the number of messages changes at a point."""
@@ -508,18 +503,6 @@ def _note(begun: dict[str, Initialized], bound: Bound, *first: Any) -> Initializ
 
 def _as_noted(opened: Initialized, *_: Any) -> Initialized:
     return opened
-
-
-def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:
-    """Copy settings with other parameter values.
-
-    Args:
-        settings: the settings; they are not modified.
-        names: the full names of the parameters.
-        values: (k,), their new values.
-    """
-    pairs = zip(names, values.tolist(), strict=True)
-    return reduce(merge, (nested(name, value) for name, value in pairs), dict(settings))
 
 
 def _failures(outputs: Mapping[str, Ragged]) -> list[str]:

@@ -19,6 +19,7 @@ from fuselog.pipeline.altering.sources import split_settings
 from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
 from fuselog.pipeline.optimise import DROP_95, beside, curvature
 from fuselog.pipeline.runs.executors import WorkerPool, pool_for
+from fuselog.pipeline.runs.trials import Trial, with_values
 from fuselog.pipeline.tuning.confidence import (
     Confidence,
     SearchOutcome,
@@ -34,10 +35,9 @@ from fuselog.pipeline.tuning.objective import (
     By,
     Objective,
     Run,
-    in_memory,
     is_innovation,
+    log_in_memory,
     silent,
-    with_values,
 )
 from fuselog.pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from fuselog.pipeline.tuning.search import (
@@ -53,7 +53,6 @@ from fuselog.pipeline.tuning.search import (
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.parameters import Parameter, field_of, merge, number_of
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
-from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
@@ -139,19 +138,21 @@ def tune(
     settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
     sources = [until_last_measured(each, bound) for each in sources]
-    runs = [in_memory(source, bound) for source in sources]
-    by = by or _criterion(runs[0], bound)
+    trials = [Trial(label, log_in_memory(source, bound), settings) for source in sources]
+    by = by or _criterion(trials[0])
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
     _refuse_random(label, bound, by)
     start = np.array([each.default for each in searched])
-    others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
-    opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and gate_of(bound) < 1.0 else settings
+    unseen = [log_in_memory(each, bind(label, held_out, settings)) for each in held_out]
+    opened = OPEN if CRITERIA[by].is_smooth and gate_of(bound) < 1.0 else {}
+    runs = [Run(each.with_settings(opened)) for each in trials]
+    others = [Run(Trial(label, each, merge(settings, opened))) for each in unseen]
     names = [each.name for each in searched]
 
     with _pool(workers, scheduler, executor) as pool:
 
         def objective(runs: Sequence[Run]) -> Objective:
-            made = Objective(label, opened, names, runs, by, gap_limit_s, on_best, pool)
+            made = Objective(names, runs, by, gap_limit_s, on_best, pool)
             made.begin(start)
             return made
 
@@ -170,15 +171,15 @@ def tune(
         sources,
         held_out,
         {
-            name: with_values(settings, names, values)
-            for name, values in zip((START, TUNED), compared, strict=True)
+            name: with_values(settings, dict(zip(names, values, strict=True)))
+            for name, values in zip((START, TUNED), compared.tolist(), strict=True)
         },
         whole,
         found,
         costs=costs,
         held_out_costs=held_out_costs,
         folds=pd.DataFrame(rows),
-        gate=gate_of(bound) if opened is not settings else 1.0,
+        gate=gate_of(bound) if opened else 1.0,
     )
 
 
@@ -191,10 +192,9 @@ def _pool(
     return pool_for(workers, scheduler, 1, executor)()
 
 
-def _criterion(run: Run, bound: Sequence[Bound]) -> By:
+def _criterion(trial: Trial) -> By:
     """Choose the criterion: likelihood, or RMSE if the estimator has no innovations."""
-    outputs = collect(replay(run.ensemble, bound))
-    return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
+    return "likelihood" if any(map(is_innovation, trial.outputs().values())) else "rmse"
 
 
 def gate_of(bound: Sequence[Bound]) -> float:
@@ -603,7 +603,7 @@ def _row_of_fold(
     costs = left_out(np.array([start, found.optimum]))
     return {
         "fold": number,
-        "left_out": ", ".join(run.name for run in left_out.runs),
+        "left_out": ", ".join(run.trial.source.name for run in left_out.runs),
         **dict(zip(rest.names, found.optimum.tolist(), strict=True)),
         f"cost_{START}": costs[0],
         f"cost_{TUNED}": costs[1],

@@ -15,7 +15,8 @@ from fuselog.pipeline.diagnosing.battery.car import (
     lever,
     recorded,
 )
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.simulators.car import stamps_ns
 
 GYRO = "/car/turn_rate"
@@ -53,9 +54,9 @@ def several(
 
 def lost_by(log: fl.MemorySource, settings: dict[str, float]) -> float:
     """By how much the log-likelihood with settings is below that of the planted values."""
-    likelihood = Likelihood("ekf")
-    likelihood.begin(Trial(log, OPEN))
-    planted, found = likelihood([Trial(log, {**OPEN, **each}) for each in (PLANTED, settings)])
+    likelihood = Likelihood()
+    likelihood.begin(Trial("ekf", [log], OPEN))
+    planted, found = likelihood([Trial("ekf", [log], {**OPEN, **each}) for each in (PLANTED, settings)])
     return planted - found
 
 

@@ -29,7 +29,8 @@ from fuselog.pipeline.diagnosing.consistency import judged_by_itself
 from fuselog.pipeline.diagnosing.findings import corrected_by, of_log
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Supposed, fit
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
@@ -45,7 +46,7 @@ SEED = 2000
 
 
 def test_the_likelihood_with_a_compass_is_that_of_the_sheet() -> None:
-    likelihood, base = Likelihood("ekf"), Trial(recorded(drive(1)), OPEN)
+    likelihood, base = Likelihood(), Trial("ekf", [recorded(drive(1))], OPEN)
     likelihood.begin(base)
     assert likelihood([base]) == pytest.approx([653.081316], abs=1e-3)
 
@@ -142,7 +143,7 @@ def test_faults_at_once_are_named_with_values_in_their_intervals(
 
 def test_a_number_at_its_limit_or_without_effect_is_no_estimate() -> None:
     log = recorded(faulty(SEED, "fix variance / 16"), has_prior=True)
-    likelihood, base = Likelihood("ekf"), Trial(log, OPEN)
+    likelihood, base = Likelihood(), Trial("ekf", [log], OPEN)
     tried = hypotheses(bind("ekf", [log], OPEN), base, likelihood.begin(base), likelihood.readings)
     [noise] = [each for each in tried if (each.kind, each.topic) == ("measurement noise", FIX)]
     [drift] = [each for each in tried if each.name == f"drifting bias {FIX} position_x_m"]
@@ -365,7 +366,7 @@ def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_
     turned = {f"/body/inertial.{field}_matrix": "0,-1,0,1,0,0,0,0,1" for field in fields}
     found = []
     for settings in (turned, {}):
-        likelihood, base = Likelihood("ekf"), Trial(alter(log, settings), OPEN)
+        likelihood, base = Likelihood(), Trial("ekf", [alter(log, settings)], OPEN)
         seen, bound = likelihood.begin(base), bind("ekf", [base.source], OPEN)
         tried = hypotheses(bound, base, seen, likelihood.readings)
         some = [each for each in tried if each.kind == "start" or "mounting" in each.topic]

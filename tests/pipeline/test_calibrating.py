@@ -26,10 +26,11 @@ from fuselog.pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from fuselog.pipeline.diagnosing.battery.car import drive as battery_drive
 from fuselog.pipeline.diagnosing.battery.car import late
 from fuselog.pipeline.diagnosing.battery.car import recorded as battery_recorded
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.command import progress_of
 from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.pipeline.tuning.information import information
-from fuselog.pipeline.tuning.objective import Best, Objective, in_memory
+from fuselog.pipeline.tuning.objective import Best, Objective, Run
 from fuselog.pipeline.tuning.search import Coordinates
 from fuselog.pipeline.tuning.tuning import _levelled
 from fuselog.recorders.common_streams import fix_stream, prior_stream, truth_stream
@@ -39,6 +40,7 @@ from fuselog.recorders.parameters import Parameter
 from fuselog.recorders.recording import Recording
 from fuselog.recorders.simulators.car import Floats, arcs, stamps_ns
 from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import memory_source
 from tests.goldens import keeping
 
@@ -162,7 +164,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         advice(replace(found, logs=[without]))
     for left_out in ("nothing", "/car/heading"):  # a manoeuvre has the sensors of the log
         streams = {name: log.streams[name] for name in log.streams if name != left_out}
-        made = _simulated(found, replace(log, streams=streams), "circle").ensemble[0]
+        made = _simulated(found, replace(log, streams=streams), "circle").trial.source
         assert {*made.topics} == {*streams}
 
 
@@ -179,7 +181,7 @@ def test_the_next_manoeuvre_is_the_sheets() -> None:
 
     def told(motion: str, duration_s: float) -> Floats:
         log = recorded(drive(None, motion=motion, duration_s=duration_s, **WIDE))
-        run = in_memory(log, bind("ekf", [log], OPEN))
+        run = Run(Trial("ekf", Ensemble([log]), OPEN))
         objective = replace(found.objective, runs=[run])
         objective.begin(values)
         return turned.T @ information(objective, values, useful, order) @ turned

@@ -22,10 +22,11 @@ from fuselog.pipeline.diagnosing.consistency import of_each_component
 from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.search import Gains, Peak, peak
 from fuselog.pipeline.diagnosing.sentences import cause_of
 from fuselog.pipeline.optimise import end, side_by_side
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.checks.lint import lint
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
@@ -41,7 +42,7 @@ SEEN = "/robot1/range_bearing"
 def gains_of(source: fl.MemorySource, settings: dict[str, float]) -> dict[str, Peak]:
     """What scaling each noise alone gains, and by how much (logarithms)."""
     given = {"kind": "ekf", **settings, **OPEN}
-    base, likelihood = Trial(source, given), Likelihood("ekf")
+    base, likelihood = Trial("ekf", [source], given), Likelihood()
     seen = likelihood.begin(base)
     tried = hypotheses(bind("ekf", [source], given), base, seen, likelihood.readings)
     [before] = likelihood([base])
@@ -143,12 +144,12 @@ def test_trials_with_other_numbers_are_replayed_together(
     late = replace(run, streams={**run.streams, SEEN: alter.delayed(run.streams[SEEN], 0.2)})
     given = {"kind": "ekf", "sigma_range_m": 0.1}
     tried = [
-        Trial(run, given),
-        Trial(run, {**given, "sigma_bearing_rad": 0.05}),
-        Trial(late, {**given, "bias_range_m": 0.1}),
-        Trial(run, {**given, "gate_probability": 0.9}),
+        Trial("ekf", [run], given),
+        Trial("ekf", [run], {**given, "sigma_bearing_rad": 0.05}),
+        Trial("ekf", [late], {**given, "bias_range_m": 0.1}),
+        Trial("ekf", [run], {**given, "gate_probability": 0.9}),
     ]
-    told, replay, runs = Likelihood("ekf"), trials_of.replay, list[int]()
+    told, replay, runs = Likelihood(), trials_of.replay, list[int]()
     told.begin(tried[0])
     alone = [told([each])[0] for each in tried]
 
@@ -367,7 +368,7 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     source = fl.record("landmarks", seed=4, duration_s=2.0, landmarks=3)
     faulty = alter.altered(source, "/robot1/prior", alter.shifted("mean", 0), 2.0)
     given = {"kind": "ekf", **OPEN}
-    base, likelihood = Trial(faulty, given), Likelihood("ekf")
+    base, likelihood = Trial("ekf", [faulty], given), Likelihood()
     seen = likelihood.begin(base)
     tried = hypotheses(bind("ekf", [faulty], given), base, seen, likelihood.readings)
     alike = [each for each in tried if each.part == "x_m"]

@@ -21,12 +21,12 @@ from fuselog.pipeline.diagnosing.joint import Supposed, fit
 from fuselog.pipeline.diagnosing.likelihood import (
     EVER_NS,
     Likelihood,
-    Trial,
     _broad,
     _span,
     first_of_each,
 )
 from fuselog.pipeline.optimise import DROP_95
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.broad_starts import broad_starts
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
@@ -36,9 +36,11 @@ OPEN = {"kind": "ekf", "gate_probability": 1.0}
 
 def likelihood(source: fl.MemorySource, stated: float = 1.0) -> float:
     """Of the car as it is, over the starts of a log whose fixes state so many times the variance."""
-    told = Likelihood("ekf")
-    told.begin(Trial(car(2000, stated), OPEN) if stated != 1.0 else Trial(source, OPEN))
-    [found] = told([Trial(source, OPEN)])
+    told = Likelihood()
+    told.begin(
+        Trial("ekf", [car(2000, stated)], OPEN) if stated != 1.0 else Trial("ekf", [source], OPEN)
+    )
+    [found] = told([Trial("ekf", [source], OPEN)])
     return found
 
 
@@ -292,7 +294,7 @@ def late(at: float, *_: float) -> str:
 
 def test_a_gate_that_is_set_is_no_advice() -> None:
     """The gate is open while causes are sought, so that whoever gives advice knows what is set."""
-    base = Trial(car(2000), {"kind": "ekf", **OPEN})
+    base = Trial("ekf", [car(2000)], {"kind": "ekf", **OPEN})
     tried = hypotheses(bind("ekf", [base.source], base.settings), base, {}, {})
     [outliers] = [each for each in tried if each.kind == "outliers"]
     remedy = outliers.remedy(1.0)
@@ -320,8 +322,8 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     wrong = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert sum(each["kind"] == "gate" for each in wrong["sentences"]) == 1
     assert "ekf.log_likelihood.car" not in wrong["metrics"]
-    told = Likelihood("ekf")
-    told.begin(base := Trial(car(2000, 1 / 256), OPEN))
+    told = Likelihood()
+    told.begin(base := Trial("ekf", [car(2000, 1 / 256)], OPEN))
     assert wrong["metrics"]["ekf.open_gate_log_likelihood"] == pytest.approx(told([base])[0])
     assert "16" in wrong["sentences"][0]["sentence"]
 

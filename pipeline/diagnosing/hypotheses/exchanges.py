@@ -1,6 +1,8 @@
 """Hypotheses that two numbers of a map, or two topics, are swapped."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -9,7 +11,7 @@ import numpy as np
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.advice import Advice
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic, supposed
-from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Bound
 from fuselog.replay.engine.streams.sources import MemorySource
@@ -50,13 +52,13 @@ def of_numbers(
             if source.topics[here].schema_name == source.topics[there].schema_name:
                 words = f"{here} and {there} are swapped"
                 advice = Advice(f"{here}.exchanged", there)
-                without = _back(here, there)
+                without = partial(_back, here, there)
                 yield supposed("exchanged numbers", here, there, without, words, advice)
 
 
-def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
-    """Make a function that swaps the messages of two topics back in a trial."""
-    return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
+def _back(first: str, second: str, trial: Trial, _: float) -> Trial:
+    """Swap the messages of two topics back in a trial."""
+    return replace(trial, runs=[alter.exchanged(trial.source, first, second)])
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.advice import Advice, number
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameters, field_of
@@ -109,17 +110,7 @@ def in_topic(
 
     `stretched` is the factor by which the value stretches measurements; see `Trial`.
     """
-
-    def without(trial: Trial, value: Any) -> Trial:
-        source = alter.altered(trial.source, topic, alteration, -value)
-        if not stretched:
-            return trial._replace(source=source)
-        before = trial.stretched.get(topic, 0.0)
-        return trial._replace(
-            source=source, stretched={**trial.stretched, topic: before - stretched * value}
-        )
-
-    return without
+    return lambda trial, value: trial.altered(topic, alteration, -value, -stretched * value)
 
 
 def has(parameters: Parameters | None, name: str) -> bool:
@@ -202,7 +193,7 @@ def noise_gain_over(
 
     @cache
     def disturbed() -> tuple[list[Trial], NDArray[np.float64]]:
-        trials = [now, *(now._replace(source=each) for each in likelihood.disturbed(now))]
+        trials = [now, *likelihood.disturbed(now)]
         return trials, _lost(likelihood, trials)
 
     def gain(of: Hypothesis, value: Number) -> tuple[float, float]:

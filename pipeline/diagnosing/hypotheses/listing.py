@@ -15,7 +15,7 @@ from fuselog.pipeline.diagnosing.hypotheses.parameters import (
 )
 from fuselog.pipeline.diagnosing.hypotheses.stamps import hold_of, lag_of, of_stamps
 from fuselog.pipeline.diagnosing.hypotheses.starts import of_start
-from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Bound, Reading
 

@@ -7,7 +7,7 @@ import numpy as np
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.advice import Advice, number, precise
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from fuselog.pipeline.diagnosing.likelihood import Trial
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.log import Stream
 from fuselog.recorders.log.planes import Origin, stated_in
@@ -28,10 +28,9 @@ def of_origin(stream: Stream, reading: Reading | None) -> Iterator[Hypothesis]:
 
 def _of_positions(stream: Stream) -> Hypothesis:
     def without(trial: Trial, by_m: Metres) -> Trial:
-        source = trial.source
         for entry, by in enumerate(by_m):
-            source = alter.altered(source, stream.topic, alter.shifted("position_m", entry), -by)
-        return trial._replace(source=source)
+            trial = trial.altered(stream.topic, alter.shifted("position_m", entry), -by)
+        return trial
 
     def words(at: Metres, low: Metres, high: Metres) -> str:
         x, y = _too_far(at, low, high)
@@ -58,10 +57,9 @@ def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
 
     def without(trial: Trial, by_m: Metres) -> Trial:
         apart = np.subtract(right(by_m), origin)
-        source = trial.source
         for field, degrees in zip(("latitude_deg", "longitude_deg"), apart, strict=False):
-            source = alter.altered(source, stream.topic, alter.shifted(field), -float(degrees))
-        return trial._replace(source=source)
+            trial = trial.altered(stream.topic, alter.shifted(field), -float(degrees))
+        return trial
 
     def words(at: Metres, low: Metres, high: Metres) -> str:
         east, north = _too_far(at, low, high)

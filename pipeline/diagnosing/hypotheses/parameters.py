@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,7 @@ from fuselog.pipeline.diagnosing.hypotheses.hypothesis import (
     supposed,
     times,
 )
-from fuselog.pipeline.diagnosing.likelihood import Trial
-from fuselog.pipeline.tuning.objective import with_values
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.tuning import value_at_start
 from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.errors import BadInput
@@ -89,8 +87,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
     letter = {"measurement noise": "R", "process noise": "Q"}.get(kind)
 
     def without(trial: Trial, logarithm: float) -> Trial:
-        settings = with_values(trial.settings, [name], np.array([value * np.exp(logarithm)]))
-        return trial._replace(settings=settings)
+        return trial.with_settings({name: float(value * np.exp(logarithm))})
 
     def words(at: float, low: float, high: float) -> str:
         so = f", so that {letter} is too {size_of(at)}" if letter else ""
@@ -131,7 +128,9 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
 
         # a covariance stated too small is corrected by a larger one
-        without = partial(_spread, stream.topic, spread)
+        def without(trial: Trial, at: float, spread: alter.Alteration = spread) -> Trial:
+            return trial.altered(stream.topic, spread, at)
+
         kind: Kind = "measurement noise"
         yield Hypothesis(
             kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, remedy, reported=_factor
@@ -141,10 +140,6 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
 def _factor(logarithm: float) -> float:
     """Convert a logarithm to the factor of a standard deviation."""
     return float(np.exp(logarithm))
-
-
-def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float) -> Trial:
-    return trial._replace(source=alter.altered(trial.source, topic, spread, logarithm))
 
 
 def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
@@ -188,8 +183,8 @@ def _parameters(
         return tuple(by) if size > 1 else (by,)
 
     def without(trial: Trial, by: Any) -> Trial:
-        added = np.add(values, numbers(by))
-        return trial._replace(settings=with_values(trial.settings, list(names), added))
+        added = np.add(values, numbers(by)).tolist()
+        return trial.with_settings(dict(zip(names, added, strict=True)))
 
     def words(at: Any, low: Any, high: Any) -> str:
         changes = [
@@ -235,8 +230,8 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
     reopens = has(parameters, "gate_reopens_s")
 
     def without(trial: Trial, reopens_s: float) -> Trial:
-        settings = {**trial.settings, "gate_probability": GATE}
-        return trial._replace(settings=settings | ({"gate_reopens_s": reopens_s} if reopens else {}))
+        reopening = {"gate_reopens_s": reopens_s} if reopens else {}
+        return trial.with_settings({"gate_probability": GATE, **reopening})
 
     def words(reopens_s: float, *_: float) -> str:
         which = "some measurements" if reopens_s == REOPENS_S else "whole stretches of measurements"

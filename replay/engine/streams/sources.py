@@ -1,7 +1,7 @@
 """Sources of a replay: runs in log files, or recordings in memory."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, Self
@@ -338,4 +338,20 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     ]
     return MemorySource(
         {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
+    )
+
+
+def in_memory(source: LogSource | MemorySource, topics: Iterable[str] | None = None) -> MemorySource:
+    """Read topics of a log, by default all that were recorded; a recording is in memory already."""
+    if isinstance(source, MemorySource):
+        return source
+    if topics is None:
+        topics = [topic for topic in source.topics if is_sensed(source, topic)]
+    return MemorySource(
+        source.read(list(topics)),
+        source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns),
+        source.name,
+        source.start_ns,
+        source.end_ns,
+        rejections=source.rejections,
     )

@@ -17,8 +17,9 @@ from fuselog.pipeline.diagnosing.hypotheses.components import of_components
 from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
-from fuselog.pipeline.diagnosing.likelihood import Likelihood, Trial
+from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.sentences import notes_of, ranked
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.checks.lint import lint
 from fuselog.recorders.log import Stream, make_stream, schemas
@@ -33,7 +34,7 @@ def all_faults() -> Iterator[str]:
     source = recorded(faulty(2000, "nothing"), has_prior=True)
     settings = {"kind": "ekf", "gate_probability": 1.0}
     bound = bind("ekf", [source], settings)
-    likelihood, base = Likelihood("ekf"), Trial(source, settings)
+    likelihood, base = Likelihood(), Trial("ekf", [source], settings)
     innovations = likelihood.begin(base)
     for each in hypotheses(bound, base, innovations, likelihood.readings):
         yield from _both_ways(each)

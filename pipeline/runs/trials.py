@@ -1,0 +1,62 @@
+"""Trials: an estimator over runs in memory, replayed again with other settings or altered runs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from typing import Any
+
+from fuselog.pipeline.altering import alterations as alter
+from fuselog.recorders.parameters import merge, nested
+from fuselog.replay.engine.replaying.estimator import Bound, bind
+from fuselog.replay.engine.replaying.replaying import collect, replay
+from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.sources import MemorySource
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """An estimator with its settings, over runs in memory that are replayed together.
+
+    Attributes:
+        label: the estimator's label.
+        runs: the runs; an `Ensemble` caches what its replays have in common.
+        settings: the estimator's parameters, with its `kind` if that is not the label.
+        stretched: by topic, the logarithm of the volume of measurements relative to the log's: other
+            units change the density of the numbers.
+    """
+
+    label: str
+    runs: Sequence[MemorySource]
+    settings: Mapping[str, Any]
+    stretched: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def source(self) -> MemorySource:
+        """Return the first run, which is the only one unless runs are replayed together."""
+        return self.runs[0]
+
+    @property
+    def bound(self) -> list[Bound]:
+        """Bind the estimator to the runs; raises BadInput as `bind`."""
+        return bind(self.label, self.runs, self.settings)
+
+    def with_settings(self, values: Mapping[str, Any]) -> "Trial":
+        """Copy the trial with other values of parameters, by their full names."""
+        return replace(self, settings=with_values(self.settings, values))
+
+    def altered(
+        self, topic: str, alteration: alter.Alteration, value: float, stretched: float = 0.0
+    ) -> "Trial":
+        """Copy the trial with a topic altered, whose measurements become `stretched` larger."""
+        runs = [alter.altered(each, topic, alteration, value) for each in self.runs]
+        by_topic = {**self.stretched, topic: self.stretched.get(topic, 0.0) + stretched}
+        return replace(self, runs=runs, stretched=by_topic if stretched else self.stretched)
+
+    def outputs(self) -> dict[str, Ragged]:
+        """Replay the runs: outputs by topic; raises BadInput as `replay`."""
+        return collect(replay(self.runs, self.bound))
+
+
+def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy settings with other values of parameters, by their full names."""
+    return reduce(merge, (nested(name, value) for name, value in values.items()), dict(settings))
