@@ -14,7 +14,7 @@ from fuselog.recorders.units import mistaken
 NEAR = 0.05  # tolerance of a factor
 SCALE = (0.8, 1.25)  # acceptable motion of positions per metre of a speed
 SPREAD = 0.25
-LEAP_S = {18.0: "GPS time runs 18 s ahead of UTC since 2017"}
+LEAP_S = {18.0: "GPS time has been 18 s ahead of UTC since 2017"}
 LEAP_TOLERANCE_S = 0.6
 LEAPED = 2.0  # times the motion between nearly all fixes: beyond it, the body may have moved
 REST = 0.05  # share of the larger speeds

@@ -42,7 +42,9 @@ class Loop(Protocol):
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Compile a function of arrays and numbers, with all functions that it calls, at its first call.
 
-    This is for functions that Python calls directly; in another kernel they are compiled with the rest.
+    Use this for a function that Python calls directly. If a kernel calls the function, it is compiled
+    together with that kernel.
+
     Arguments are positional; the function returns nothing, or one number of the annotated kind. A call
     raises BadInput if the source of a function is not available.
 

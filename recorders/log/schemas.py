@@ -502,8 +502,8 @@ ITERATION = _declare(
 )
 OBSERVABILITY = _declare(
     "Observability",
-    "Information of the measurements since an earlier stamp about the state at that stamp: rank and "
-    "eigenvalues, ascending, of the local Gramian in units of the prior, and the weakest direction.",
+    "The information of the measurements since an earlier stamp about the state at that stamp: rank and "
+    "eigenvalues (ascending) of the local Gramian in units of the prior, and the weakest direction.",
     Field("begin_time_ns", "time_ns"),
     _identifier("rank"),
     _identifier("measurements"),

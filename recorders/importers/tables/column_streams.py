@@ -262,7 +262,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     if not (place or turn):
         return
     if place and heading:
-        why = "the names are a position and a heading, without a covariance, as the truth has them"
+        why = "the columns give a position and a heading without a covariance, like a recorded truth"
         yield from stream_lines(
             f"{table.prefix}/truth", "TruthState", why, *_truth(place, factors, turn, heading), *said
         )
