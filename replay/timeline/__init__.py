@@ -1,5 +1,4 @@
-"""Rerun timelines: sinks, columns, the scenes of robots and inertial units; begin with `show`.
+"""Rerun timelines: sinks, drawing, and the scenes of robots and inertial units; begin with `show`.
 
-Families draw their scenes in `fuselog.replay.families`; `generic` draws a log without a registered
-scene.
+Families draw their scenes in `fuselog.replay.families`; `generic` draws logs without a registered scene.
 """

@@ -28,7 +28,7 @@ class Fan(NamedTuple):
 
 
 def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
-    """Return the layout above a plot for each estimate that has copies."""
+    """Return the layout with a plot below it for each estimate that has copies."""
     plots = []
     for estimate in dict.fromkeys(fan.estimate for fan in fans):
         plot = entity_path("plots", "stress", estimate)

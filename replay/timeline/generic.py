@@ -1,8 +1,8 @@
-"""Scene of a log without a family of its own: everything in the log, by schema.
+"""Scene of a log that belongs to no family: all topics, by schema.
 
 Positions are drawn in a plane for each frame of the log and on a map of the earth: truths, estimates,
-fixes, poses, and landmarks with the measurements of them. A sensor's measurements are drawn around it,
-and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to this.
+fixes, poses, and landmarks with their measurements. The measurements of a sensor are drawn around it,
+and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to these views.
 """
 
 from collections.abc import Iterator, Sequence
@@ -130,7 +130,7 @@ def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
 
 
 def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:
-    """Draw everything with a position, one view per frame side by side; no board without positions."""
+    """Draw all positions, with one view per frame side by side; return no panel without positions."""
     by_frame: dict[str, list[Stream]] = {"": []}
     for stream in sensed:
         if stream.schema.full_name in {*FIXES, LANDMARK} and stream["position_m"].shape[1] >= 2:
@@ -148,7 +148,7 @@ def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) 
 def _draw_plane(
     canvas: Canvas, scene: Scene, case: str, frame: str, sensed: list[Stream]
 ) -> list[Board]:
-    """Draw the positions in one frame; truths and estimates are in the log's own, which has no name."""
+    """Draw the positions in one frame; truths and estimates are in the frame of the log, named ""."""
     root, shown, paths = entity_path(ROOT, case), [], []
     named: dict[str, Colour] = {}
     if frame:
@@ -191,7 +191,7 @@ def _draw_plane(
 
 
 def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
-    """Draw geodetic fixes on a map of the earth, and paths of estimates if an origin is stated."""
+    """Draw geodetic fixes on a map of the earth, with paths of estimates if an origin is stated."""
     root = entity_path("geodetic", case)
     origin = stated_origin({each.topic: scene.source.topics[each.topic] for each in fixes[:1]})
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
@@ -239,7 +239,7 @@ def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[r
 def _draw_field(
     canvas: Canvas, case: str, stream: Stream, field: Field, curves: Floats
 ) -> rrb.TimeSeriesView:
-    """Plot a field's curves (curves, n); rotations are shown as angles."""
+    """Plot the curves (curves, n) of a field; rotations are shown as angles."""
     quantity, unit, scale = shown_unit(field.name)
     plot = entity_path("plots", case, _name(stream, case), field.name)
     named: Sequence[str] = [str(element) for element in range(len(curves))]
@@ -257,7 +257,7 @@ def _draw_field(
 
 
 def _euler_deg(quaternions: Floats) -> Floats:
-    """Convert quaternions to roll, pitch, yaw (n, 3) in deg (about x, y, z); NaN if invalid."""
+    """Convert quaternions to roll, pitch and yaw (n, 3) in deg (about x, y and z); NaN if invalid."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     angles = np.full((len(quaternions), 3), np.nan)

@@ -1,7 +1,7 @@
-"""Runner of `rerun ARGUMENTS` that ends when the other end of its standard input is closed.
+"""Launcher of `rerun ARGUMENTS` that ends when the other end of its standard input is closed.
 
-The operating system closes the pipe when the process that holds it ends in any way, so no viewer
-outlives its fuselog.
+The operating system closes the pipe when its owner ends in any way, so no viewer outlives the process of
+fuselog that started it.
 """
 
 import os

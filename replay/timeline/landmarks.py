@@ -1,4 +1,4 @@
-"""Scene of robots, each on its map of landmarks, with its errors, NEES, NIS and events."""
+"""Scene of robots: for each, a map with landmarks, errors, NEES, NIS and events."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -49,9 +49,9 @@ from fuselog.replay.timeline.drawing.registered import draw_registered
 HEADING = "heading_rad"
 # Length of an arrow as a fraction of the scene.
 ARROW_SHARE = 0.04
-# A single position is a dot; its width is this multiple of a path's.
+# A single position is a dot; its width is this multiple of the width of a path.
 SINGLE = 1.5
-# Schemas of measurements of landmarks, and the field with the landmark's number.
+# Schemas of measurements of landmarks, and the field with the number of the landmark.
 SIGHTINGS = {
     schemas.RANGE_BEARING.full_name: "target_id",
     schemas.RANGE.full_name: "target_id",
@@ -60,16 +60,16 @@ SIGHTINGS = {
 }
 SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
-# Parameters of a sensor's field of view; number of vertices and colour of its drawing.
+# Parameters of the field of view of a sensor; number of vertices and colour of its drawing.
 VIEW, CORNERS, SEEN_UP_TO = ("maximum_range_m", "field_of_view_deg"), 49, (110, 110, 90)
-# The most fields of view that are drawn.
+# Largest number of drawn fields of view.
 VIEWS = 500
 # A measurement is drawn from a pose only if the pose is not older than this.
 FRESH_NS = 500_000_000
 
 
 class Track(NamedTuple):
-    """Poses (n, 3) of a robot, x, y, heading, from the truth or an estimator.
+    """Poses (n, 3) of a robot (x, y, heading) from the truth or an estimator.
 
     A heading that is not stated is NaN.
     """
@@ -141,7 +141,7 @@ def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
 
 
 def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
-    """Draw path, arrows and ellipses of a robot in a scene of this extent; return the path's entity."""
+    """Draw path, arrows and ellipses of a robot in a scene of this extent; return the path entity."""
     entity = f"{root}/{track.name}"
     if track.name == "truth":
         draw_way(canvas, f"{entity}/whole", track.poses[:, :2])
@@ -182,7 +182,7 @@ def draw_sights(
 
 
 def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) -> dict[str, Colour]:
-    """Draw the field of view of a sensor if the run's parameters state it; return its colour by name."""
+    """Draw the field of view of a sensor if the run's parameters state it; return colours by name."""
     run, truths = scene.source.run, [track for track in tracks if track.name == "truth"]
     for topic in scene.topics_near(robot):
         sensor = topic.rpartition("/")[2]
@@ -204,7 +204,7 @@ def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) ->
 
 
 def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
-    """Return the sorted distinct (time, target) pairs of streams, each with the field of its targets."""
+    """Return the sorted distinct (time, target) pairs of streams, given the field of their targets."""
     times, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for stream, field in streams:
         times.append(stream.publish_time_ns)
@@ -214,7 +214,7 @@ def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
 
 
 def _places_at(tracks: list[Track], time_ns: Times) -> Floats:
-    """Interpolate the robot's position (n, 2), from the truth or else the first recent estimate."""
+    """Interpolate the positions (n, 2) of a robot from the truth, otherwise from a recent estimate."""
     places = np.full((len(time_ns), 2), np.nan)
     for track in tracks:
         row = np.searchsorted(track.time_ns, time_ns, side="right") - 1

@@ -1,4 +1,4 @@
-"""Worst moments of a run, stored in its timeline and used for the viewer's cursor."""
+"""Worst moments of a run, which are stored in its timeline and used for the cursor of the viewer."""
 
 from collections.abc import Sequence
 from pathlib import Path

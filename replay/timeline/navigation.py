@@ -1,7 +1,7 @@
-"""Scene of a body that moves and rotates in space: its path, its axes, and the uncertainty of both.
+"""Scene of a body that moves and rotates in space: its path, its axes, and their uncertainty.
 
-It is drawn for every estimate of a 3D position with an orientation, whatever program wrote the log. If
-there are long gaps between fixes, the path is marked and the plots are shaded there.
+It is drawn for every estimate of a 3D position with an orientation, in any log. In long gaps between
+fixes, the path is marked and the plots are shaded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,14 +42,14 @@ PLACE = ("x_m", "y_m", "z_m")
 ORIENTATION = tuple(f"orientation_{part}" for part in "wxyz")
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 ANGLES = ("roll", "pitch", "yaw")
-# Components plotted in one view, by the beginning of their names.
+# Components that are plotted in one view, by the beginning of their names.
 BIASES = (("gyro_bias_", "Gyro bias"), ("accelerometer_bias_", "Accelerometer bias"))
 FORWARD: tuple[Colour, ...] = ((230, 60, 40), (0, 158, 115), (0, 114, 178))
-# Ellipsoids along a path, which overlap to a tube: their largest number, and their distance by size.
+# Ellipsoids along a path, which overlap and form a tube: largest number, and distance relative to size.
 TUBE, TUBE_STEP = 300, 0.5
 # A tube thinner than this fraction of the scene is not drawn, because it would hide the path.
 TUBE_SHARE = 0.005
-# Brightness of the axes of a vector if several bodies are plotted.
+# Brightness of the components of a vector if several bodies are plotted.
 SHADES = (1.0, 0.75, 0.5)
 
 
@@ -60,9 +60,9 @@ class Body(NamedTuple):
         width: width of its lines in pixels.
         time_ns: (n,).
         values: (n, components), in the order of `names`.
-        deviations: (n, tangent components) standard deviations in the order of `tangent`, None for the
+        deviations: (n, tangent components) standard deviations in the order of `tangent`; None for the
             truth.
-        covariance: (n, 3, 3) of the position, None for the truth.
+        covariance: (n, 3, 3) of the position; None for the truth.
     """
 
     label: str
@@ -163,7 +163,7 @@ def _silent(stream: Stream, end_ns: int) -> Times:
 
 
 def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
-    """Draw fixes as points, coloured by the standard deviation that they state."""
+    """Draw fixes as points, coloured by their stated standard deviations."""
     rows = thin(stream.publish_time_ns)
     place = stream["position_m"][rows].astype(np.float32)
     colours = by_deviation(stream["covariance_m2"][rows], MUTED)
@@ -171,7 +171,7 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
 
 
 def _fix_colours(fixes: Sequence[tuple[str, Stream]]) -> dict[str, Colour]:
-    """Return the names of the colours of fixes, by the standard deviation that they state."""
+    """Return the colours of fixes by name, for ranges of the stated standard deviation."""
     drawn = [by_deviation(stream["covariance_m2"], MUTED) for _, stream in fixes]
     found = {tuple(colour) for colours in drawn for colour in np.unique(colours, axis=0).tolist()}
     named = {f"fixes to {limit:g} m": colour for limit, colour in QUALITIES}
@@ -203,9 +203,9 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
-    """Draw ellipsoids of two standard deviations along the path, if they are larger than its line.
+    """Draw ellipsoids of two standard deviations along the path, if they are wider than its line.
 
-    They are wireframes, because the viewer's eye may be inside one.
+    They are wireframes, because the camera may be inside an ellipsoid.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
@@ -250,7 +250,7 @@ def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
 
 
 def _groups(bodies: Sequence[Body]) -> Iterator[tuple[str, str, str, list[str]]]:
-    """Yield the plots: a name, a title, its unit and its components."""
+    """Yield the name, title, unit and components of each plot."""
     names = dict.fromkeys(name for body in bodies for name in body.names)
     if set(VELOCITY) <= set(names):
         yield "velocity", "Velocity", "m/s", list(VELOCITY)
@@ -271,7 +271,7 @@ def _draw_group(
     components: Sequence[str],
     outages: Times,
 ) -> rrb.TimeSeriesView:
-    """Plot some components of all bodies, with bands for biases and shades in gaps between fixes."""
+    """Plot components of all bodies, with bands for biases and shades in gaps between fixes."""
     plot, largest = entity_path("plots", case, "motion", name), 0.0
     for body in bodies:
         shades = [_shaded(body.colour, share) for share in SHADES]
@@ -297,7 +297,7 @@ def _shaded(colour: Colour, share: float) -> Colour:
 
 
 def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
-    """Return a component's values (n,) and sigmas (n,) in the displayed unit; None if missing."""
+    """Return values (n,) and sigmas (n,) of a component in the displayed unit; None if missing."""
     if component in ANGLES:
         if not set(ORIENTATION) <= set(body.names):
             return None

@@ -1,4 +1,4 @@
-"""Drawing of one run of a replay in Rerun: to a file, a live viewer, or both in one pass."""
+"""Drawing of one run of a replay in Rerun, to a file, to a live viewer, or to both in one pass."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,16 +28,16 @@ from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
-# Number of output messages that are sent to a receiver at a time.
+# Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
 
 
 class Drawing:
     """Timeline of one run, drawn while the run is replayed.
 
-    A receiver is sent every block as it comes. A file is drawn at the end, from the messages that were
-    kept: all of them in a short run, otherwise a selection that is even in time. Use it as a context
-    manager: it is finished at the end, unless an exception was raised.
+    A receiver gets every block immediately. A file is drawn at the end from the messages that were kept:
+    all messages of a short run, otherwise a selection evenly spaced in time. Use the drawing as a
+    context manager, which finishes it at the end unless an exception was raised.
 
     Args:
         source: the run.
@@ -45,12 +45,12 @@ class Drawing:
         focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
         connect: URL of a receiver, rerun+http://HOST:PORT/proxy.
-        at: `worst` or `worst:ESTIMATOR`: without a focus, the case of that moment is shown first.
+        at: `worst` or `worst:ESTIMATOR`; without a focus, the case of this moment is shown first.
         sides: estimators whose scenes are shown side by side, with the differences of their errors.
         fans: distances of copies from their estimates.
 
     Raises BadInput if neither `save` nor `connect` is given, if a sink fails (see `open_recording`), or
-    if there is no such focus.
+    if the focus does not exist.
     """
 
     def __init__(
@@ -116,9 +116,9 @@ class Drawing:
                 self._send(self._live, self._fresh.last_ns)
 
     def _send(self, live: rr.RecordingStream, until_ns: int, last: Scene | None = None) -> None:
-        """Send everything new since the last time, and sensor messages up to a stamp.
+        """Send all new outputs since the last call, and sensor messages up to a stamp.
 
-        `last` is the scene of the whole run, at its end.
+        At the end of the run, `last` is the scene of the whole run.
         """
         sensed = self._sensed.read_to(until_ns)
         scene = Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus)
@@ -143,7 +143,7 @@ class Drawing:
         )
         if self._live is not None:
             self._send(self._live, np.iinfo(np.int64).max, scene)
-        # moving entities have been sent; the ranges of views are still those of the last part
+        # moving entities have been sent, but the ranges of views are still those of the last part
         if self._live is not None and self._sent > 1:
             self._draw(self._live, scene, is_still=True)
         if self._save is not None:
@@ -181,18 +181,18 @@ def show(
     save: Path | None = None,
     connect: str | None = None,
 ) -> None:
-    """Draw one run of an ensemble with all its estimators, with the drawing of its scenario's family.
+    """Draw one run of an ensemble with all its estimators, by the drawing code of its scenario family.
 
     Args:
         source: the run.
-        outputs: the estimators' streams of the ensemble, by topic; without any, only the log is shown.
+        outputs: output streams of the ensemble, by topic; without outputs, only the log is shown.
         errors: the errors of the ensemble's estimates.
         run: index in the ensemble of the run `source`.
         focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
         connect: URL of a receiver, rerun+http://HOST:PORT/proxy.
 
-    Raises BadInput if there is no such run or focus, or if a sink fails (see `open_recording`).
+    Raises BadInput if the run or the focus does not exist, or if a sink fails (see `open_recording`).
     """
     runs = max((ragged.runs for ragged in outputs.values()), default=1)
     if not 0 <= run < runs:

@@ -1,7 +1,7 @@
-"""Estimators side by side: a family's scenes once for each, and the differences of their errors.
+"""Scenes of a family side by side, one per estimator, and the differences of their errors.
 
-The family has drawn everything once; each scene shows the same entities except those of the other
-estimators. Colours, cursor and everything else are therefore the same in all scenes.
+The family has drawn all entities once; each scene shows them except those of the other estimators.
+Colours, cursor and all other properties are therefore the same in all scenes.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 def draw_side_by_side(
     canvas: Canvas, scene: Scene, layout: Board, estimators: Sequence[str]
 ) -> rrb.Container:
-    """Return the layout with a scene for each estimator, above plots of the differences of errors."""
+    """Return the layout with a scene for each estimator, above plots of differences of errors."""
     plots = [view for case in scene.cases for view in _draw_differences(canvas, scene, case, estimators)]
     board = _split(layout, estimators)
     if not plots:
@@ -29,7 +29,7 @@ def draw_side_by_side(
 
 
 def _split(layout: Board, estimators: Sequence[str]) -> Board:
-    """Split every view of a scene in the layout by estimator; legends are not split."""
+    """Split every view of a scene in the layout by estimator, except legends."""
     if isinstance(layout, rrb.Container):
         layout.contents = [
             _split(each, estimators) if isinstance(each, rrb.Container | rrb.View) else each
@@ -56,7 +56,7 @@ def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.Vie
 def _draw_differences(
     canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot how much larger the errors of others are than the first's, at their common stamps."""
+    """Plot the errors of others minus those of the first estimator, at common stamps."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
     plot, unit, drawn = entity_path("plots", case, "difference"), "-", False

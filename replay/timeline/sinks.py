@@ -1,9 +1,9 @@
 """Sinks of a timeline: a file or a live viewer.
 
-A file appears under its name only when it is complete. Rerun encodes it in memory and it is written
-here, because Rerun's own writer does not report a disk that is full at the end, and may wait forever. A
-live receiver is contacted before anything is sent, because Rerun itself waits many seconds for a
-missing receiver, and forever for one that does not answer.
+A file appears under its name only when it is complete. Rerun encodes it in memory, and fuselog writes
+it, because Rerun's own writer does not report a full disk at the end and may wait forever. A live
+receiver is contacted before data is sent, because Rerun itself waits many seconds for a missing
+receiver, and forever for a receiver that does not answer.
 """
 
 import os
@@ -31,11 +31,11 @@ _GIVEN_UP_S = 2.0
 def open_recording(
     application_id: str, recording_id: str, *, save: Path | None = None, connect: str | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """Open a recording without clocks of this machine, so that equal input gives equal content.
+    """Open a recording that does not contain clocks of this machine, so that it is reproducible.
 
     Args:
-        application_id: identifier for which the viewer stores one layout.
-        recording_id: recordings with the same identifier are one recording in a viewer.
+        application_id: identifier under which the viewer stores a layout.
+        recording_id: identifier of the recording; a viewer merges recordings with the same identifier.
         save: the .rrd file to write, in a folder that exists.
         connect: receiver to use instead of a file, `rerun+http://HOST:PORT/proxy`.
 
@@ -63,7 +63,7 @@ def open_recording(
 
 
 def rerun_path(path: Path) -> str:
-    """Return a file's name in the form that Rerun reads as UTF-8, in any locale.
+    """Return the name of a file in the form that Rerun reads as UTF-8 in any locale.
 
     Raises BadInput if the name is not UTF-8.
     """
@@ -74,7 +74,7 @@ def rerun_path(path: Path) -> str:
 
 
 def _finish(recording: rr.RecordingStream, connect: str) -> None:
-    """Send everything that is still queued, and close."""
+    """Send all queued data, and close."""
     failure: Exception | None = None
     try:
         recording.flush(timeout_sec=_FLUSH_S)
@@ -91,7 +91,7 @@ def _finish(recording: rr.RecordingStream, connect: str) -> None:
 
 
 def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
-    """Disconnect and test whether that ended; if a receiver does not answer, Rerun may wait forever."""
+    """Disconnect, and test whether this succeeded; Rerun may wait forever if a receiver is silent."""
     closing = threading.Thread(target=recording.disconnect, daemon=True)
     closing.start()
     closing.join(limit_s)
@@ -112,7 +112,7 @@ def _require_receiver(url: str) -> None:
 
 
 def _address(url: str) -> tuple[str | None, int | None]:
-    """Return host and port of a receiver's URL; None if it is not such a URL."""
+    """Return host and port of the URL of a receiver; None if it is not a valid URL."""
     try:
         parts = urlsplit(url)
         is_receiver = parts.scheme == "rerun+http" and parts.path == "/proxy"

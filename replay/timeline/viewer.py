@@ -1,7 +1,7 @@
-"""Rerun's viewer, which rerun-sdk includes: its window, a picture, or a page for a browser.
+"""Viewer of Rerun, which is part of rerun-sdk: a window, a picture, or a page for a browser.
 
-It listens only on the loopback interface, reports no usage, connects to no network, and ends with the
-process that started it, even if that is killed.
+It listens only on the loopback interface, does not report usage, does not use the network, and ends with
+the process that started it, even if that process is killed.
 """
 
 import os
@@ -26,21 +26,21 @@ from fuselog.recorders.processes import start_module
 from fuselog.replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-# Value of the PNG keyword `Software` of a picture.
+# Value of the PNG keyword `Software` in a picture.
 SOFTWARE = "fuselog"
 _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0
 _SAID = "rerun.log"
-# The viewer's own messages cover its first three or four pictures, however long these take, so the
-# first pictures are taken of an empty window. The first picture of a timeline may be incomplete.
+# Messages of the viewer cover its first three or four pictures, regardless of the time, so the first
+# pictures are taken of an empty window. The first picture of a timeline may be incomplete.
 _EMPTY_PICTURES, _PICTURES = 7, 3
-# The height in pixels of the viewer's bar, with its menu and badges of its environment.
+# Height in pixels of the viewer's bar, with the menu and badges of its environment.
 _BAR = 36
 
 
 class Listener(NamedTuple):
-    """Running Rerun process and the address at which it receives."""
+    """Running Rerun process, and the address at which it receives data."""
 
     url: str
     process: subprocess.Popen[bytes]
@@ -54,16 +54,16 @@ def screenshot(
     size: tuple[int, int] = (1600, 1000),
     progress: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
-    """Save the viewer's picture of a timeline, without its bar; needs only a Vulkan driver, no screen.
+    """Save a picture of a timeline in the viewer; this needs a Vulkan driver, but no screen.
 
     Args:
         rrd: the timeline.
         png: the picture to write.
-        at_s: time of the cursor in seconds since the run's epoch; None for the middle.
+        at_s: time of the cursor in s since the epoch of the run; None for the middle.
         size: width and height in pixels.
-        progress: called with descriptions of the current step.
+        progress: function that is called with a description of the current step.
 
-    Returns the reports of errors in views; empty if there are none.
+    Returns the reports of errors in views; empty without errors. The bar of the viewer is cut off.
 
     Raises BadInput if a file cannot be found or written, if `at_s` is outside the run, or if no Vulkan
     driver is installed.
@@ -98,9 +98,9 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
 
     Args:
         rrd: the timeline.
-        at_s: time of the cursor in seconds since the run's epoch; None to leave it to the viewer.
+        at_s: time of the cursor in s since the epoch of the run; None for the viewer's default.
 
-    Raises BadInput if there is no such file or no screen, or if the viewer cannot run.
+    Raises BadInput if the file or a screen is missing, or if the viewer cannot run.
     """
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
@@ -123,13 +123,13 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
 
 
 def serve(rrd: Path, announce: Callable[[str], None]) -> None:
-    """Serve a timeline to browsers on this machine with Rerun's web viewer until it is interrupted.
+    """Serve a timeline to browsers on this machine with the web viewer of Rerun, until interrupted.
 
     Args:
         rrd: the timeline.
-        announce: called with the address of the page as soon as it answers.
+        announce: function that is called with the address of the page as soon as it is available.
 
-    Raises BadInput if there is no such file, or the viewer ends.
+    Raises BadInput if the file is missing, or if the viewer ends.
     """
     _require_timeline(rrd)
     port = _free_port()
@@ -145,7 +145,7 @@ def serve(rrd: Path, announce: Callable[[str], None]) -> None:
 def view_inline(rrd: Path) -> None:
     """Show a timeline in a notebook cell with the widget of the package rerun-notebook.
 
-    Raises BadInput if the package is not installed, or if there is no such file.
+    Raises BadInput if the package is not installed, or if the file is missing.
     """
     _require_timeline(rrd)
     try:
@@ -171,7 +171,7 @@ def in_notebook() -> bool:
 def listen(folder: Path, *options: str) -> Iterator[Listener]:
     """Run `rerun OPTIONS` as a receiver on the loopback interface, with `folder` as its home directory.
 
-    Raises BadInput if it does not start, or ends while it is still needed.
+    Raises BadInput if the process does not start, or ends while it is still needed.
     """
     port = _free_port()
     address = ["--port", str(port), "--bind", "127.0.0.1"]
@@ -200,7 +200,7 @@ def _running(
             environment=environment,
             stdout=output,
             stderr=output,
-            start_new_session=True,  # an interrupt from the terminal is ours to handle
+            start_new_session=True,  # this process handles an interrupt from the terminal
         )
     assert process.stdin is not None
     try:
@@ -213,7 +213,7 @@ def _running(
 def _private_environment(folder: Path) -> dict[str, str]:
     """Return an environment with its own folders and without usage reports.
 
-    The viewer's check for updates fails, because the proxy for it does not exist.
+    The viewer's check for updates fails, because its proxy does not exist.
     """
     environment = {name: value for name, value in os.environ.items() if not _is_proxy(name)}
     for kind in ("CONFIG", "DATA", "CACHE"):
@@ -250,7 +250,7 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
 
 
 def _ended(process: subprocess.Popen[bytes]) -> bool:
-    """Test whether the process has ended or soon will; its port closes before it ends."""
+    """Test whether the process has ended or will end soon; its port closes before it ends."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
     return process.poll() is not None

@@ -1,5 +1,5 @@
-"""Traces of models as expression graphs: each function is called once with traced numbers.
+"""Tracing of models to expression graphs, by calls of their functions with traced numbers.
 
-The graph of a function provides its exact derivatives (`derivatives`), its machine code (`emission`) and
-readable formulas (`formulas`). Begin with `functions`, whose classes wrap a model's functions.
+Exact derivatives (`derivatives`), machine code (`emission`) and readable formulas (`formulas`) of a
+function are made from its graph. Begin with `functions`, whose classes wrap the functions of a model.
 """

@@ -1,7 +1,7 @@
-"""Graphs written as readable C99, with a line for each expression that is used more than once.
+"""Writing of graphs as readable C99, with a line for each expression that is used more than once.
 
-Sums and products are in the order in which kernels compute them, so that a compiler that neither
-contracts nor reorders operations (`-ffp-contract=off`, no `-ffast-math`) gives the same bits.
+Sums and products are in the same order as in kernels. A compiler that neither contracts nor reorders
+operations (`-ffp-contract=off`, no `-ffast-math`) therefore produces the same results, bit for bit.
 """
 
 import math
@@ -17,7 +17,10 @@ import numpy as np
 from fuselog.replay.tracing.formulas import Text
 from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
-SHORTEST, LONGEST = 16, 90  # characters: shorter expressions are repeated, longer ones get a line
+SHORTEST, LONGEST = (
+    16,
+    90,
+)  # characters: shorter expressions are repeated, longer ones split
 
 _CHOICE, _OR, _AND, _EQUAL, _COMPARISON, _SUM, _PRODUCT, _SIGN, _WHOLE = range(9)
 _OPERATORS: dict[Any, tuple[str, int]] = {
@@ -108,7 +111,7 @@ static REAL sign_of(REAL x)
 
 
 class Precision(NamedTuple):
-    """How numbers are written: their type, and the suffix of constants and of libm's functions."""
+    """Notation of numbers: their type, and the suffix of constants and of libm's functions."""
 
     real: str = "double"
     ending: str = ""
@@ -116,8 +119,8 @@ class Precision(NamedTuple):
     def number(self, value: float) -> str:
         """Write a number so that it is read back unchanged.
 
-        In single precision, numbers that would be rounded to zero become the smallest normal number, so
-        that a nonzero divisor stays nonzero; numbers beyond the range become infinite.
+        In single precision, numbers that would be rounded to zero become the smallest normal number,
+        because a nonzero divisor must stay nonzero; numbers beyond the range become infinite.
         """
         if self.ending and np.isfinite(value) and value != 0.0:
             limits = np.finfo(np.float32)
@@ -145,13 +148,13 @@ def c_lines(
     of: str = "v",
     known: Mapping[Node, str] = MappingProxyType({}),
 ) -> Iterator[str]:
-    """Yield lines that assign the named nodes, as `const double name = ...;`, after the lines they need.
+    """Yield lines that assign the named nodes, such as `const double name = ...;`, in order.
 
     Args:
         named: the nodes by name; a name that is not an identifier, such as `P[0][0]`, is assigned to.
-        inputs: names of the graph's inputs, by place.
+        inputs: names of the inputs of the graph, by place.
         precision: precision of the numbers.
-        of: first letter of the names of additional lines.
+        of: first letter of the names of further variables, which are assigned first.
         known: names of nodes that earlier lines define.
     """
     everything = needed(named.values(), known)
@@ -244,7 +247,7 @@ def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str], precision
 
 
 def _equality(node: Node, numbers: list[Text], precision: Precision) -> Text:
-    """Write a comparison of numbers for equality without `==`, which compilers warn about."""
+    """Write a comparison of numbers for equality without `==`, because compilers warn about it."""
     first, last = (each.text for each in numbers)
     is_unequal = node.operation is operator.ne
     if node.arguments[1].operation is CONSTANT and not node.arguments[1].value:
@@ -254,7 +257,7 @@ def _equality(node: Node, numbers: list[Text], precision: Precision) -> Text:
 
 
 def _power(base: str, exponent: int, precision: Precision) -> Text:
-    """Write a power by repeated squaring, as kernels do."""
+    """Write a power by repeated squaring, as in kernels."""
     found, square, rest = "", base, abs(exponent)
     while rest:
         if rest & 1:
@@ -272,7 +275,7 @@ def _power(base: str, exponent: int, precision: Precision) -> Text:
 
 
 def helpers_of(nodes: Collection[Node], precision: Precision) -> list[str]:
-    """Return the functions that these nodes need and C lacks."""
+    """Return the functions that these nodes need and that C lacks."""
     used = {node.operation for node in nodes}
     compared = [_IS_EQUAL] if used & {operator.eq, operator.ne} else []  # left out if it is not called
     texts = [text for operation, (_, text) in HELPERS.items() if operation in used]

@@ -1,15 +1,15 @@
-"""Exact forward differentiation of graphs: how each number changes with chosen inputs.
+"""Exact forward differentiation of graphs with respect to chosen inputs.
 
 Griewank and Walther, Evaluating Derivatives, chapter 3. Only derivatives that can differ from zero are
 computed, so the sparsity pattern of a Jacobian is also known. If a derivative does not exist or is
-infinite at one point, its value there is defined:
+infinite at a point, its value is defined as follows:
 
-- `sqrt`, `cbrt`, `hypot`, `arctan2` and `abs` have slope 0 where their arguments are 0: the mean of both
-  sides of `abs`, and no NaN from the length of a zero vector;
-- the minimum and the maximum of two equal numbers have the slopes of the first;
-- step functions (`floor`, `round`, `sign`, `//`) have slope 0 everywhere, `a % b` that of
+- `sqrt`, `cbrt`, `hypot`, `arctan2` and `abs` have slope 0 at arguments of 0, which is the mean of both
+sides of `abs` and avoids NaN for the length of a zero vector; - the minimum and the maximum of two equal
+numbers have the slopes of the first; - step functions (`floor`, `round`, `sign`, `//`) have slope 0
+everywhere, `a % b` that of
   `a - b floor(a / b)`;
-- a branch has the slopes of the side that is taken.
+- a branch has the slopes of the selected side.
 
 Other infinite derivatives (`log` at 0, `1 / x`) result in slopes that are infinite or NaN.
 """
@@ -42,7 +42,7 @@ def _power_slopes(value: Any, base: Any, exponent: Any) -> tuple[Any, Any]:
     return by_base, where(base == 0.0, 0.0, value * np.log(base))
 
 
-# Derivatives of a function's value by each argument, from its value and its arguments.
+# Derivatives of the value of a function by each argument, from its value and its arguments.
 SLOPES: dict[Any, Callable[..., tuple[Any, ...]]] = {
     operator.neg: lambda v, x: (-1.0,),
     operator.add: lambda v, x, y: (1.0, 1.0),
@@ -86,10 +86,10 @@ Slopes = dict[int, Node]
 
 
 def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes]) -> list[Slopes]:
-    """Compute the derivatives of outputs by the variables of the seeds; missing ones are zero.
+    """Compute the derivatives of outputs by the variables of the seeds; missing derivatives are zero.
 
     Args:
-        trace: trace whose graph contains the nodes and is extended by the derivatives.
+        trace: trace whose graph contains the nodes; the derivatives are added to the graph.
         outputs: nodes to differentiate.
         seeds: derivatives of the inputs by each variable.
     """

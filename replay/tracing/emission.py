@@ -1,4 +1,4 @@
-"""Translation of a graph to instructions of a kernel, and to Python."""
+"""Translation of a graph to instructions of a kernel, or to Python."""
 
 import operator
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ _SIGNS = {
 
 
 def python_of(outputs: Sequence[Node], inputs: dict[Any, str]) -> list[str]:
-    """Return Python lines that compute a graph's outputs and return them as a list."""
+    """Return Python lines that compute the outputs of a graph and return them as a list."""
     lines: list[str] = []
     names: dict[Node, str] = {}
     for node in needed(outputs):

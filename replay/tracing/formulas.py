@@ -1,7 +1,7 @@
-"""Graphs written as readable formulas in Python, which compute the same values.
+"""Writing of graphs as readable Python formulas, which compute the same values.
 
-Expressions that are used more than once, unless they are short, and expressions that would not fit in a
-line get their own lines.
+Long expressions that are used more than once, and expressions that would not fit in a line, are on
+separate lines.
 """
 
 import operator
@@ -16,9 +16,12 @@ from fuselog.replay.tracing.functions import TracedFunction
 from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 from fuselog.replay.tracing.traced import Trace
 
-SHORTEST, LONGEST = 20, 100  # characters: shorter expressions are repeated, longer ones get a line
+SHORTEST, LONGEST = (
+    20,
+    100,
+)  # characters: shorter expressions are repeated, longer ones split
 
-# Precedence of operators: as in Python, except that a remainder is separated from products around it.
+# Precedence of operators, as in Python, except that remainders next to products are in parentheses.
 _CHOICE, _OR, _AND, _NOT, _COMPARISON, _SUM, _REMAINDER, _PRODUCT, _SIGN, _POWER, _WHOLE = range(11)
 _OPERATORS: dict[Any, tuple[str, int]] = {
     operator.or_: ("or", _OR),
@@ -47,7 +50,7 @@ _KNOWN: dict[float, tuple[str, int]] = {
 
 
 class Text(NamedTuple):
-    """A formula or a C expression, and the precedence of its last operation."""
+    """Formula or C expression, with the precedence of its last operation."""
 
     text: str
     binds: int
@@ -63,12 +66,12 @@ def formulas_of(
     outputs: Mapping[str, Node],
     by: Mapping[Any, str],
 ) -> list[str]:
-    """Return lines `name = formula` of a function's outputs and their nonzero derivatives.
+    """Return lines `name = formula` for the outputs of a function and their nonzero derivatives.
 
     Args:
         function: the function.
         inputs: names of its inputs, by place.
-        outputs: its nodes, by name.
+        outputs: its output nodes, by name.
         by: names of the inputs by which it is differentiated, by place.
     """
     trace, names = Trace(function.graph, {}), list(by.values())
@@ -86,7 +89,7 @@ def formulas_of(
 
 
 def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str]:
-    """Yield a line for each named node, after the lines that it needs."""
+    """Yield a line for each named node, after the lines on which it depends."""
     everything = needed(named.values())
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
@@ -110,7 +113,7 @@ def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str
 
 
 def _text_of(node: Node, given: list[Text], inputs: Mapping[Any, str]) -> Text:
-    """Write a node as a formula of its arguments' formulas."""
+    """Write a node as a formula, given the formulas of its arguments."""
     operation = node.operation
     if operation is INPUT:
         return Text(inputs[node.value], _WHOLE)

@@ -1,8 +1,9 @@
-"""Tracing of models' functions: called directly if kernels are plain Python, as graphs otherwise.
+"""Tracing of the functions of models, which plain-Python kernels call directly instead.
 
-A model's function takes tuples of numbers, numbers, parameters (a NamedTuple of numbers), and sometimes
-arrays that it changes; it returns a tuple of numbers, or one number. `Argument`s describe what it takes.
-It is called once for every path through its conditions; selections join the results.
+The arguments of a model's function are tuples of numbers, numbers, parameters (a NamedTuple of numbers),
+and sometimes arrays that it changes; the result is a tuple of numbers or one number. `Argument`
+describes the arguments. To trace a function, it is called once for every path through its conditions,
+and selections join the results.
 """
 
 import re
@@ -38,19 +39,19 @@ _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
-    """An array of these sizes, which the function reads and changes."""
+    """Array of these sizes, which the function reads and changes."""
 
     sizes: tuple[int, ...]
 
 
-# a tuple of this many numbers; the names of parameters; an array; a number (None)
+# size of a tuple of numbers; names of parameters; an array; or None for a number
 Argument = int | tuple[str, ...] | Shape | None
 
 
 class Result(NamedTuple):
-    """Result of a function: the nodes that it returns, and whether they are one number or a tuple.
+    """Result of a function: the returned nodes, and whether they are a single number or a tuple.
 
-    `written` are the array entries that it changes: argument, index, and node.
+    `written` has the array entries that the function changes: argument, index, and node.
     """
 
     returned: tuple[Node, ...]
@@ -59,7 +60,7 @@ class Result(NamedTuple):
 
 
 class TracedFunction:
-    """A function of a model, with its graph."""
+    """Function of a model, with its graph."""
 
     def __init__(self, function: Callable[..., Any], arguments: Sequence[Argument]) -> None:
         self.function = function
@@ -67,7 +68,7 @@ class TracedFunction:
         self.__name__ = getattr(function, "__name__", "function")
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the function; for traced numbers, inline its graph in theirs."""
+        """Call the function; for traced numbers, copy its graph into their graph."""
         found = trace_of(arguments)
         if found is None or self.result.written:
             return self.function(*arguments)
@@ -81,16 +82,16 @@ class TracedFunction:
 
     @cached_property
     def result(self) -> Result:
-        """The traced result; raises BadInput, with line and advice, if tracing is impossible."""
+        """Traced result; raises BadInput, with line and advice, if tracing is impossible."""
         return trace(self.graph, self.function, self.arguments)
 
     @property
     def outputs(self) -> list[Node]:
-        """All nodes that the function returns and writes."""
+        """All nodes that the function returns or writes."""
         return [*self.result.returned, *(node for _, _, node in self.result.written)]
 
     def kernel_identity(self) -> str:
-        """Return the part of a kernel's key that depends on the graph."""
+        """Return the part of the kernel key that depends on the graph."""
         return self._identity
 
     @cached_property
@@ -112,7 +113,7 @@ class TracedFunction:
 
 
 class Derivative:
-    """A function that returns the values of a traced function and selected derivatives.
+    """Function that returns the values of a traced function and selected derivatives.
 
     Args:
         function: the function.
@@ -134,7 +135,7 @@ class Derivative:
 
     @cached_property
     def entries(self) -> dict[Any, Node]:
-        """The derivatives by place, without those that are zero."""
+        """Nonzero derivatives by place."""
         trace = Trace(self.function.graph, {})
         returned = self.function.result.returned
         slopes = slopes_of(trace, returned, self._seeds(trace))
@@ -152,7 +153,7 @@ class Derivative:
         return [*self.function.result.returned, *self.entries.values()]
 
     def kernel_identity(self) -> str:
-        """Return the part of a kernel's key that depends on the graph."""
+        """Return the part of the kernel key that depends on the graph."""
         return _digest([repr(self.function.arguments), repr(self.places), *described(self.outputs)])
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
@@ -160,9 +161,9 @@ class Derivative:
         return tuple(_called(program, emitter, self.function, self.outputs, arguments))
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
-        """Return the values from the function itself, and the derivatives from the graph.
+        """Compute the values by the function itself, and the derivatives by the graph.
 
-        For traced numbers, both come from the graph, which is inlined in theirs.
+        For traced numbers, both are computed by the graph, which is copied into their graph.
         """
         found = trace_of(arguments)
         if found is not None:
@@ -172,7 +173,7 @@ class Derivative:
 
     @cached_property
     def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
-        """Places of inputs that the derivatives need, and a function that computes the derivatives."""
+        """Places of the inputs that derivatives need, and a function that computes the derivatives."""
         nodes = list(self.entries.values())
         places = [node.value for node in needed(nodes) if node.operation == INPUT]
         names = {place: f"x{index}" for index, place in enumerate(places)}
@@ -184,7 +185,7 @@ class Derivative:
 
 
 def arguments_like(values: Sequence[Any]) -> tuple[Argument, ...]:
-    """Describe arguments such as these values."""
+    """Describe the types of these argument values."""
     return tuple(
         (getattr(each, "_fields", None) or len(each)) if isinstance(each, tuple) else None
         for each in values
@@ -201,7 +202,7 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """Return the numbers of a graph's outputs by calling a separate function of the inputs they need."""
+    """Return the output numbers of a graph, by a call of a separate function of the needed inputs."""
     places = [node.value for node in needed(outputs) if node.operation == INPUT]
     key = "graph", *places, *described(outputs)
     if key not in program.instances:
@@ -333,7 +334,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """Return a function's name, with its file and line or those at which its own code failed."""
+    """Return the name of a function, with its file and line, or those of an error in its code."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())
@@ -359,12 +360,12 @@ _KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
-    """Return a function as a traced one, as the same object while the function does not change.
+    """Return the traced form of a function: the same object as long as the function does not change.
 
-    It is traced again if what it reads has changed or may have changed; see `reads`. None and functions
-    that are already traced are returned unchanged.
+    A function is traced again if the values that it reads have changed or may have changed; see `reads`.
+    None and functions that are already traced are returned unchanged.
 
-    Raises BadInput if it cannot be traced, or gives another result when it is traced again.
+    Raises BadInput if the function cannot be traced, or has a different result when it is traced again.
     """
     if function is None or isinstance(function, TracedFunction):
         return function

@@ -1,8 +1,8 @@
-"""Expression graphs: numbers computed from others, without duplicates, and with constants folded.
+"""Expression graphs without duplicates and with folded constants.
 
 A node is an operation of Python or NumPy on other nodes; equal nodes are the same object.
-Simplifications preserve all bits with one exception: zero times anything is zero, so that independence
-of an input costs nothing.
+Simplifications preserve all bits with one exception: zero times anything is zero, so that an independent
+input costs nothing.
 """
 
 import math
@@ -41,7 +41,7 @@ _COMMUTATIVE = (operator.add, operator.mul)
 
 
 class Node:
-    """A number or a truth value: an operation, its arguments, and its constant."""
+    """Number or truth value: an operation, its arguments, and its constant."""
 
     __slots__ = ("arguments", "is_truth", "number", "operation", "value")
 
@@ -60,12 +60,12 @@ class Node:
         return self.operation is CONSTANT
 
     def is_number(self, value: float) -> bool:
-        """Test whether it is known to be this number."""
+        """Test whether the node is known to be this number."""
         return self.operation is CONSTANT and not self.is_truth and self.value == value
 
 
 class Graph:
-    """The nodes of one function, in an order in which they can be computed."""
+    """Nodes of one function, in an order in which they can be computed."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -181,9 +181,9 @@ def _power(base: float, exponent: int) -> float:
 
 
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
-    """Return all nodes that the outputs depend on, including these, in an order of computation.
+    """Return all nodes on which the outputs depend, including the outputs, in order of computation.
 
-    Known nodes are included, but not the nodes that only they depend on.
+    Known nodes are included, but not the nodes on which only they depend.
     """
     found: set[Node] = set()
     waiting = list(outputs)
@@ -196,7 +196,7 @@ def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
 
 
 def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:
-    """Find nodes that should be computed before a loop: constant in it, and containing a function call.
+    """Find nodes to compute before a loop: they are constant in it and contain a function call.
 
     Args:
         outputs: outputs of the loop.
@@ -215,7 +215,7 @@ def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Nod
 
 
 def described(outputs: Iterable[Node]) -> Iterator[str]:
-    """Yield a digest of each output that only depends on its graph, not on anything else traced."""
+    """Yield a digest of each output that depends only on its own part of the graph."""
     outputs = list(outputs)
     words: dict[Node, str] = {}
     for node in needed(outputs):

@@ -1,4 +1,4 @@
-"""Inlining of graphs in others, when a traced function is called with traced numbers."""
+"""Copying of a graph into another one when a traced function is called with traced numbers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from fuselog.replay.tracing.traced import Trace, Traced
 
 
 class Parameters:
-    """The parameters of a function during tracing."""
+    """Parameters of a function during tracing."""
 
     def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
         self.trace, self._argument, self._names = trace, argument, names
@@ -23,7 +23,7 @@ class Parameters:
         return (getattr(self, name) for name in self._names)
 
 
-# traces in progress, in any thread; without any, all numbers are known
+# traces in progress, in any thread; without traces, all numbers are known
 _AT_WORK: list[Trace] = []
 
 
@@ -38,7 +38,7 @@ def tracing(trace: Trace) -> Iterator[None]:
 
 
 def trace_of(arguments: Sequence[Any]) -> Trace | None:
-    """Return the trace of the traced numbers among these arguments; None if there are none."""
+    """Return the trace of the traced numbers in these arguments; None if no number is traced."""
     return _found(arguments) if _AT_WORK else None
 
 
@@ -58,7 +58,7 @@ def _found(arguments: Sequence[Any]) -> Trace | None:
 def inlined(
     trace: Trace, outputs: Sequence[Node], number_at: Callable[[Any], Any]
 ) -> tuple[Traced, ...]:
-    """Copy nodes of one graph to another, with numbers of the latter in place of the inputs."""
+    """Copy nodes of one graph to another, and replace the inputs by numbers of the other graph."""
     graph, found = trace.graph, dict[Node, Node]()
     for node in needed(outputs):
         given = [found[each] for each in node.arguments]

@@ -1,9 +1,10 @@
-"""Detection of what a function reads besides its arguments, to know whether it would do the same again.
+"""Detection of the values that a function reads in addition to its arguments.
 
-This is only possible if everything is visible and cannot change unnoticed: the code, defaults and
-closure of the function, and the globals and attributes of modules that its bytecode names. Each of them
-must be a number, a string, a tuple of these, a function without state, or a Python function for which
-the same holds. A list, an array, an attribute of an object, a file and a clock may change unnoticed.
+If these values have not changed, another call gives the same result. The detection is possible only if
+all values are visible and cannot change unnoticed: the code, defaults and closure of the function, and
+the globals and attributes of modules that its bytecode names. Each of them must be a number, a string, a
+tuple of these, a function without state, or a Python function with the same properties. A list, an
+array, an attribute of an object, a file and a clock may change unnoticed.
 """
 
 import builtins
@@ -29,7 +30,7 @@ _OF_NUMPY = (
     "identity inner interp ones outer prod reshape round around searchsorted sinc stack sum trace "
     "transpose vstack where zeros float64"
 )
-# Functions whose results only depend on their arguments; referenced here, so that their ids are not
+# Functions whose results depend only on their arguments; referenced here so that their ids are not
 # reused.
 _PURE = {
     id(each): each
@@ -53,10 +54,10 @@ def pure(kind: type[Made]) -> type[Made]:
 
 
 class Reads(NamedTuple):
-    """The places that a function reads, and their values.
+    """Places that a function reads, and their values.
 
     Attributes:
-        functions: the function and those that it calls, with their code and defaults.
+        functions: the function and the functions that it calls, with their code and defaults.
         cells: cells of closures.
         names: globals and attributes of modules.
     """
@@ -81,13 +82,13 @@ class Reads(NamedTuple):
 
 
 def reads_of(function: Any) -> Reads | None:
-    """Find what a function reads; None if any of it may change unnoticed."""
+    """Find the values that a function reads; None if one of them may change unnoticed."""
     reads = Reads([], [], [])
     return reads if _sees(reads, function) else None
 
 
 def _sees(reads: Reads, value: Any) -> bool:
-    """Record what a value reads, and return whether nothing of it can change unnoticed."""
+    """Record what a value reads; return False if anything may change unnoticed."""
     if type(value) in _IMMUTABLE or id(value) in _PURE:
         return True
     if type(value) is tuple:
@@ -131,13 +132,13 @@ def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
 
 @lru_cache(maxsize=1024)
 def _chains(code: CodeType) -> tuple[tuple[str, ...], ...] | None:
-    """Return the globals that code names, with attributes after them; None if it uses names otherwise.
+    """Return the globals that code names, with their attributes; None if it uses names in other ways.
 
-    Imports, classes, assignments to globals or attributes, and `__attributes__` do so.
+    Other ways are imports, classes, assignments to globals or attributes, and `__attributes__`.
     """
     instructions = [each for each in dis.get_instructions(code) if each.opname != "EXTENDED_ARG"]
     chains: list[list[str]] = []
-    is_open = False  # whether a following attribute belongs to the last chain
+    is_open = False  # whether the next attribute belongs to the last chain
     for each in instructions:
         if each.opname == "LOAD_GLOBAL":
             chains.append([each.argval])

@@ -1,8 +1,8 @@
-"""Traced numbers: a model's function is called with them, which results in its graph.
+"""Traced numbers, with which a model's function is called to record its graph.
 
-They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects.
-Conditions that depend on them are followed on both paths (see `functions`). Uses that would fix an
-unknown value, such as float() or an index, raise an error with advice.
+They support Python's operators and NumPy's functions of numbers, even inside arrays of objects.
+Conditions that depend on them are followed on both paths (see `functions`). Uses that need a known
+value, such as float() or an index, raise an error with advice.
 """
 
 import linecache
@@ -18,7 +18,7 @@ from fuselog.replay.tracing.graph import Graph, Node
 
 
 class CannotTrace(TypeError):
-    """Error that explains what a graph cannot represent, and what to write instead."""
+    """Error for operations that a graph cannot represent, with advice on alternatives."""
 
 
 MOST_WAYS = 256
@@ -40,7 +40,7 @@ def refused(what: str) -> CannotTrace:
 
 
 def too_many_ways() -> CannotTrace:
-    """Make the error for too many conditions, which may also come from an endless loop."""
+    """Make the error for too many conditions, which may be due to an endless loop."""
     return CannotTrace(
         f"there are more than {MOST_WAYS} paths through its `if`s and `while`s on numbers that are only "
         "known later; write np.clip or np.where, and a fixed number of iterations"
@@ -48,7 +48,7 @@ def too_many_ways() -> CannotTrace:
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
-    """A number of a graph, which grows as the number is used."""
+    """Number of a graph, which grows when the number is used."""
 
     __slots__ = ("node", "trace")
 
@@ -60,7 +60,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         return f"traced number {self.node.number}"
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        options.pop("out", None)  # of `x += y`, which can also make a new number
+        options.pop("out", None)  # of `x += y`, which may also make a new number
         if method != "__call__":
             raise CannotTrace(f"it uses np.{ufunc.__name__}.{method}; write it with operators")
         if options:
@@ -100,7 +100,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 class Trace:
-    """One call of a function with traced numbers: the graph, and the path through its conditions."""
+    """Call of a function with traced numbers: the graph, and the path through the conditions."""
 
     def __init__(self, graph: Graph, decisions: dict[Node, bool]) -> None:
         self.graph = graph
@@ -108,7 +108,7 @@ class Trace:
         self.more: list[Node] = []  # newly reached conditions
 
     def decided(self, number: Traced) -> bool:
-        """Return the path at a condition: a new one is true at first, and tried the other way later."""
+        """Return the path at a condition; a new condition is true first, and false in a later call."""
         node = (
             number.node
             if number.node.is_truth
@@ -117,7 +117,7 @@ class Trace:
         if node.is_constant:
             return bool(node.value)
         if node not in self.decisions:
-            if len(self.more) == MOST_WAYS:  # each is tried the other way later
+            if len(self.more) == MOST_WAYS:  # each is false in a later call
                 raise too_many_ways()
             self.decisions[node] = True
             self.more.append(node)
@@ -135,7 +135,7 @@ class Trace:
 
 
 def where(condition: Any, yes: Any, no: Any) -> Any:
-    """Select one of two numbers; the other may have any value."""
+    """Select one of two numbers; the other number may have any value."""
     numbers = [each for each in (condition, yes, no) if isinstance(each, Traced)]
     if not numbers:
         return yes if condition else no
@@ -147,7 +147,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
-    """Trace `np.interp` over a known table, with the line segment of the last knot before x."""
+    """Trace `np.interp` over a known table, by the line segment after the last knot before x."""
     known_x, known_y = (_known("np.interp", each) for each in (xp, fp))
     found = where(np.isnan(x), x, known_y[0] if left is None else left)
     for k in range(len(known_x) - 1):
@@ -198,7 +198,7 @@ def _log_of_sum(x: Any, y: Any) -> Any:
     return where(x == y, x + np.log(2.0), larger + np.log1p(np.exp(less - larger)))
 
 
-# Functions composed of others; selections ignore NaN in the other alternative.
+# Functions composed of other functions; selections ignore NaN in the other alternative.
 _COMPOSED: dict[Any, Callable[..., Any]] = {
     np.where: where,
     np.minimum: lambda x, y: where((x <= y) | np.isnan(x), x, y),
@@ -243,7 +243,7 @@ _OPERATORS: dict[Any, Any] = {
     np.floor_divide: operator.floordiv,
     np.fabs: np.absolute,
 }
-# Functions that a graph represents directly, besides the operators.
+# Functions that a graph represents directly, in addition to the operators.
 PRIMITIVES = (
     *(np.sqrt, np.cbrt, np.hypot, np.exp, np.exp2, np.expm1, np.log, np.log2, np.log10, np.log1p),
     *(np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.arctan2, np.sinc),
@@ -279,7 +279,7 @@ def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None
 
 
 def _power(trace: Trace, base: Any, exponent: Any) -> Any:
-    """Trace a power; integer exponents become multiplications, as in Python's source."""
+    """Trace a power; integer exponents become multiplications."""
     if isinstance(exponent, int | np.integer):
         return trace.number(trace.graph.power(trace.node_of(base), int(exponent)))
     return trace.number(trace.graph.apply(np.power, trace.node_of(base), trace.node_of(exponent)))

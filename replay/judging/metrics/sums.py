@@ -52,7 +52,7 @@ class BinnedSums:
             part[:, :, 1 + column] += sums.reshape(shape)
 
     def merge(self, other: "BinnedSums") -> None:
-        """Add other sums with the same columns, whose groups begin with or after the first one here."""
+        """Add other sums with the same columns and with no group before the first group here."""
         theirs = other._sums[: other._groups, : other._bins]
         while self.width < other.width:
             self._double()

@@ -1,1 +1,1 @@
-"""Elements for the scenes of any family: canvas, plane, plots; begin with `canvas`."""
+"""Elements of scenes for any family, such as the canvas, planes and plots; begin with `canvas`."""

@@ -1,6 +1,6 @@
-"""Drawings of a sensor's measurements around it, in its own frame with its x axis to the right.
+"""Drawings of measurements around a sensor, in its own frame with the x axis to the right.
 
-Ranges are circles, bearings and lines of sight are rays from the origin, detections are points.
+Ranges are circles, bearings and lines of sight are rays from the origin, and detections are points.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ CORNERS = 49
 
 
 def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DView]:
-    """Draw a sensor's measurements around it, if they have positions in the plane; return the view."""
+    """Draw measurements around a sensor, if they have positions in the plane; return the view."""
     if stream.schema.full_name == schemas.DETECTION.full_name:
         seen = stream["position_m"][:, :2]
         if seen.shape[1] == 2:

@@ -1,8 +1,8 @@
-"""Scene (content of a timeline), canvas (the recording that it is drawn on), and drawing code.
+"""Scene (content of a timeline), canvas (recording on which it is drawn), and drawing code.
 
-A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
-that moves is on three Rerun timelines: `step`, `sim_time` (since the run's epoch) and `utc`. If stamps
-are not dates, as those of a simulated clock in a bag, `utc` is the time of recording.
+A timeline consists of parts: each part sends its columns and returns the view that shows them. Moving
+entities are on three Rerun timelines: `step`, `sim_time` (since the epoch of the run) and `utc`. If
+stamps are not dates, as with a simulated clock in a bag, `utc` is the time of recording.
 """
 
 import re
@@ -27,7 +27,7 @@ Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]
 
-# Okabe and Ito's colours, which everyone can distinguish; red is reserved for faults.
+# Colours by Okabe and Ito, which colour-blind people can distinguish; red is reserved for faults.
 PALETTE: tuple[Colour, ...] = (
     (86, 180, 233),
     (230, 159, 0),
@@ -42,10 +42,10 @@ TRUTH: Colour = (200, 200, 200)
 MUTED: Colour = (130, 130, 130)
 WRONG: Colour = (230, 60, 40)
 
-# The most rows of a moving entity, evenly in time: several per pixel of a plot, and several a second
-# in a log of a quarter of an hour.
+# Largest number of rows of a moving entity, evenly spaced in time: several per pixel of a plot, and
+# several per second in a log of 15 minutes.
 DRAWN_ROWS = 5000
-# A stream has a gap after this multiple of its usual interval, but not before this time.
+# A silence longer than both this multiple of the usual interval and this time is a gap of a stream.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
 # A stream has a rate if half of its intervals differ from the usual one by at most this fraction.
@@ -57,20 +57,20 @@ ESTIMATES = (
     schemas.TRACK_ESTIMATE,
     schemas.SCORE_VECTOR,
 )
-# Stamps before the year 2000 do not count from 1970.
+# Stamps before the year 2000 are not dates.
 DATES_FROM_NS = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One run and the results of the estimators.
+    """One run and the results of estimators.
 
     Attributes:
         source: sensor streams and truth of the run.
         outputs: output streams of this run, by topic.
-        errors: errors of this run's estimates, if there is truth.
+        errors: errors of the estimates of this run, if there is truth.
         focus: the case that is shown first; None for the first one.
-        moments: the moments of the run's largest NEES and errors.
+        moments: the moments of the largest NEES and errors of the run.
         divergences: points at which estimators diverge, by topic of their innovations.
     """
 
@@ -83,7 +83,7 @@ class Scene:
 
     @property
     def estimators(self) -> list[str]:
-        """Return the estimators' labels, in the order in which they were given."""
+        """Return the labels of the estimators, in the given order."""
         names = [split_topic(topic)[0] for topic in self.outputs]
         return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
@@ -95,12 +95,12 @@ class Scene:
         return sorted(found, key=_natural) or [""]
 
     def colour(self, estimator: str) -> Colour:
-        """Return the colour that `estimator` has in all views."""
+        """Return the colour of `estimator` in all views."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
 
     @property
     def spare_colours(self) -> Iterator[Colour]:
-        """Yield colours without end, first those that no estimator has."""
+        """Yield colours endlessly, starting with those that no estimator has."""
         used = len(self.estimators) % len(PALETTE)
         return cycle([*PALETTE[used:], *PALETTE[:used]])
 
@@ -120,7 +120,7 @@ class Scene:
         return named | {name: self.colour(name) for name in self.estimators_of(case)}
 
     def estimators_of(self, case: str) -> list[str]:
-        """Return the estimators that estimate something of `case`."""
+        """Return the estimators with estimates of `case`."""
         own = {name for schema in ESTIMATES for name, _ in self.outputs_of(case, schema)}
         return [name for name in self.estimators if name in own]
 
@@ -144,7 +144,7 @@ class Scene:
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """Return the run's sensor topics below `case` and those below no case, if they can be read."""
+        """Return the readable sensor topics of the run below `case` or below no case."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -155,7 +155,7 @@ class Scene:
 
     @cached_property
     def unread(self) -> dict[str, str]:
-        """Return why messages of some topics cannot be read as columns, such as images, by topic."""
+        """Return, by topic, why its messages (such as images) cannot be read as columns."""
         found: dict[str, str] = {}
         for topic in self.source.topics:
             try:
@@ -165,12 +165,12 @@ class Scene:
         return found
 
     def read(self, topic: str) -> Stream:
-        """Read all of the run's topic `topic`."""
+        """Read all messages of `topic` in the run."""
         return self.source.read([topic])[topic]
 
     @property
     def dates(self) -> "Dates | None":
-        """Return the dates of stamps, from the topic with most messages; None if stamps are dates."""
+        """Return dates of stamps, from the topic with the most messages; None if stamps are dates."""
         streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
         return dates_of(max(streams, key=len)) if streams else None
 
@@ -190,7 +190,7 @@ def _natural(name: str) -> list[tuple[str, int]]:
 
 @dataclass(frozen=True)
 class Dates:
-    """Two clocks: stamps (k,), and by how many ns the dates are later (k,).
+    """Relation of two clocks: stamps (k,), and dates minus stamps in ns (k,).
 
     The difference is linear between two stamps, and constant before the first and after the last.
     """
@@ -207,7 +207,7 @@ class Dates:
 
 
 def dates_of(stream: Stream) -> Dates | None:
-    """Return the dates at which a stream's messages were logged; None if its stamps are dates."""
+    """Return the dates at which the messages of a stream were logged; None if its stamps are dates."""
     stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
     if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
         return None
@@ -223,7 +223,7 @@ class Canvas:
         epoch_ns: the run's time zero.
         end_ns: time of the last estimate or truth.
         steps_ns: distinct times of estimates, which `step` counts.
-        is_still: whether moving entities are not sent, because they have been sent already.
+        is_still: whether moving entities are left out because they have already been sent.
         dates: dates of stamps, if stamps are not dates.
     """
 
@@ -254,16 +254,16 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log properties (`what`) of `entity` that hold at all times, such as a style."""
+        """Log properties (`what`) of `entity` for all times, such as a style."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Drawing of a scenario family.
+    """Drawing code of a scenario family.
 
     Attributes:
-        draw: draw(canvas, scene) sends everything and returns the layout of the views.
+        draw: draw(canvas, scene) sends the whole drawing and returns the layout of the views.
     """
 
     draw: Callable[[Canvas, Scene], rrb.Container | rrb.View]
@@ -282,14 +282,14 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:
-    """Return a case's board with its plots to the right, if there are any, all of equal height."""
+    """Return the panel of a case with its plots, if any, to the right, all of equal height."""
     shares = [float(strips_of(plot)) for plot in plots]
     columns = [board, rrb.Vertical(*plots, row_shares=shares)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
 
 
 def strips_of(board: Board) -> int:
-    """Count the views one below another in a part of a layout."""
+    """Count the views below each other in a part of a layout."""
     if not isinstance(board, rrb.Container):
         return 1
     within = [strips_of(each) for each in board.contents if isinstance(each, rrb.Container | rrb.View)]
@@ -297,7 +297,7 @@ def strips_of(board: Board) -> int:
 
 
 def entity_path(*parts: str) -> str:
-    """Join parts to an entity path, without empty ones, such as the case of a log with only one."""
+    """Join parts to an entity path, ignoring empty parts, such as the only case of a log."""
     return "/".join(part for part in parts if part)
 
 
@@ -307,7 +307,7 @@ def escaped(entity: str) -> str:
 
 
 def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows to draw: all of them, or the last one in each of `rows` equal spans of time.
+    """Return the rows to draw: all rows, or the last row in each of `rows` equal spans of time.
 
     Args:
         time_ns: (n,), in order.
@@ -320,7 +320,7 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a curve to draw: all of them, or the minimum and maximum of each span of time.
+    """Return the rows of a curve to draw: all rows, or the minimum and maximum of each span of time.
 
     Args:
         time_ns, values: (n,), in order of time.
@@ -332,9 +332,9 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
 
 
 def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a scatter plot to draw: all of them, or `rows` at random, in order.
+    """Return the rows of a scatter plot to draw: all rows, or a random selection of `rows`, in order.
 
-    Extremes as for a curve would leave out the points in between, which are the majority.
+    Extremes, as for a curve, would leave out the points in between, which are the majority.
     """
     if count <= rows:
         return np.arange(count)
@@ -342,10 +342,10 @@ def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
-    """Return the rows of the minimum and maximum of every span, the first one among equals.
+    """Return the rows of the minimum and maximum of every span; among equal values, the first.
 
     Args:
-        of_span: (n,), sorted index of each value's span, from zero on.
+        of_span: (n,), sorted index, from zero, of each value's span.
         values: (n,); NaN is never an extreme.
     """
     first = np.flatnonzero(np.diff(of_span, prepend=-1))
@@ -364,10 +364,10 @@ def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
 
 
 def gap_limit_ns(time_ns: Times) -> int:
-    """Compute how long a stream with these sorted times may be silent before this counts as a gap.
+    """Compute the longest silence of a stream with these sorted times that is not a gap.
 
-    A stream without a rate, such as gunshots or objects seen by a camera, comes in bursts. Its limit is
-    based on the pauses that make up half of its time, without the longest one.
+    A stream without a rate, such as gunshots or objects seen by a camera, has bursts. Its limit is based
+    on the pauses that make up half of its time, without the longest pause.
     """
     intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)
     usual_ns = usual_interval_ns(time_ns)

@@ -18,14 +18,14 @@ from fuselog.replay.timeline.drawing.plane import (
     turn_up,
 )
 
-# Height of a line of text below the ellipses, as a fraction of the picture above it.
+# Height of a line of text below the ellipses, as a fraction of the height of the picture.
 LINE_SHARE = 0.1
 
 
 def draw_close_up(canvas: Canvas, scene: Scene, case: str) -> rrb.Spatial2DView | None:
-    """Draw the errors of a case in which each estimator has one estimate, with NEES below them.
+    """Draw the errors of a case in which each estimator has a single estimate, with the NEES below.
 
-    Return None if there are more estimates, or none with a position.
+    Return None if there are more estimates, or if no estimate has a position.
     """
     found = [each for each in scene.errors_of(case) if not each.is_bound]
     placed = [each for each in found if set(PLANE) <= set(each.components)]

@@ -1,4 +1,4 @@
-"""Curves with logarithmic axes, one view per panel, because Rerun's plots only have time as an axis."""
+"""Curves with logarithmic axes, one view per panel, because plots of Rerun support only time axes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -14,12 +14,12 @@ from fuselog.replay.timeline.drawing.canvas import MUTED, Canvas, Colour
 from fuselog.replay.timeline.drawing.plane import GRID, Stroke, bounds_of, turn_up, with_legend
 from fuselog.replay.timeline.sinks import open_recording
 
-# Distance of an axis' numbers from the edge, as a fraction of the panel.
+# Distance of the numbers of an axis from the edge, as a fraction of the panel.
 LABEL_SHARE = 0.08
 
 
 class CurvePanel(NamedTuple):
-    """Curves of a view: name with its axes, positive points (n, 2) by curve, and strokes by curve."""
+    """Curves of a view: name with axes, positive points (n, 2) by curve, and strokes by curve."""
 
     name: str
     curves: Mapping[str, Floats]

@@ -1,4 +1,4 @@
-"""Event log of a run: worst moments, rejected and late measurements, failures, gaps."""
+"""Event log of a run: worst moments, rejected and out-of-sequence measurements, failures, gaps."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ NOT_SENSED = frozenset(
 )
 
 
-# Meaning of components on a receiver's solution, numbered as in RTKLIB, and on a body.
+# Meaning of components for the solution of a receiver, numbered as in RTKLIB, and for a body.
 STATES: Mapping[str, Mapping[float, str]] = {
     "quality": {
         1: "solution fixed",
@@ -51,7 +51,7 @@ STATES: Mapping[str, Mapping[float, str]] = {
 class Happened(NamedTuple):
     """Events of an estimator or a sensor: a text for each time, all of one level.
 
-    `part` is the entity below that of `who`, if the events have one of their own.
+    `part` is the entity below that of `who`, if the events have a separate entity.
     """
 
     who: str
@@ -64,7 +64,7 @@ class Happened(NamedTuple):
 def above_events(
     board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
 ) -> rrb.Container:
-    """Return a board above events, if there are any; the board is `share` times as high."""
+    """Return a panel above events, if there are any; the panel is `share` times as high."""
     return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
 
 
@@ -76,10 +76,10 @@ def draw_events(
     also: Iterable[Happened] = (),
     more: Collection[str] = (),
 ) -> list[rrb.TextLogView]:
-    """Draw the events of a case, one entity per estimator and sensor; no view if there are none.
+    """Draw the events of a case, one entity per estimator and sensor; return no view without events.
 
-    `not_drawn` gives the reasons why topics have no drawing, besides unreadable topics; `also` are
-    events from the scenario family; `more` are other cases whose worst moments are included.
+    `not_drawn` has the reasons why topics have no drawing, in addition to unreadable topics; `also` has
+    events of the scenario family; `more` has other cases whose worst moments are included.
     """
     root = entity_path("events", case)
     reasons = {**scene.unread, **(not_drawn or {})}
@@ -124,7 +124,7 @@ def _of_moments(scene: Scene, cases: Collection[str]) -> Iterator[Happened]:
 
 
 def _of_divergences(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield the points at which estimators diverge, unless a diagnosis has found the cause."""
+    """Yield the points at which estimators diverge, unless a diagnosis has already found the cause."""
     diagnosed = {estimator for estimator, _ in scene.outputs_of(case, schemas.DIAGNOSED)}
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         if stream.topic in scene.divergences and estimator not in diagnosed:
@@ -174,7 +174,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
-    """Describe rejected measurements by the sensors that have a message of the same stamp and target."""
+    """Describe rejected measurements by the sensors with a message of the same stamp and target."""
     sensed = {
         _within(topic, case): scene.read(topic)
         for topic in scene.topics_near(case)
@@ -223,7 +223,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
-    """Yield changes of the state that a sensor reports of its solution or its body, see STATES."""
+    """Yield changes of the state of the solution or body that a sensor reports; see STATES."""
     if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
         return
     for column, component in enumerate(stream.components):
@@ -235,7 +235,7 @@ def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
 
 
 def _gaps(stream: Stream) -> Times:
-    """Find gaps much longer than a sensor's usual interval: (n, 2), start and end."""
+    """Find gaps (n, 2), start and end, that are much longer than the usual interval of a sensor."""
     times = stream.publish_time_ns
     long = np.diff(times) > gap_limit_ns(times)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)

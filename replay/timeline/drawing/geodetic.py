@@ -1,6 +1,6 @@
 """Maps of the earth with points by latitude and longitude.
 
-The tiles of the map come from the network; without it, the points are still at their positions.
+The tiles of the map are loaded from the network; offline, the points are still drawn at their positions.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ QUALITIES: tuple[tuple[float, Colour], ...] = (
 )
 POOR: Colour = (120, 95, 60)
 SHOWN_SHARE = 0.9
-# Positions are far off beyond this multiple of the displayed extent.
+# Positions beyond this multiple of the displayed extent are far off.
 FAR = 10.0
 # Approximate width of the map and width of its tiles.
 MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
@@ -35,9 +35,9 @@ def degrees_of(stream: Stream) -> Floats:
 
 
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
-    """Draw geodetic fixes as points connected by a thin line; positions that are far off are left out.
+    """Draw geodetic fixes as points connected by a thin line, without positions that are far off.
 
-    Points are coloured by the standard deviation that fixes state, otherwise with `colour`.
+    Points are coloured by the stated standard deviation of the fixes, otherwise with `colour`.
     """
     degrees = degrees_of(stream)
     rows = np.flatnonzero(are_near(degrees))
@@ -66,7 +66,7 @@ def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
     """Return colours (n, 3) of fixes by their mean standard deviation.
 
     Args:
-        covariance_m2: (n, d * d), row-major; d is 0 if fixes have none.
+        covariance_m2: (n, d * d), row-major; d is 0 if fixes have no covariance.
         unknown: colour if it is NaN.
     """
     size = round(covariance_m2.shape[1] ** 0.5)
@@ -86,9 +86,9 @@ def map_view(
 
     Args:
         canvas: the canvas.
-        root: entity that is shown.
+        root: entity to show.
         degrees: latitude and longitude of positions in deg, (n, 2).
-        paths: entities that are shown up to `trail_s` before the cursor.
+        paths: entities to show up to `trail_s` before the cursor.
         trail_s: length of these trails in s.
     """
     near = are_near(degrees)
@@ -103,13 +103,13 @@ def map_view(
 
 
 def usual(places: Floats) -> Floats:
-    """Compute corners (2, d) that contain most positions, so that outliers do not shrink the picture."""
+    """Compute corners (2, d) of a box around most positions, so that outliers do not shrink the view."""
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     return np.nanquantile(places, [tail, 1.0 - tail], axis=0)
 
 
 def are_near(places: Floats) -> NDArray[np.bool_]:
-    """Find the positions that are not far off; the map's view centres on everything in it."""
+    """Find the positions that are not far off, because the view of a map centres on all its points."""
     low, high = usual(places)
     margin = FAR * (high - low).max()
     return ((places >= low - margin) & (places <= high + margin)).all(axis=1)

@@ -1,8 +1,8 @@
 """Scenes in the plane: paths, poses, covariance ellipses, numbered points, lines of sight.
 
-True coordinates are sent. In Rerun's 2D views y points down, so everything below `map` has a transform
-that makes it point up. Moving objects are logged at their time and disappear when they are no longer
-current; a path has one segment per row, and the view shows the last minute of it.
+Coordinates are sent unchanged. In Rerun's 2D views, y points down, so all entities below `map` have a
+transform that makes y point up. Moving objects are logged at their time and disappear when they are no
+longer current; a path has one segment per row, and the view shows its last minute.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,22 +36,24 @@ ROOT = "map"
 GRID: Colour = (45, 45, 45)
 TRAIL_S = 60.0
 ELLIPSE_VERTICES = 24
-# The lines of a scan stay for this multiple of the usual interval between scans.
+# The lines of a scan stay visible for this multiple of the usual interval between scans.
 SHOWN_INTERVALS = 1.5
-# The most particles drawn, always all those of a stamp; the area of each is proportional to its weight.
+# Largest number of particles drawn; all particles of a stamp are drawn, or none. Areas are proportional
+# to weights.
 CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
-# Margin as a fraction of a side, and the shortest side that counts as a fraction of the longer one.
+# Margin as a fraction of a side, and smallest length of the shorter side as a fraction of the longer
+# one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
 LEGEND = "Legend"
-# A legend's row: its width and the gap between names in characters, its height in them and in the board.
+# Row of a legend: width and gap between names in characters; height in characters and in the panel.
 LEGEND_CHARACTERS, LEGEND_GAP, LEGEND_ROW, LEGEND_SHARE = 100.0, 5.0, 6.0, 0.07
-# Points closer than this fraction of the map's extent share one label.
+# Points closer than this fraction of the extent of the map share one label.
 LABEL_SHARE = 0.04
 
 
 class Stroke(NamedTuple):
-    """Style of a line: colour, and radius in pixels. Wide lines are drawn below narrow ones."""
+    """Style of a line: colour and radius in pixels; wide lines are drawn below narrow ones."""
 
     colour: Colour
     radius_px: float = 1.0
@@ -79,9 +81,9 @@ def turn_up(canvas: Canvas, root: str = ROOT) -> None:
 def draw_points(
     canvas: Canvas, entity: str, numbers: NDArray[np.int64 | np.str_], places: Floats
 ) -> None:
-    """Draw fixed points with their numbers or names; close ones share a label below the lowest.
+    """Draw fixed points with their numbers or names; close points share a label below the lowest.
 
-    Viewers draw in single precision; a point that is infinite in it is left out.
+    Viewers draw in single precision; points that are infinite in single precision are left out.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
@@ -228,7 +230,7 @@ def draw_polygons(
 
 
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
-    """Draw the path of a point: each row is the segment from the position before.
+    """Draw the path of a point; each row is the segment from the previous position.
 
     Args:
         canvas, entity, time_ns, places, stroke: as for `draw_dots`.
@@ -239,11 +241,11 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 
 
 def draw_way(canvas: Canvas, entity: str, places: Floats) -> None:
-    """Draw the whole true path of a point, faintly, also ahead of the cursor.
+    """Draw the whole true path of a point as a faint line, including the part after the cursor.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
-        places: (n, 2), in m; unknown ones are NaN.
+        places: (n, 2), in m; unknown positions are NaN.
     """
     known = places[np.isfinite(places).all(axis=1)].astype(np.float32)
     style = Stroke(TRUTH).fields() | {"colors": [(*TRUTH, 70)], "draw_order": 0.0}
@@ -284,7 +286,7 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
 
     Args:
         canvas, entity, time_ns, stroke: as for `draw_dots`.
-        outlines: (n, vertices, 2), in m; those with NaN are left out.
+        outlines: (n, vertices, 2), in m; outlines with NaN are left out.
     """
     good = np.isfinite(outlines).all(axis=(1, 2))
     times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
@@ -294,7 +296,7 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
 
 
 def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
-    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if not positive definite.
+    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if one is not positive definite.
 
     Args:
         means, covariances: (n, 2), (n, 2, 2).
@@ -321,9 +323,9 @@ def draw_lines(
     radius_px: float = 0.75,
     interval_ns: float | None = None,
 ) -> None:
-    """Draw the lines of one time, a scan, together.
+    """Draw the lines of one stamp, which are a scan, together.
 
-    They are replaced by the next scan, and disappear if that comes later than usual.
+    The next scan replaces them; they disappear if it is later than usual.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
@@ -350,7 +352,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Return times and numbers of objects; the number becomes zero `shown_ns` after the last ones."""
+    """Return times and numbers of objects; a number becomes zero `shown_ns` after the last object."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])
@@ -368,11 +370,11 @@ def plane_view(
     *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
-    """Make a view with a grid that shows at least some positions.
+    """Make a view with a grid that contains the given positions.
 
     Args:
         canvas: the canvas.
-        root, others: entities that are shown.
+        root, others: entities to show.
         paths: entities that are shown up to `trail_s` before the cursor.
         places: (n, 2), in m.
         trail_s: length of these trails in s.
@@ -402,13 +404,13 @@ def bounds_of(places: Floats) -> tuple[Floats, Floats]:
 
 
 def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board: Board) -> Board:
-    """Return a board with a legend above it: a row of coloured dots with names.
+    """Return a panel with a legend above it, a row of coloured dots with names.
 
     Args:
         canvas: the canvas.
         name: name of the legend, unique in the layout.
-        colours: colours by name; without any, the board is returned unchanged.
-        board: a scene, or several with the same colours.
+        colours: colours by name; without colours, the panel is returned unchanged.
+        board: the panel of a scene, or of several scenes with the same colours.
     """
     if not colours:
         return board
@@ -435,7 +437,7 @@ def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board:
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
-    """Return the time range that ends at the cursor and is `trail_s` long, on every timeline."""
+    """Return the time range of length `trail_s` that ends at the cursor, on every timeline."""
     steps = round(trail_s * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
     cursor = rrb.TimeRangeBoundary.cursor_relative
     begin = cursor(seconds=-trail_s)
@@ -449,7 +451,7 @@ def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
 
 
 def extent_of(places: Floats) -> float:
-    """Compute the longer side of the box around positions (n, 2), ignoring NaN; one if it is zero."""
+    """Compute the longer side of the box around positions (n, 2), ignoring NaN; 1 if it is zero."""
     known = places[np.isfinite(places).all(axis=1)]
     return float(np.ptp(known, axis=0).max()) or 1.0 if len(known) else 1.0
 

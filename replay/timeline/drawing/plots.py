@@ -41,13 +41,13 @@ from fuselog.replay.timeline.drawing.close_up import draw_close_up
 SIGMAS = 2.0
 _AXES = ("w", "x", "y", "z", "vx", "vy", "vz", "yaw", "pitch", "roll")
 _TITLES = {"NEES": "NEES of this run,", "NIS": "NIS of"}
-# The most plots one below another, and the most of them in one tab.
+# Largest number of plots below each other, and largest number in one tab.
 MOST_STRIPS, TAB_STRIPS = 6, 4
-# Fraction of a plot's height that a legend takes: for itself, for each entry, and at most.
+# Height of a legend as a fraction of a plot: constant part, part per entry, and maximum.
 LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
 # The same in the smaller panels of NEES and NIS.
 SMALL_ENTRY, SMALL_MOST = 0.15, 0.7
-# An error plot names the estimators with more than this fraction of errors outside its range.
+# An error plot lists the estimators with more than this fraction of errors outside its range.
 SILENT_SHARE = 0.01
 # Upper end of plots of shares and probabilities, which leaves room for their legends.
 SHARES = 1.5
@@ -71,9 +71,9 @@ LINE, POINTS, SINGLE = line(WIDTH), dots(WIDTH), dots(5.0)
 
 
 class Squares(NamedTuple):
-    """Chi-square values of an estimator with their degrees of freedom; `of` names the components.
+    """Chi-square values of an estimator with their degrees of freedom, and names of the components.
 
-    `of` is empty if the number of degrees is enough.
+    `of`, the names, is empty if the degrees of freedom are a sufficient description.
     """
 
     degrees: int
@@ -86,10 +86,10 @@ class Squares(NamedTuple):
 def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True) -> list[Board]:
     """Draw NEES, errors, NIS and effective particles of a case, at most `MOST_STRIPS` at a time.
 
-    If there are more, errors are in tabs by quantity, and so are the others if they are still too many.
-    Single estimates in the plane are shown close up first, because their plots over time are single
-    points. Without errors or innovations there are no plots. `legend` is False if a scene names the
-    colours.
+    If there are more plots, errors are in tabs by quantity, and the other plots too if there are still
+    too many. Single estimates in the plane are first shown in a close-up, because their plots over time
+    are single points. There are no plots without errors or innovations. `legend` is False if a scene has
+    its own legend.
     """
     errors = draw_errors(canvas, scene, case)
     nees = draw_nees(canvas, scene, case, legend=legend)
@@ -110,14 +110,14 @@ def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 
 
 def in_strips(views: Mapping[str, rrb.View], name: str) -> rrb.Container:
-    """Return views of components one below another, or in tabs by quantity if they are too many."""
+    """Return views of components below each other, or in tabs by quantity if there are too many."""
     if len(views) <= MOST_STRIPS:
         return rrb.Vertical(*views.values(), name=name)
     return _tabs(_by_quantity(views), TAB_STRIPS, name)
 
 
 def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None = None) -> rrb.Tabs:
-    """Return one tab for each group, or several if the group has more than `most` strips."""
+    """Return one tab for each group, or several tabs if a group has more than `most` strips."""
     return rrb.Tabs(
         *(
             rrb.Vertical(*views[first : first + most], name=title)
@@ -129,7 +129,7 @@ def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None 
 
 
 def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
-    """Group views by component: the axes of a vector together, single numbers up to a tab's size."""
+    """Group views by component: axes of a vector together, single numbers up to the size of a tab."""
     groups: dict[str, list[rrb.View]] = {}
     for component, view in views.items():
         groups.setdefault(_vector_of(component), []).append(view)
@@ -146,7 +146,7 @@ def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
 
 
 def _vector_of(component: str) -> str:
-    """Return the quantity of which a component is an axis: position, half size, gyro bias."""
+    """Return the vector quantity to which a component belongs, such as the position or the gyro bias."""
     quantity, unit, _ = shown_unit(component)
     words = quantity.split()
     kept = [word for word in words if word not in _AXES]
@@ -158,7 +158,7 @@ def _vector_of(component: str) -> str:
 
 
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> dict[str, rrb.TimeSeriesView]:
-    """Draw a plot for each component of a case: each estimator's error in its band of +-2 sigma."""
+    """Draw a plot for each component of a case: the error of each estimator in its band of ±2 sigma."""
     found = scene.errors_of(case)
     components = dict.fromkeys(name for errors in found for name in errors.components)
     return {
@@ -195,7 +195,8 @@ def _draw_error(
             names=names, colors=[colour, (*colour, 150)], widths=[scene.width(errors.estimator), 0.0]
         )
         canvas.fix(entity, style)
-    # the most accurate estimator with a credible NEES sets the range, or else the most accurate of all
+    # the most accurate estimator with a credible NEES determines the range, otherwise the most accurate
+    # of all
     credible = list(compress(extents, judged)) or extents
     extent = nice(1.2 * max(min(credible), np.finfo(float).tiny))
     for errors in found:
@@ -230,7 +231,7 @@ def _draw_point(
 def draw_nees(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> list[rrb.TimeSeriesView]:
-    """Draw each estimator's NEES with the bounds of a single run, in a plot per number of components."""
+    """Draw the NEES of each estimator with the bounds of a run, in one plot per number of components."""
     found = [
         Squares(len(errors.components), "", errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
@@ -242,7 +243,7 @@ def draw_nees(
 def draw_nis(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> list[rrb.TimeSeriesView]:
-    """Draw each estimator's NIS as points, in a plot per set of measured components."""
+    """Draw the NIS of each estimator as points, in one plot per set of measured components."""
     found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         innovations = innovations_of(gather([stream]))
@@ -271,7 +272,7 @@ def _draw_squares(
     """Draw chi-square values of one run, as lines or points, and the 95 % band of consistent estimators.
 
     Values above the panel are marked at its upper edge and counted in its title. The panel ends above
-    the band, or, if most values of every estimator are above the band, above those of the best
+    the band or, if most values of all estimators are above the band, above the values of the best
     estimator.
     """
     views = []
@@ -328,7 +329,7 @@ def _mark_above(
 
 
 def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw the probabilities of all modes, in a plot for each estimator; smoothed ones separately."""
+    """Draw the probabilities of all modes, in one plot per estimator; smoothed ones separately."""
     views = []
     for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
         name = stream.topic.rpartition("/")[2]
@@ -342,7 +343,7 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
 
 
 def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw the effective share of each filter's particles."""
+    """Draw the effective share of particles of each filter."""
     plot, found = entity_path("plots", case, "effective"), False
     for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
         share, found = stream["effective"] / stream["particles"], True
@@ -354,7 +355,7 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
 def draw_components(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> dict[str, rrb.TimeSeriesView]:
-    """Draw one plot per component of a case's Gaussian estimates: the estimators' means and truth."""
+    """Draw one plot per component of the Gaussian estimates of a case, with means and truth."""
     found = [("truth", TRUTH, LINE, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         style = line(scene.width(estimator))
@@ -434,7 +435,7 @@ def plot_view(
 
 
 def shown_unit(component: str) -> tuple[str, str, float]:
-    """Return quantity, displayed unit, and the factor to that unit; angles are displayed in degrees.
+    """Return quantity, displayed unit, and factor to this unit; angles are displayed in degrees.
 
     A name that does not end in a unit, such as `pressure_a`, is a quantity without a unit.
     """

@@ -38,7 +38,7 @@ def draw_triads(
 
 
 def space_view(root: str, name: str) -> rrb.Spatial3DView:
-    """Return a view of triads around one origin, with x towards the eye."""
+    """Return a view of triads around one origin, with x towards the camera."""
     return rrb.Spatial3DView(
         origin=escaped(root),
         name=name,

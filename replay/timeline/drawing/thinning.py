@@ -1,4 +1,4 @@
-"""Thinning of a long run for its timeline: short runs are complete, longer ones even in time."""
+"""Thinning of long runs for timelines: short runs are complete, longer ones evenly sampled."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ Times = NDArray[np.int64]
 KEPT_ROWS = 50_000
 # The same for errors, which have covariances and are only drawn as curves.
 KEPT_ERRORS = 20_000
-# Schemas whose messages are meaningless without the others, so that all are kept.
+# Schemas for which all messages are kept, because they are meaningless without the others.
 WHOLE = frozenset(
     schema.full_name
     for schema in (
@@ -42,12 +42,11 @@ Rows = TypeVar("Rows", Stream, Errors)
 
 
 class Thinned(Generic[Rows]):
-    """Rows of a stream, thinned as they come to about `limit` and at most twice as many.
+    """Rows of a stream, thinned on arrival to about `limit` rows and at most twice as many.
 
-    Time is divided into cells of a power of two of nanoseconds. In each cell, the rows of the last
-    stamp are kept, and those at which one of the curves has its minimum or maximum, so that peaks
-    remain. Cells are nested in wider cells, so the result does not depend on the blocks in which the
-    rows come.
+    Time is divided into cells of a power of two of nanoseconds. In each cell, the rows of the last stamp
+    are kept, and those at which a curve has its minimum or maximum, which preserves peaks. Cells are
+    nested in wider cells, so the result does not depend on the division into blocks.
     """
 
     def __init__(
@@ -94,7 +93,7 @@ class Thinned(Generic[Rows]):
         return self._shift == 0
 
     def _coarsen(self, most: int) -> None:
-        """Widen the cells until at most this number of rows is left."""
+        """Widen the cells until at most this number of rows remains."""
         self._thin()
         while self._count > most and self._shift < LAST_SHIFT:
             self._shift += 1
@@ -110,7 +109,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Find the rows that are kept in their cells; in the widest cell, those of the last stamp."""
+        """Find the rows to keep in their cells; in the widest cell, only those of the last stamp."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
@@ -122,7 +121,7 @@ class Thinned(Generic[Rows]):
         return stays[stamp]
 
     def _is_first(self, rows: Rows) -> NDArray[np.bool_]:
-        """Find the rows of the first stamp, which the block before may share."""
+        """Find the rows of the first stamp, which may also be in the previous block."""
         time_ns = self._time_ns(rows)
         return time_ns == time_ns[:1]
 
@@ -139,7 +138,7 @@ def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
 
 
 def thinned_errors(limit: int) -> Thinned[Errors]:
-    """Make thinned rows for the errors of one run."""
+    """Make a thinned series for the errors of one run."""
     return Thinned(
         limit,
         lambda errors: errors.time_ns,
@@ -150,7 +149,7 @@ def thinned_errors(limit: int) -> Thinned[Errors]:
 
 
 def curves_of(stream: Stream) -> Iterator[tuple[Field, Floats]]:
-    """Yield the fields that are curves over time, as (curves, n): no covariances, no long vectors."""
+    """Yield the fields that are curves over time (curves, n), without covariances and long vectors."""
     for entry in stream.schema:
         if entry.kind in ("real", "vector") and not entry.name.startswith("covariance"):
             values = stream[entry.name].reshape(len(stream), -1 if len(stream) else 0).T
@@ -167,7 +166,7 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 
 
 class Thin:
-    """Thinned outputs of a run and errors of its estimates, with the last stamp of an output."""
+    """Thinned outputs of a run and errors of its estimates, with the last stamp of each output."""
 
     def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
@@ -209,7 +208,7 @@ class Thin:
 
 @dataclass(frozen=True)
 class Held:
-    """Source with some topics already in memory, thinned or in part."""
+    """Source with some topics already in memory, thinned or incomplete."""
 
     of: Source
     streams: Mapping[str, Stream]
@@ -241,11 +240,11 @@ class Held:
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Return all topics of the source, in memory or not."""
+        """Return all topics of the source, including those that are not in memory."""
         return self.of.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return the messages in memory of the topics; read the other topics completely."""
+        """Return the messages of topics in memory, and read other topics completely."""
         others = self.of.read([topic for topic in topics if topic not in self.streams])
         return {
             topic: self.streams[topic] if topic in self.streams else others[topic] for topic in topics
@@ -269,7 +268,7 @@ class Held:
 class Sensed:
     """Sensor streams and truths of a source, read along with a replay of it.
 
-    Maps, and topics with a single message, such as the mounting of a sensor, hold for every span of the
+    Maps and topics with a single message, such as the mounting of a sensor, apply to every span of the
     run.
     """
 
