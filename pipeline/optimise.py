@@ -1,7 +1,7 @@
-"""Minimisation of a cost, its curvature at the minimum, and the ends of 95 % likelihood intervals.
+"""Minimisation of a cost, its curvature at the minimum, and 95 % likelihood intervals.
 
-A cost is evaluated at many points per call, so that its evaluations can be distributed; minus a
-log-likelihood is such a cost. Begin with `minimum`. `Beside` holds costs around a point, and
+A cost is evaluated at many points per call, so its evaluations can be distributed; minus a
+log-likelihood is such a cost. Begin with `minimum`. `Beside` contains the costs around a point, and
 `profile_ends` finds intervals.
 """
 
