@@ -13,7 +13,7 @@ from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
 
-NOTHING = "nothing found by looking at the log alone"
+NOTHING = "no errors found in the log itself"
 
 
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002

@@ -106,7 +106,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
         ]
         made = _all(pool.executor, _replayed, asked)
     served = {model for model, _ in scenarios}
-    why = "no scenario fits it: its first replay compiles"
+    why = "no scenario fits this model, so its first replay compiles the kernels"
     return [*made, *(Precompiled(*pair, "", 0.0, why) for pair in pairs if pair[0] not in served)]
 
 

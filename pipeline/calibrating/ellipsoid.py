@@ -197,8 +197,8 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     readings = np.concatenate([_readings(source, field) for source in sources])
     if len(readings) < FEWEST:
         raise BadInput(
-            f"{field}: has {len(readings)} readings; an ellipsoid needs at least {FEWEST}; those of an "
-            "accelerometer are half seconds in which it is still"
+            f"{field}: has {len(readings)} readings; an ellipsoid needs at least {FEWEST}; a reading of "
+            "an accelerometer is its mean over half a second at rest"
         )
     if np.ptp(readings, axis=0).max() == 0.0:
         raise BadInput(f"{field}: its {len(readings)} readings are all equal; rotate the unit")

@@ -96,8 +96,7 @@ def record(
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
-    help="For ROS: where the publish time of a message comes from, its header or the bag [default: "
-    "header].",
+    help="For ROS: the source of a message's publish time, its header or the bag [default: header].",
 )
 @click.option(
     "--mapping",

@@ -134,8 +134,8 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
         _, made = _made("filter", label, settings, run, DOUBLE)
         if found not in (made.digest, made._replace(precision=SINGLE).digest):
             raise BadInput(
-                f"{program['path']}: was deployed from a different filter ({found}) than {label} in "
-                f"{run.name} ({made.digest}), which the golden has; deploy that filter, with the same "
+                f"{program['path']}: was deployed from a different filter ({found}) than the golden's "
+                f"{label} in {run.name} ({made.digest}); deploy the golden's filter with the same "
                 "settings"
             )
     return {label: program}

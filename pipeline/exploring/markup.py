@@ -55,7 +55,7 @@ def head_html(
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
-        verdict = one.verdicts.get(case, Summary("failed", "It gave no estimates.", ""))
+        verdict = one.verdicts.get(case, Summary("failed", "The filter returned no estimates.", ""))
         parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
         if case in one.cases:
             parts.append(_numbers_html(one, played.get(PINNED), case))

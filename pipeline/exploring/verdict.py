@@ -73,7 +73,11 @@ def _evidence(case: Case) -> str:
     words = {"innovations": "NIS is {:.2f} per component", "errors": "NEES is {:.2f} for {:.0f}"}
     facts = [words[each.name].format(each.found.value, each.aim) for each in _squares_of(case)[::-1]]
     within = "within its interval" if len(facts) == 1 else "within their intervals"
-    return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge it by."
+    return (
+        f"{' and '.join(facts)}, {within}."
+        if facts
+        else "The log has neither truth nor innovations to judge it."
+    )
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

@@ -65,7 +65,7 @@ def evaluate(expression: str, values: Values) -> Value:
         return value_of(parse(expression), values)
     except (TypeError, AttributeError, ValueError, OverflowError):
         raise BadInput(
-            f"'{expression}' uses a number, a list or a comparison where one of the others is expected"
+            f"'{expression}' uses a number, a list or a comparison in the wrong place"
         ) from None
 
 

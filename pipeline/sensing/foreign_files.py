@@ -35,7 +35,7 @@ def explained(path: Path) -> list[str]:
             if path.stem.endswith("t")
             else "an Allan deviation, of a gyro in deg/h"
         )
-        return [f"{path}: this is a column of imu_utils: {what}; it gives no interval"]
+        return [f"{path}: this file was written by imu_utils ({what}) and has no intervals"]
     return []
 
 

@@ -236,7 +236,7 @@ class Stressed:
             return f"{begin}the copy fails {each.failed}"
         begin += each.far
         if self.worst == "harmless":
-            return f"{begin}; every other change that was tried does less"
+            return f"{begin}; every other change that was tried has less effect"
         if not np.isfinite(self.ratio(name)):
             return begin
         return f"{begin}; {self._shrinking(name)}"

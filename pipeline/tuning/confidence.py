@@ -186,8 +186,8 @@ def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str
         return f"{names[first]}: the logs determine it within a factor of {_factor(value):.2g} (95 %)"
     if not others:
         return (
-            f"{names[first]}: the logs do not determine it; they only fit worse with the start value, "
-            f"{free[first].default:g}"
+            f"{names[first]}: the logs do not determine it; they only show that the start value, "
+            f"{free[first].default:g}, fits less well"
         )
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"

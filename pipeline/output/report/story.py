@@ -368,7 +368,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
     if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
         nis = number(each.squares[1].found.value)
-        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is right.")
+        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is ideal.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes
@@ -633,9 +633,9 @@ def numbers_of(by: Squares) -> str:
     """Write the mean of squares with its interval, and the ideal value."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
-        return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
+        return f"{name} {number(by.found.value)}; {number(by.aim)} is ideal"
     found, low, high = alike(by.found[:3], Scale())
-    return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is right"
+    return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is ideal"
 
 
 def gauge(by: Squares) -> Gauge:
