@@ -103,7 +103,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
-    """Return the value of a number, as it is set, stated by a channel, or assumed; else NaN."""
+    """Return the value of a number: the set value, or that of a channel, or the default; else NaN."""
     for each in bound:
         with suppress(BadInput):
             value, _ = value_at_start(name, source, each)
