@@ -17,7 +17,7 @@ SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
 def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
-    """Write the name, value and ends of a slider, and mark the log's own value.
+    """Write a slider's name, value and ends as HTML, with a mark at the value from the log.
 
     For a parameter in the state, the value is the initial estimate.
     """
@@ -80,7 +80,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
 
 
 def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
-    """Write a filter's verdict in its colour."""
+    """Write a filter's verdict in the filter's colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
     return (

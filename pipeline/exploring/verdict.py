@@ -32,7 +32,7 @@ class Summary(NamedTuple):
 
 
 def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Summary:
-    """Judge a filter on a log by NEES, NIS and the warnings about its replay for this case."""
+    """Judge a filter by its NEES, NIS and warnings in one case of a log."""
     if failures:
         return Summary("failed", "It stopped.", failures[0])
     own = [each for each in alarms if each.part in ("", case.name)]

@@ -72,7 +72,7 @@ def alarms_of(
 
     Args:
         judge: of all runs.
-        parameters: of the estimators by label, if known.
+        parameters: parameters of the estimators by label, if known.
         coverage: how many measurements of each topic were used.
     """
     uninformed = [*_of_components(judge)]

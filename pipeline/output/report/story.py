@@ -67,7 +67,7 @@ Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
 class Gauge(NamedTuple):
-    """The position of a mean of squares on a scale from conservative to overconfident, in percent.
+    """The position of a mean NEES or NIS, in percent of a scale from conservative to overconfident.
 
     Attributes:
         usual: the range that counts as consistent, which is the 95 % range or a small deviation.
@@ -330,7 +330,7 @@ def _card(
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
-    """Return a card's look, its mark, and its label."""
+    """Return the look, the mark and the label of a card."""
     verdict = each.verdict
     if each.has_failed:
         return "broken", "✕", "Fails in every run"
@@ -630,7 +630,7 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
 
 
 def numbers_of(by: Squares) -> str:
-    """Write the mean of squares with its interval, and the ideal value."""
+    """Write a mean NEES or NIS with its interval, and the ideal value."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is ideal"
@@ -639,7 +639,7 @@ def numbers_of(by: Squares) -> str:
 
 
 def gauge(by: Squares) -> Gauge:
-    """Locate a mean of squares on the scale of a gauge."""
+    """Find the position of a mean NEES or NIS on the scale of a gauge."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)
