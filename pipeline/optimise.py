@@ -1,7 +1,7 @@
-"""Minimisation of a cost, its curvature at the minimum, and the ends of 95 % likelihood intervals.
+"""Minimisation of a cost, its curvature at the minimum, and 95 % likelihood intervals.
 
-A cost is evaluated at many points per call, so that its evaluations can be distributed; minus a
-log-likelihood is such a cost. Begin with `minimum`. `Beside` holds costs around a point, and
+A cost is evaluated at many points per call, so its evaluations can be distributed; minus a
+log-likelihood is such a cost. Begin with `minimum`. `Beside` contains the costs around a point, and
 `profile_ends` finds intervals.
 """
 
@@ -62,7 +62,7 @@ def minimum(
     wall = (10.0 * abs(at_start) if np.isfinite(at_start) else 0.0) + 1e6
 
     def with_gradient(point: Floats) -> tuple[float, Floats]:
-        """Compute the cost and its slopes; a slope towards a wall is zero, as at a bound."""
+        """Compute the cost and its slopes; a slope towards a point that cannot be evaluated is zero."""
         steps = STEP * np.eye(len(point))
         points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
         here, ahead, behind = np.split(np.fmin(cost(points), wall), [1, 1 + len(point)])
@@ -145,7 +145,7 @@ def curvature(
         cost: of points (n, k).
         point: (k,).
         places: indices of m of the k coordinates.
-        steps: of the finite differences, one for all coordinates or (m,).
+        steps: steps of the finite differences, one for all coordinates or (m,).
 
     Returns:
         The costs around the point, and the derivatives (m, m); not finite if a cost is not finite.
@@ -190,10 +190,10 @@ def profile_ends(
     within: float = END,
     doublings: int = DOUBLINGS,
 ) -> tuple[Floats, Floats]:
-    """Find the ends of the 95 % interval of each number; the other numbers follow it by the curvature.
+    """Find the ends of each number's 95 % interval; the curvature determines the other numbers there.
 
     Args:
-        cost: minus the log-likelihood, of points (n, k).
+        cost: function that computes minus the log-likelihoods of points (n, k).
         point: (k,) the minimum.
         curvature: (k, k) the second derivatives at the minimum.
         corrections: the number of Newton steps that re-optimise the other numbers at each value, for
@@ -267,9 +267,10 @@ def side_by_side(
     searches: Sequence[Search[Asked, Found]],
     gains_of: Callable[[Sequence[tuple[int, Asked]]], Sequence[float]],
 ) -> list[Found]:
-    """Run searches in step: evaluate the gains of all values that they ask for together.
+    """Run searches in parallel, with one evaluation of all values that they request at a time.
 
-    `gains_of` takes pairs of a search's index and a value. A gain of NaN counts as minus infinity.
+    `gains_of` is a function of pairs of a search's index and a value. A gain of NaN counts as minus
+    infinity.
     """
     asked = {place: list(next(search)) for place, search in enumerate(searches)}
     results: dict[int, Found] = {}

@@ -84,7 +84,7 @@ def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]
 
 
 def spread(field: str) -> Alteration:
-    """Multiply a covariance by e^(2 value), and standard deviations thus by e^value."""
+    """Multiply a covariance by e^(2 value), so that standard deviations change by the factor e^value."""
     return partial(_spread, field)
 
 
@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Reorder the entries of a vector and of its covariance; the alteration's number is ignored."""
+    """Reorder the entries of a vector and of its covariance; this alteration needs no number."""
     return partial(_permuted, field, tuple(order))
 
 

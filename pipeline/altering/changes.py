@@ -54,7 +54,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """A setting of a topic: its text and its parts."""
+    """A setting of a topic, with its text and its parts."""
 
     key: str
     what: str
@@ -66,7 +66,7 @@ class _Setting(NamedTuple):
         return BadInput(f"--set {self.key}={self.value}: expected {expected}")
 
     def number(self, name: str, example: str) -> float:
-        """Parse the value, which may have a unit such as `300 ms`; otherwise it is in that of `name`."""
+        """Parse the value; its unit is that of `name`, unless the text has one, such as `300 ms`."""
         found = _NUMBER.fullmatch(str(self.value))
         if isinstance(self.value, bool) or found is None:
             raise self.refused(example)
@@ -94,7 +94,7 @@ class Change:
 
     Attributes:
         topic: its name.
-        stored: the topic of the log from which it is read, which differs if topics are swapped.
+        stored: the topic of the log from which the topic is read; it differs if topics are swapped.
         first_ns: the start of the run, at which the drift of a clock begins.
         columns: alterations of its columns, in their order.
         metadata: metadata in addition to those in the log.
@@ -115,7 +115,7 @@ class Change:
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Move stamps (n,) in ns, as `alterations.drifted` and `delayed` correct clock and delay."""
+        """Correct stamps (n,) in ns for clock and delay, as `alterations.drifted` and `delayed` do."""
         since_ns = (stamps_ns - self.first_ns) * alter.pace(-self.gain) - self.delay_ns
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
@@ -151,7 +151,7 @@ def is_of_topic(key: str) -> bool:
 def is_parameter(key: str) -> bool:
     """Test whether a setting of a topic is a parameter of its sensor, not an alteration of the log.
 
-    Parameters of sensors are never named like a field of their messages with such a suffix.
+    The names of parameters never consist of a field's name and the suffix of an alteration.
     """
     _, dot, what = key.rpartition(".")
     if not (is_of_topic(key) and dot) or what in (*WHATS, "delay"):
@@ -234,7 +234,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield settings of single topics; repeat a setting of all topics for each that it concerns."""
+    """Yield settings by topic; repeat a setting of all topics for each topic that it concerns."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:

@@ -17,11 +17,11 @@ class Entry(NamedTuple):
     """A number in a topic's messages that an estimator uses.
 
     Attributes:
-        field, place: its field, and its index in the field; a heading belongs to the field `quaternion`.
-        name: its name in a setting, with the unit.
-        is_angle: whether it is a measured angle.
-        number: its index among the numbers that the reading returns; None if it affects several.
-        varies: its standard deviation over the log.
+        field, place: the field, and the index in it; a heading belongs to the field `quaternion`.
+        name: the name in a setting, with the unit.
+        is_angle: whether the number is a measured angle.
+        number: the index of the measured number that it changes; None if it changes several.
+        varies: standard deviation over the log.
     """
 
     field: str
@@ -33,7 +33,7 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Test whether the number is the heading of orientations."""
+        """Test whether this is the heading of orientations."""
         return self.field == "quaternion"
 
 

@@ -16,11 +16,11 @@ def in_one_plane(
 ) -> dict[str, Change]:
     """Extend the changes of topics so that all positions are in one local tangent plane.
 
-    The plane is that of the truth, because errors are computed in it, or that of the first topic.
+    It is the plane of the truth, in which errors are computed, or without truth that of the first topic.
 
     Args:
         name: the run's name.
-        topics: the topics as stored in the run.
+        topics: the topics that are stored in the run.
         changes: other alterations, by topic, which are applied first.
 
     Raises BadInput if planes differ and a topic with positions does not state its local tangent plane.

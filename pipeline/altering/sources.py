@@ -1,7 +1,7 @@
 """Runs with altered topics, such as `--set /fix.delay_s=0.3`; the log files are not changed.
 
 A log is altered block by block. A topic whose stamps change is read separately and merged with the
-others by its new stamps. Memory holds one block of each, even if the stamps change by hours.
+others by its new stamps. Memory holds only one block of each topic, even if the stamps change by hours.
 """
 
 import json
@@ -33,7 +33,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
     """Alter the topics of a run, in addition to the alterations that it already has.
 
-    If its topics state different tangent planes, they are converted to one; see `in_one_plane`.
+    Topics in different tangent planes are converted to one plane; see `in_one_plane`.
 
     Args:
         source: the run.
@@ -63,7 +63,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 def alter_all(
     sources: Iterable[LogSource | MemorySource], settings: Settings
 ) -> list[LogSource | MemorySource]:
-    """Alter the topics of runs; messages left out because they would be before 1970 are logged.
+    """Alter the topics of runs, and log how many messages are omitted because they would be before 1970.
 
     Raises BadInput in the same cases as `alter`.
     """
@@ -213,7 +213,7 @@ class AlteredLog(LogSource):
         return replace(stream, topic=topic, metadata=self.topics[topic].metadata)
 
     def whole(self) -> "AlteredLog":
-        """Return the source without its limits in time."""
+        """Return the source over the whole run."""
         return replace(self, start_ns=None, end_ns=None)
 
     def blocks(

@@ -43,7 +43,7 @@ from fuselog.replay.foreign.naming import allowed
 
 @without_warnings_of_numbers()
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
-    """Record a run of a scenario in memory; it can be replayed and read like a log, and written to one.
+    """Record a run of a scenario in memory; the recording can be replayed like a log, or written to one.
 
     Args:
         scenario: a name from `scenarios`, or a TOML file.
@@ -170,7 +170,7 @@ def run(
         errors: whether all individual errors are kept.
         workers: number of processes that share the runs; a script that uses more than one must guard its
             own code with `if __name__ == "__main__":`, because the processes import it. None uses all
-            cores if that is worthwhile.
+            cores if that saves time.
         scheduler: a Dask scheduler whose workers share the runs, or `local:N`.
         executor: any other executor whose workers can read this machine's files.
         set: entries of the experiment, parameters of its scenario, or of its estimators by label:
@@ -224,8 +224,8 @@ def sweep(
 
     Args:
         experiment: a name from `experiments`, a TOML file, or an experiment that was read.
-        over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`; or
-            ranges, as returned by `parse_over`.
+        over: values by key, such as `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1,
+            2]}`, or ranges, as returned by `parse_over`.
         runs: number of runs at each point; by default the experiment's.
         seed: by default the experiment's.
         samples: number of points to sample instead of using the whole grid.

@@ -1,6 +1,6 @@
 """Answers to `--set NAME=?`, which prints a parameter's meaning, unit, accepted values and default.
 
-Every command states which objects its settings belong to, with a key of `TAKERS`.
+A key of `TAKERS` identifies the kind of object to which the settings of a command belong.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -66,7 +66,7 @@ def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> d
 
 
 def _of_topic(name: str) -> Iterator[list[object]]:
-    """Yield rows on the settings of a topic: of the named setting, or of all."""
+    """Yield table rows on one setting of a topic, or on all of them."""
     topic, _, asked = name.rpartition(".")
     ending = asked.rpartition("_")[2]
     whole = [what for what in WHATS if what == asked]

@@ -93,9 +93,9 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print the details of one entry, or the whole list as JSON; a failing entry shows its error.
+    """Print the details of one entry, or the whole list as JSON with errors of entries that fail.
 
-    Raises BadInput if the one entry is unknown or does not load.
+    Raises BadInput if the entry is unknown or cannot be loaded.
     """
     known = LISTS[kind]()
     if name is None:
@@ -113,12 +113,12 @@ def show(kind: str, name: str | None, *, as_json: bool) -> None:
 
 
 def methods() -> dict[str, dict[str, str]]:
-    """Find the methods that can estimate each model, or what the model lacks for them."""
+    """Find the methods that can estimate each model, and what the model lacks for the others."""
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
 def show_formulas(name: str | None, *, as_json: bool) -> None:
-    """Print the formulas of a model; raises BadInput if none is named, or it is unknown."""
+    """Print the formulas of a model; raise BadInput if no model is named, or if it is unknown."""
     if name is None:
         raise BadInput("--formulas needs a model, for example: fuselog models robot --formulas")
     if as_json:
@@ -129,7 +129,7 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
 
 
 def _methods_of(model: Model) -> dict[str, str]:
-    """Return "yes" for every method that can estimate the model, or what the model lacks for it."""
+    """Return "yes" for a method that can estimate the model, otherwise what the model lacks for it."""
     lacking = {name: method.lacks(model) for name, method in METHODS.items()}
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
@@ -198,13 +198,13 @@ def _model(name: str, model: Model) -> Entry:
 
 
 def stated_of(model: Model) -> set[str]:
-    """Return the parameters of a model that are read from a log's channels unless they are set."""
+    """Return the parameters of a model that a log's channels determine unless they are set."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
     return own & {*number_fields(model.parameters)}
 
 
 def _listed(components: Mapping[str, str]) -> str:
-    """Join components, each followed by its kind unless it is linear."""
+    """Format components, each followed by its kind unless it is linear."""
     return ", ".join(
         name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
     )

@@ -13,7 +13,7 @@ from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
 
-NOTHING = "nothing found by looking at the log alone"
+NOTHING = "no errors found in the log itself"
 
 
 def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
@@ -26,7 +26,7 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     Returns:
         The findings, each with its topic, the evidence and a remedy; empty if nothing is wrong.
 
-    Raises BadInput if the log cannot be read or changed in this way.
+    Raises BadInput if the log cannot be read, or if a change is invalid.
 
     >>> import fuselog as fl
     >>> run = fl.record("landmarks", seed=7, duration_s=2.0)

@@ -85,9 +85,9 @@ def listed(kind: str) -> dict[str, Any]:
 
 
 def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
-    """Collect descriptions from the entries themselves, which imports all of them.
+    """Import all entries, and collect their descriptions.
 
-    An entry that does not load shows its error; with `all_load` it raises BadInput.
+    The description of an entry that cannot be loaded is its error; with `all_load`, BadInput is raised.
     """
     from fuselog.pipeline.api import catalog
 

@@ -40,7 +40,7 @@ class Plan:
     """A replay that is ready to run.
 
     Attributes:
-        sources: the spans of the runs.
+        sources: the runs, limited to the replayed span.
         estimators: settings by label.
         origins: the initial state of each run, or empty; see `origins_of`.
         order: the clock that orders the messages.

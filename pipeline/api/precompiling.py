@@ -30,7 +30,7 @@ Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """The result for a model and method: the replayed scenario and its run time, or the reason why not.
+    """The result for a model and a method: the scenario and its run time, or the reason for a failure.
 
     Attributes:
         model, method: their registered names.
@@ -61,8 +61,8 @@ def precompile(
 
     Args:
         models: names from `models`, all by default.
-        methods: such as "smoother:ukf"; ekf, ukf and smoother:ekf by default. If either argument is left
-            out, methods that cannot estimate a model are skipped.
+        methods: methods such as "smoother:ukf"; by default ekf, ukf and smoother:ekf. If either argument
+            is left out, methods that cannot estimate a model are skipped.
         workers: number of processes, by default one per core; a script must guard its own code with `if
             __name__ == "__main__":`, because the processes import it.
 
@@ -106,7 +106,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
         ]
         made = _all(pool.executor, _replayed, asked)
     served = {model for model, _ in scenarios}
-    why = "no scenario fits it: its first replay compiles"
+    why = "no scenario fits this model, so its first replay compiles the kernels"
     return [*made, *(Precompiled(*pair, "", 0.0, why) for pair in pairs if pair[0] not in served)]
 
 
@@ -172,7 +172,7 @@ def _all(executor: Executor, work: Callable[..., Any], asked: Iterable[tuple[Any
 
 
 def _fits(scenario: str, models: Iterable[str]) -> tuple[str, dict[str, Any]]:
-    """Find the models that fit a scenario's log, and the sensors of each."""
+    """Find the models that fit a scenario's log, with the sensors that each model uses."""
     topics, found = _recorded(scenario).topics, {}
     for name in models:
         model = load("models", name, Model)

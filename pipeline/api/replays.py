@@ -74,8 +74,8 @@ def replay(
             prior's.
         gap_limit_s: the longest gap over which the truth is interpolated.
         arrival_order: process messages in order of log time, as they arrived.
-        late: how messages that arrive out of sequence are handled: "drop", "wait:0.5" (in seconds) or
-            "rewind:0.5"; by default they count as measured on arrival.
+        late: handling of messages that arrive out of sequence: "drop", "wait:0.5" (in seconds) or
+            "rewind:0.5"; by default, they are treated as if measured on arrival.
         set: parameters of all estimators that have them, and changes of topics before the replay:
             `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
         metrics: their names; all by default.
@@ -304,7 +304,7 @@ class Replay(Showing):
 
     @property
     def input_sha256(self) -> str:
-        """Compute the SHA-256 of the input: the files of logs, and the columns of recordings."""
+        """Compute the SHA-256 of the input, from the files of logs and the columns of recordings."""
         digest = hashlib.sha256()
         for log in self.logs:
             if isinstance(log, MemorySource):

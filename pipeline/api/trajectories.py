@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences on corrections and doubts, and on a time offset that was not found."""
+        """Return notes on corrections, doubts, and a time offset that could not be found."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         notes = [in_vain] if sought and not self.compared.time_offset_s else []
@@ -111,7 +111,7 @@ class Evaluation:
         return "\n".join([name, *self.notes, *values])
 
     def figure(self) -> "Figure":
-        """Draw the path in matplotlib, with its errors as colours."""
+        """Draw the path in matplotlib, coloured by error."""
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:
@@ -280,7 +280,7 @@ def compare_logs(
 def trajectory_figures(
     compared: Mapping[str, Compared], suffix: str = ""
 ) -> dict[str, "Chart | Figure"]:
-    """Draw figures in the style of evo for estimates by label: paths, errors, and errors as colours."""
+    """Draw paths, errors, and paths coloured by error, in the style of evo, by label."""
     figures: dict[str, Chart | Figure] = {
         f"trajectory{suffix}": _path_chart(compared),
         f"pose-errors{suffix}": _error_chart(compared),
@@ -336,7 +336,7 @@ def _places(done: Compared) -> np.ndarray:
 
 
 def error_along_path(done: Compared) -> "Figure":
-    """Draw the aligned path with its APE as colours, and the true path."""
+    """Draw the aligned path, coloured by APE, and the true path."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 

@@ -68,8 +68,8 @@ def calibrate(
     ]
     if not marked:
         raise BadInput(
-            f"estimator {label}: its model marks no calibration parameter that the logs read; choose "
-            "parameters yourself with fuselog tune --free NAME"
+            f"estimator {label}: its model marks no calibration parameter on which the logs depend; "
+            "choose parameters yourself with fuselog tune --free NAME"
         )
     for name in fixed:
         if name not in marked:

@@ -1,7 +1,7 @@
 """The simulated car whose calibration is estimated, with its sensor errors and their names in a model.
 
-Scales and the bias of `TRUTH` describe readings relative to the motion. Those of `OURS`, as in the
-model, describe the motion relative to readings.
+Scales and the bias of `TRUTH` describe readings relative to the motion. Those of `OURS` describe the
+motion relative to readings, as in the model.
 """
 
 from typing import Any

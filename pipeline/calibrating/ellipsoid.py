@@ -64,7 +64,7 @@ class Ellipsoid:
 
     @property
     def matrix(self) -> Floats:
-        """Return the symmetric matrix (3, 3): a magnetometer's soft iron, or scales and misalignment."""
+        """Return the symmetric matrix (3, 3) of scales and cross terms; soft iron for a magnetometer."""
         return matrix_of(self.fitted.numbers) * self.length / self.unit
 
     @property
@@ -180,7 +180,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     """Estimate offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
 
     Only readings of a still accelerometer are used, because it then measures only gravity. The matrix is
-    symmetric: readings do not determine the rotation between the sensor's and the body's axes.
+    symmetric, because readings do not determine the rotation between the sensor's and the body's axes.
 
     Args:
         logs: paths, opened logs, or recordings of one unit that is rotated to all sides.
@@ -197,8 +197,8 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     readings = np.concatenate([_readings(source, field) for source in sources])
     if len(readings) < FEWEST:
         raise BadInput(
-            f"{field}: has {len(readings)} readings; an ellipsoid needs at least {FEWEST}; those of an "
-            "accelerometer are half seconds in which it is still"
+            f"{field}: has {len(readings)} readings; an ellipsoid needs at least {FEWEST}; a reading of "
+            "an accelerometer is its mean over half a second at rest"
         )
     if np.ptp(readings, axis=0).max() == 0.0:
         raise BadInput(f"{field}: its {len(readings)} readings are all equal; rotate the unit")

@@ -1,4 +1,4 @@
-"""Fit of an ellipsoid to readings of a constant vector by a unit that is rotated.
+"""Fit of an ellipsoid to the readings of a constant vector by a rotating unit.
 
 A sensor reads m = A^-1 u + b + n for a vector u of known length, with isotropic noise n. The length
 determines b and the symmetric A by maximum likelihood, but not a rotation of the sensor's axes.
@@ -38,7 +38,8 @@ class Fit(NamedTuple):
         numbers: (9,) in the order of `NAMES`.
         covariance: (9, 9) of the numbers that are determined; meaningless for others.
         lacking: the numbers that the readings do not determine.
-        turned_about: the axis that is closest to the only axis of rotation; empty if there were several.
+        turned_about: the coordinate axis closest to the only axis of rotation; empty if there were
+            several.
         sigma: the standard deviation of the noise.
         correlation: correlation of the noise of successive readings.
     """

@@ -1,4 +1,4 @@
-"""Advice on the next manoeuvre to record, by the information that it would add to a calibration.
+"""Advice on the next manoeuvre to record, from the information that it would add to a calibration.
 
 Manoeuvres of a wheeled robot are simulated without noise, with the sensors, steps and noise of the log
 and the estimated values, to compute their information. The best manoeuvre depends on the criterion: the
@@ -116,7 +116,7 @@ def advice(found: Tuning) -> list[str]:
 
 
 def _simulated(found: Tuning, log: Source, motion: str) -> Run:
-    """Simulate a log of a manoeuvre with the same topics and the estimated values."""
+    """Simulate a manoeuvre with the estimated values, as a log with the same topics."""
     streams = _of_kinds(log)
     odometry_s, fix_s, compass_s = (_step_s(streams.get(topic)) for topic in SIMULATED)
     usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}

@@ -1,4 +1,4 @@
-"""Functions that find the parts of a replay that differ from its golden, by how much and since when."""
+"""Functions that find the differences between a replay and its golden: what, how much and since when."""
 
 import base64
 import math
@@ -32,7 +32,8 @@ class Discrepancy(NamedTuple):
         run: name of the run.
         topic: topic of the stream.
         part: the column, or another part of the stream, such as its metadata.
-        apart: difference relative to the size of the column; infinite if one of the two is missing.
+        apart: difference relative to the size of the column; infinite if the part is missing on one
+            side.
         allowed: largest allowed difference, relative to the size of the column.
         row: first kept row whose difference exceeds `allowed`; None if there is no such row.
         component: component of the column.

@@ -127,7 +127,7 @@ class _Golden(_Part):
 
 
 def write(path: Path, golden: Golden) -> None:
-    """Write a golden, the same bytes for equal goldens; raise BadInput if it is too large."""
+    """Write a golden, with the same bytes for equal goldens; raise BadInput if it is too large."""
     text = json.dumps(golden, sort_keys=True, separators=(",", ":")).encode()
     if not _is_small(text):
         raise BadInput(

@@ -256,9 +256,8 @@ def evaluate_trajectory(
         raise BadInput(f"{estimates[1]}: only one trajectory can be judged at a time; remove the others")
     if logs or metrics or errors or recover:
         raise BadInput(
-            "--log, --metric, --errors and --recover apply to logs, --truth applies to trajectory "
-            "files; "
-            "use one or the other"
+            "--log, --metric, --errors and --recover apply to logs, and --truth to trajectory files; "
+            "do not combine them"
         )
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
@@ -322,8 +321,8 @@ def _print_outcome(
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
-            "nees: of one run; the interval is that of a single step, so a NEES inside it does not show "
-            "that the filter is consistent, only that it is not grossly inconsistent; see also "
+            "nees: it is that of one run, and its interval is that of a single step, so a NEES inside "
+            "the interval shows only that the filter is not grossly inconsistent; see also "
             "nis_per_component"
         )
     for sentence in [*judge.notes_of_coverage, *unused]:

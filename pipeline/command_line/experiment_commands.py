@@ -53,7 +53,7 @@ def run_named(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment, or replay logs as one, and print its metrics and claims.
+    """Run an experiment, or replay logs as an experiment, and print its metrics and claims.
 
     With `tells_parameters`, print only the parameters of its estimators.
     """

@@ -148,14 +148,14 @@ def evaluate(
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, if SIDES are trajectory files.")
 @click.option(
     "--case",
-    help="The truth that trajectory files are judged against, such as robot2, if a log has several.",
+    help="The truth for trajectory files, such as robot2, if a log has several.",
 )
 @click.option(
     "--margin",
     type=click.FloatRange(min=0),
     default=0.02,
     show_default=True,
-    help="The relative difference of a metric that counts as no difference.",
+    help="The relative difference of a metric that is considered irrelevant.",
 )
 @click.option("--out", type=RESULT, help="Write a result folder: tables, figures, the timeline.")
 @click.option("--save", type=TIMELINE, help="Write the timelines, side by side, to this .rrd file.")
@@ -191,7 +191,9 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("label", "The estimator [default: the only one of an estimates log].")
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
-@click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the findings as events.")
+@click.option(
+    "--save", type=TIMELINE, help="Write a timeline to this .rrd, with the findings as events."
+)
 @model_option
 @click.option(
     "--tried", "tells_tried", is_flag=True, help="List every change that was tried, with its gain."
@@ -225,14 +227,15 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option(
     "--save",
     type=TIMELINE,
-    help="A timeline (.rrd) of the first log to write, with the changed replays next to the original.",
+    help="Write a timeline of the first log to this .rrd, with the changed replays next to the "
+    "original.",
 )
 @replay_options
 def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Replay LOG with tiny changes of stamps, order, inputs, start and parameters.
 
-    The verdict comes first: harmless, sensitive (half the change has half the effect), or discontinuous
-    or chaotic (it does not). Each estimator needs at most twelve replays.
+    The verdict is printed first: harmless, sensitive (half the change has half the effect), or
+    discontinuous or chaotic (it has not). Each estimator needs at most twelve replays.
     """
     from fuselog.pipeline.stressing.command import stress_logs
 
@@ -256,7 +259,7 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     "scales",
     multiple=True,
     metavar="COMPONENT=SIGMA",
-    help="The unit of a component, as a standard deviation, instead of the prior's (repeatable).",
+    help="The standard deviation that is the unit of a component, instead of the prior's (repeatable).",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @recover_option

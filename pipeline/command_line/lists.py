@@ -62,17 +62,15 @@ def models(name: str | None, formulas: bool, as_json: bool) -> None:
     "fuselog cache --warm robot inertial:smoother:ekf",
 )
 @click.argument("pairs", nargs=-1, metavar="[MODEL[:METHOD]]...")
-@click.option(
-    "--clear", is_flag=True, help="Remove the files that fuselog wrote there, and nothing else."
-)
+@click.option("--clear", is_flag=True, help="Remove the files that fuselog wrote to the cache.")
 @click.option(
     "--warm",
     is_flag=True,
-    help="Compile what the first replay of the models would compile, on all cores.",
+    help="Compile the kernels that the first replay of these models needs, on all cores.",
 )
 @json_option
 def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> None:
-    """Show the size of the cache of compiled kernels and samples, which fuselog can make again.
+    """Show the size of the cache of compiled kernels and samples, which can be deleted safely.
 
     --warm compiles the kernels of the named models and methods: ekf, ukf and smoother:ekf for a model
     without a method, and all models if nothing is named. It replays short recordings of scenarios that

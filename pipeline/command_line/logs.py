@@ -93,7 +93,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 
 
 @command(
-    "Calibrate a magnetometer or accelerometer that was turned.",
+    "Calibrate a magnetometer or accelerometer by rotating it.",
     "fuselog ellipsoid turned.mcap --field /imu.magnetic_field_ut --length 48.5",
     "fuselog ellipsoid positions.mcap --field /imu.specific_force_mps2",
 )
@@ -111,7 +111,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 @recover_option
 @json_option
 def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
-    """Estimate offsets, scales and cross terms of a sensor from LOGS in which it is turned to all sides.
+    """Estimate offsets, scales and cross terms of a sensor that is rotated to all sides in LOGS.
 
     The Earth's magnetic field and gravity have constant magnitudes, so raw readings lie on an ellipsoid.
     Hold an accelerometer still in each position. Terms that the rotations do not determine are named and
@@ -158,7 +158,7 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     "--at",
     type=Instant(),
     metavar="SECONDS|worst[:ESTIMATOR]",
-    help="Set the time cursor this many seconds into the run, or at the largest NEES (without NEES the "
+    help="Set the time cursor to this many seconds into the run, or to the largest NEES (or else the "
     "largest error) of all estimators or of one.",
 )
 @click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run.")
@@ -220,9 +220,9 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    tum and kitti take trajectories: poses, and the estimates and truths that have a position; mot takes
-    tracks and truths frame by frame, as TrackEval reads them; csv and parquet take any stream, as a
-    table; foxglove writes one log of the messages that Foxglove and Rerun show.
+    tum and kitti are for trajectories: poses, and estimates and truths with a position. mot is for
+    tracks and truths, frame by frame, as TrackEval reads them. csv and parquet are for any stream, as a
+    table. foxglove writes one log with messages that Foxglove and Rerun show.
     """
     from fuselog.pipeline.logs.exporting import export as export_log
 
@@ -258,7 +258,8 @@ def export(path: Path, to: Any, **options: Any) -> None:
 def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
     """Write part of PATH, a log or an estimates log, as a new log.
 
-    Maps, priors and the messages at the first stamp of the log are kept whole, whatever the span.
+    Maps, priors and the messages at the first stamp of the log are copied completely, regardless of
+    the span.
     """
     from fuselog.pipeline.logs.edit import cut as cut_log
 
@@ -337,7 +338,7 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
 )
 @recover_option
 def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
-    """Write PATH, a log or an estimates log, with renamed topics or components; references follow."""
+    """Write PATH, a log or an estimates log, with renamed topics or components; update references."""
     from fuselog.pipeline.logs.edit import relabel as relabel_log
 
     done = relabel_log(

@@ -30,7 +30,7 @@ class OutputFile(Output):
         super().__init__(suffix, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path; reject one that exists and is not a regular file."""
+        """Return the path, unless something other than a regular file exists there."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.exists() and not path.is_file():
             self.fail(f"{path} is not a regular file", param, ctx)
@@ -218,8 +218,9 @@ class SetOption(click.Option):
     """The option --set, to which `settle` adds the values of other options after parsing.
 
     Attributes:
-        takes: kind of object that has the settings, a key of `fuselog.pipeline.api.asking.TAKERS`.
-        replays: whether the command replays logs. Such a command also has --origin, which becomes a
+        takes: kind of object to which the settings belong, a key of
+            `fuselog.pipeline.api.asking.TAKERS`.
+        replays: whether the command replays logs and therefore also has --origin, which becomes a
             setting of all topics.
     """
 

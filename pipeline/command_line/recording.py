@@ -96,8 +96,7 @@ def record(
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
-    help="For ROS: where the publish time of a message comes from, its header or the bag [default: "
-    "header].",
+    help="For ROS: the source of a message's publish time, its header or the bag [default: header].",
 )
 @click.option(
     "--mapping",
@@ -166,7 +165,7 @@ def _import(
     *,
     stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write a log, with `stated` instead of the used parameters in its metadata."""
+    """Import data and write a log; its metadata contains `stated` instead of the used parameters."""
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings

@@ -174,10 +174,10 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
     """Estimate the parameters of an estimator that explain LOGS best, with 95 % intervals.
 
-    LOGS are logs or folders of logs; --validate takes one log or folder each time: --validate test.
-    The search starts from --set NAME=VALUE, or from what the log's channels state. Truth is needed only
-    for --by nees and --by rmse. Ctrl-C ends the search with the best values so far. Use settings.toml
-    from the result folder with --settings of fuselog replay and run.
+    LOGS are logs or folders of logs; --validate takes one log or folder and can be repeated. The search
+    starts from --set NAME=VALUE, or from the values in the log's channels. Truth is needed only for
+    --by nees and --by rmse. Ctrl-C ends the search with the best values so far. Use settings.toml from
+    the result folder with --settings of fuselog replay and run.
     """
     from fuselog.pipeline.tuning.command import tune_logs
 
@@ -239,8 +239,8 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
 @estimator_option(
     "labels",
-    "With --update: an estimator of the golden (repeatable). Without: a program to check in "
-    "place of the golden's estimator, for example lib:./robot_ekf.so.",
+    "With --update: an estimator of the golden (repeatable). Without --update: a program to check "
+    "instead of the golden's estimator, for example lib:./robot_ekf.so.",
     many=True,
 )
 @arrival_option
@@ -269,7 +269,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 
     The exit code is 1 if anything differs; the first difference is printed with its stamp. For an
     intended change, update the golden in the same commit. To check a filter written by fuselog deploy,
-    use -e lib:PATH; it must be made from the golden's filter.
+    use -e lib:PATH; it must have been deployed from the golden's filter.
     """
     from fuselog.pipeline.checking.command import check_path
     from fuselog.pipeline.deploying.deploying import in_place_of_golden
@@ -284,7 +284,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     "fuselog deploy run.mcap -e ekf --settings tuned.toml --single -o robot_ekf",
 )
 @click.argument("log", type=ANY_PATH)
-@estimator_option("name", "The filter: ekf or ukf.", required=True)
+@estimator_option("name", "The filter, such as ekf, ukf or sqrt:ekf.", required=True)
 @model_option
 @click.option(
     "-o",
@@ -298,7 +298,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 @settings_option
 @set_option("estimators")
 def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:
-    """Write a filter as C99 from LOG, including its sensors, the values its channels state, and a test.
+    """Write a filter as C99, with the sensors and parameters of LOG, and a test from its messages.
 
     The C code performs the same operations in the same order, so its estimates are identical to the last
     bit; README.md in the folder explains how to build, test and replay it.

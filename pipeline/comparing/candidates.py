@@ -106,7 +106,7 @@ class Given:
 def measured(
     name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any] | None
 ) -> Candidate:
-    """Judge the estimates of a label run by run, where each pair is a log and its estimates."""
+    """Judge the estimates of a label run by run; each of the `pairs` is a log with its estimates."""
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []
     times: list[pd.DataFrame] = []
@@ -184,7 +184,7 @@ def name_of(path: Path) -> str:
 
 
 def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[str] = ()) -> Given:
-    """Return the estimators of a replay, after those whose estimates were recorded in its logs.
+    """Return the estimators of a replay, preceded by the estimators whose estimates its logs contain.
 
     Raises BadInput if two of the logs are of the same run.
     """

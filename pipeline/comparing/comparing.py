@@ -386,7 +386,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
 
 
 def _span_s(tables: Iterable[pd.DataFrame]) -> float:
-    """Choose a span length that is a multiple of every table's and gives at most `SPANS` spans."""
+    """Choose a span length that is a multiple of each table's, for at most `SPANS` spans."""
     ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
     width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
     longest = max(int(each.max()) for each in ends_ms)

@@ -48,7 +48,7 @@ def inputs_of(
     gap_limit_s: float,
     recover: bool,
 ) -> list[Given]:
-    """Read the input at every path; logs without the named estimates are replayed together."""
+    """Read the input at every path, and replay logs that do not contain the named estimates."""
     named = named_in(estimators)
     kinds = [kind_of(path, named, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
@@ -93,7 +93,7 @@ def named_in(estimators: Sequence[str | Mapping[str, Kind]]) -> list[str]:
 
 
 def with_logs_of_folders(paths: Sequence[Path], labels: Sequence[str], *, recover: bool) -> list[Path]:
-    """Replace each folder that has logs to replay by these logs."""
+    """Replace each folder of logs by the logs in it."""
     found: list[Path] = []
     for path in paths:
         logs = [] if (path / RESULT_FILE).is_file() else recordings_in(path)

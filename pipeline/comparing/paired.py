@@ -1,4 +1,4 @@
-"""Verdicts on the metrics of two candidates, withheld if irrelevant changes move the metric more."""
+"""Verdicts on the metrics of two candidates, withheld if irrelevant changes have a larger effect."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Access to the estimates of one label under the name that a comparison uses for them."""
+"""Access to an estimator's estimates under the name that a comparison uses for it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from fuselog.replay.engine.streams.sources import Source
 
 @dataclass(frozen=True)
 class Renamed:
-    """A source that reads the estimates of one label on demand, and gives them another name."""
+    """A source that reads the estimates of one label on demand, under another name."""
 
     estimates: Source
     label: str

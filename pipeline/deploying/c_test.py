@@ -47,7 +47,7 @@ class Vectors(NamedTuple):
 
 
 def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vectors:
-    """Run a filter over the first messages of a log after its start, with added outliers.
+    """Run a filter over the first messages of a log, starting at the prior, with added outliers.
 
     Raises BadInput if the filter does not start in the log, or has no estimates or accepted messages.
     """
@@ -119,7 +119,7 @@ def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
 
 
 def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:
-    """Select the first events after the start, and more until every sensor has a message."""
+    """Select the first events after the start, and as many more as every sensor needs for a message."""
     rows = np.flatnonzero(events.time_ns >= start_ns)
     found = [np.flatnonzero(events.source[rows] == sensor) for sensor in range(sensors)]
     until = max([MOST_EVENTS, *(int(each[0]) + 1 for each in found if len(each))])

@@ -39,8 +39,8 @@ class Single(NamedTuple):
         estimates: number of estimates compared with those in double precision.
         furthest: largest difference of means and covariances, relative to the number itself or to one,
             whichever is larger.
-        lost_event, lost_s: the event, and its time after the start, from which the covariance is not
-            positive definite in single precision only; None if it always is.
+        lost_event, lost_s: the event, and its time after the start, at which the covariance stops being
+            positive definite in single precision but not in double; None if there is no such event.
     """
 
     estimates: int

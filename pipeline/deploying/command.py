@@ -30,7 +30,7 @@ def deploy_filter(
         print_json(certificate)
         return
     say(f"{folder}: {', '.join(sorted(each.name for each in folder.iterdir()))}")
-    say(f"{folder / 'README.md'} says how to build, test and replay it")
+    say(f"{folder / 'README.md'} explains how to build, test and replay it")
     cost = certificate["single"]
     if cost and cost["lost_event"] is not None:
         say(lost_sentence(cost, is_root=certificate["is_root"]))

@@ -134,7 +134,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """Count a function at samples and the mean of its values, for the largest number of iterations."""
+    """Count the cost of a function at samples and of its mean, for the most iterations."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -163,7 +163,7 @@ def _narrowing(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """Count a step for every sample; operations with the same result for all samples count once."""
+    """Count the cost of a step at every sample, but operations that all samples share only once."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     inside = [node for node in needed(outputs, same) if node not in same]
@@ -190,13 +190,13 @@ def _orthogonalising(rows: int, columns: int) -> Cost:
 
 
 def _filling_root(size: int) -> Cost:
-    """Count the factorisation of a noise, in which the search for a pivot also divides."""
+    """Count the cost of factorising a noise covariance; the search for a pivot also divides."""
     return Cost(size * (1 + 4 * size + size + 2 * size * size), size)
 
 
 @cache
 def _algebra(m: int, t: int, is_robust: bool) -> Cost:
-    """Count the update after an innovation of m components, for a tangent space of size t."""
+    """Count the cost of an update with an innovation of m components, for a tangent space of size t."""
 
     def update(v: Any, spread: Any, cross: Any, covariance: Any, factor: Any) -> Any:
         innovation, step = Innovation(v, spread, cross), np.empty(t, object)
@@ -211,13 +211,13 @@ def _algebra(m: int, t: int, is_robust: bool) -> Cost:
 
 
 def _factored_algebra(m: int, t: int) -> Cost:
-    """Count the update of a factor: S, the whitened innovation, the step, and the factor of P."""
+    """Count the cost of updating a factor: S, the whitened innovation, the step, and the factor of P."""
     square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
     return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
 
 
 def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) -> Products:
-    """Count products with a Jacobian, with all its entries and without those that are known."""
+    """Count the cost of products with a Jacobian, with all its entries and without the known ones."""
     if not step.has(jacobian):
         return NOTHING, NOTHING
     known = {

@@ -57,8 +57,8 @@ def deploy(
     same libm.
 
     Args:
-        log: a log that the filter fits. Its sensors become those of the C code, its channels state
-            parameters that are not set, and its first messages are the test.
+        log: a log that the filter fits. The C code has the log's sensors, and the parameters in its
+            channels unless they are set; the first messages are the test.
         estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; or the result of
             `modelled` for a model of your own and one of these; or a table of settings by label.
         out: the folder to write, which must be empty or not exist; its name is the filter's name in C.
@@ -134,8 +134,8 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
         _, made = _made("filter", label, settings, run, DOUBLE)
         if found not in (made.digest, made._replace(precision=SINGLE).digest):
             raise BadInput(
-                f"{program['path']}: was deployed from a different filter ({found}) than {label} in "
-                f"{run.name} ({made.digest}), which the golden has; deploy that filter, with the same "
+                f"{program['path']}: was deployed from a different filter ({found}) than the golden's "
+                f"{label} in {run.name} ({made.digest}); deploy the golden's filter with the same "
                 "settings"
             )
     return {label: program}

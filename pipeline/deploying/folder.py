@@ -107,7 +107,7 @@ def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
 
 
 def _loop(made: CFilter) -> str:
-    """Write a loop over messages, with control, prediction, update, and the handling of outcomes."""
+    """Write an example loop over messages, with control, prediction, update and handling of outcomes."""
     name, upper = made.name, made.name.upper()
     driven = [
         f"filter.control[{upper}_CONTROL_{identifier(each).upper()}] = message.{identifier(each)};"

@@ -16,7 +16,8 @@ class Advice(NamedTuple):
         free: the parameter that can be tuned instead.
         otherwise: what else can be done, in words.
         more: further settings that are needed with it, by key.
-        is_moved: whether the value is in metres along several axes, and is added to the one already set.
+        is_moved: whether the value is a shift in metres along several axes, which is added to one
+            already set.
     """
 
     key: str

@@ -144,7 +144,7 @@ class Found(NamedTuple):
 
     Attributes:
         names: faults that the log does not distinguish, with their values; the first one is corrected.
-        over: the trial relative to which gains are computed, while the cause is the only one.
+        over: the trial to which gains are relative, while the cause is the only one.
         contenders: faults that gained nearly as much before other causes were corrected.
     """
 

@@ -77,9 +77,9 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
 def unnamed(
     done: Replay, innovations: Mapping[str, Stream], tried: int, no_judges: Collection[str]
 ) -> Iterator[Finding]:
-    """Yield NIS and NEES outside the range of a consistent filter in CONSISTENT of all logs.
+    """Yield NIS and NEES outside the range that a consistent filter has in most logs (CONSISTENT).
 
-    NIS includes all innovations, also those that a gate rejects. Truths in `no_judges` are ignored.
+    NIS includes all innovations, even those that a gate rejects. Truths in `no_judges` are ignored.
     Errors are correlated over a run, so the mean NEES has the interval of a single step.
     """
     faults = f"none of the {tried} faults tried explains it" if tried else "no fault was tried"

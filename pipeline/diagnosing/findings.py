@@ -123,7 +123,7 @@ def of_innovations(
 ) -> Iterator[Finding]:
     """Yield findings on rejected measurements and on divergence of the filter.
 
-    `gate` is its probability if the gate is fuselog's own. If outliers come in stretches, the gate
+    `gate` is the gate's probability, if it is a gate of fuselog. If outliers come in stretches, the gate
     rightly rejects measurements for a long time.
     """
     for topic, stream in innovations.items():
@@ -185,7 +185,7 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
 
 
 def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
-    """Find runs of at least `least` set flags, as from and to."""
+    """Find runs of at least `least` set flags, and return where they begin and end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 

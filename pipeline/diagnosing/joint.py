@@ -75,8 +75,8 @@ class Fit(NamedTuple):
     Attributes:
         faults: the faults with these values.
         log_likelihood: that of the log without the faults.
-        losses: loss of log-likelihood without each fault, with all others refitted, by the curvature;
-            infinite for a fault without a value.
+        losses: loss of log-likelihood if a fault is removed and all others are refitted, from the
+            curvature; infinite for a fault without a value.
         are_estimates: whether the values of a fault are estimates; they are not if the search ended at
             their limit, or if they have no effect.
         ends: ends of the 95 % profile-likelihood intervals of each fault's values; NaN if the search
@@ -217,7 +217,7 @@ class _Together:
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
-    """Compute the loss without values (m,) with a covariance (m, m); infinite without a value."""
+    """Compute the loss of log-likelihood without values (m,) that have a covariance (m, m)."""
     return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
 
 

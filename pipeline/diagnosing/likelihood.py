@@ -293,7 +293,7 @@ def _name(topic: str) -> str:
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
     """Find the span in which a filter can score measurements, and the time step of its controls.
 
-    Measurements up to a step before the span are scored at its begin. Those after it are scored for as
+    Measurements up to a step before the span are scored at its start. Those after it are scored for as
     long as the last control applies, and for the same time again. Thus messages that a small delay moves
     across an end stay comparable.
     """
@@ -324,7 +324,7 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 
 
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
-    """Limit the broad likelihood of topics that a filter predicts better than it states.
+    """Limit the broad likelihood of topics that a conservative filter predicts better than it states.
 
     For a body at rest, the broad model is more precise than a conservative filter. Without the limit, a
     delay would gain by moving messages out of the scored span.
@@ -341,7 +341,7 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Test whether rows are in the first share of their sensor's rows, by measured quantity.
+    """Test whether rows are in the first share of the rows of their sensor.
 
     A share of all rows would contain other measurements if a delay changes their order.
     """
@@ -355,7 +355,7 @@ def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
 
 
 def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
-    """Return the messages that can be scored in a span (see `_span`), moved to it if they are before."""
+    """Return the messages that can be scored in a span (see `_span`), earlier ones at its start."""
     (begin_ns, end_ns, step_ns), stamps_ns = span_ns, stream.publish_time_ns
     is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
     if is_in.all() and stamps_ns.min() >= begin_ns:
@@ -374,7 +374,7 @@ def _stated(innovations: Mapping[str, Stream]) -> float:
 
 
 def _stated_by(trial: Trial) -> Hashable:
-    """Return the statements of channels, which must be equal for trials that are replayed together."""
+    """Return the metadata of channels, which must be equal for trials that are replayed together."""
     return tuple((topic, *stream.metadata.items()) for topic, stream in trial.source.streams.items())
 
 

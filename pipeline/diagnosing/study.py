@@ -54,7 +54,7 @@ class Options(Parameters):
         faults: the names of the faults to plant, such as `landmarks-bias`; `landmarks-none` is a log
             without a fault. By default all are planted.
         battery_seed: first seed of the benchmark, see `fuselog.pipeline.diagnosing.battery.battery`.
-        battery_runs: runs of each of its cells, at most as many as of each fault; 0 by default.
+        battery_runs: runs of each cell of the benchmark, at most as many as of each fault; 0 by default.
     """
 
     faults: tuple[str, ...] = ()

@@ -48,14 +48,14 @@ class Case:
 
     Attributes:
         name: its name; may be empty.
-        components, kinds: components of the state's tangent space, and their kinds.
+        components, kinds: names and kinds of the components of the state's tangent space.
         path: the path of the estimate; None if it has no position.
-        covariance: (n, 2, 2) of the positions on the path.
+        covariance: covariances (n, 2, 2) of the positions on the path.
         sigma: standard deviations (n, d) at `time_s` (n,), according to the filter.
         errors: errors relative to the truth; None without truth.
         nis: NIS over time; None without innovations.
         whiteness: whiteness of the innovations, by measured component.
-        log_likelihood: that of all measurements; NaN if the filter does not state it.
+        log_likelihood: log-likelihood of all measurements; NaN if the filter does not state it.
         beside: the estimates (n,) of parameters in the state, and of components without truth.
     """
 
@@ -74,7 +74,7 @@ class Case:
 
     @property
     def nees_interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of a consistent filter's NEES, over the truth's components."""
+        """Return the 95 % interval of a consistent filter's NEES for the truth's components."""
         assert self.errors is not None
         return chi_square_interval(len(self.errors.components), 1)
 
@@ -89,7 +89,7 @@ def cases_of(
 
     Args:
         outputs: the outputs, by topic.
-        errors: their errors, if there is truth.
+        errors: errors of the outputs, if there is truth.
         epoch_ns: the epoch of the log.
         estimated: parameters that are part of the state.
     """
@@ -202,11 +202,11 @@ def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Fl
 
     Args:
         center: (2,), the estimate.
-        covariance: (2, 2), that of the estimate.
+        covariance: (2, 2), the covariance of the estimate.
         probability: the probability with which the ellipse contains the truth.
 
     Returns:
-        (61, 2), a closed outline in the unit of the center.
+        The closed outline (61, 2), in the unit of the center.
     """
     values, vectors = np.linalg.eigh(covariance)
     turn = np.linspace(0.0, 2.0 * np.pi, 61)

@@ -17,7 +17,7 @@ SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
 def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
-    """Write the name, value and ends of a slider, and mark the log's own value.
+    """Write a slider's name, value and ends as HTML, with a mark at the value from the log.
 
     For a parameter in the state, the value is the initial estimate.
     """
@@ -55,7 +55,7 @@ def head_html(
     parts = []
     for place, label in enumerate(labels):
         one = played[place]
-        verdict = one.verdicts.get(case, Summary("failed", "It gave no estimates.", ""))
+        verdict = one.verdicts.get(case, Summary("failed", "The filter returned no estimates.", ""))
         parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
         if case in one.cases:
             parts.append(_numbers_html(one, played.get(PINNED), case))
@@ -80,7 +80,7 @@ def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
 
 
 def _verdict_html(label: str, verdict: Summary, colour: str) -> str:
-    """Write a filter's verdict in its colour."""
+    """Write a filter's verdict in the filter's colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
     return (

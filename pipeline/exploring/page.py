@@ -54,7 +54,7 @@ class Page:
 
     Attributes:
         session: the session.
-        values: values of parameters that differ from the log's own.
+        values: values of parameters that differ from those of the log.
         played: the newest replays, by filter (0, 1, or `PINNED`).
     """
 
@@ -158,7 +158,7 @@ class Page:
         self._side.children = shown
 
     def _label(self, slider: Slider) -> None:
-        """Write the name, value and ends of a slider, and mark the log's own value."""
+        """Write a slider's name, value and ends, with a mark at the value from the log."""
         value = self.values.get(slider.name, slider.default)
         _, widget, label = self._widgets[slider.name]
         label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)

@@ -50,7 +50,7 @@ class Plot:
 
     Attributes:
         figure: the Bokeh figure.
-        sources: the changing data, by filter (0, 1, or `PINNED`) and by content, such as "line".
+        sources: data that change, by filter (0, 1, or `PINNED`) and by content, such as "line".
     """
 
     figure: Any
@@ -71,7 +71,7 @@ class Plot:
         self.figure.html_attributes = {"role": "img", "aria-label": self.figure.title.text}
 
     def show_if_drawn(self) -> None:
-        """Show the figure only if it has data of a filter."""
+        """Show the figure if it has data of a filter, and otherwise hide it."""
         self.figure.visible = any(len(x) for of in self.sources.values() for x in of.data.values())
 
     def clear(self, of: int | str) -> None:

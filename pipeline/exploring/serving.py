@@ -143,7 +143,7 @@ class _Refused(RequestHandler):
     """A request handler that refuses requests from outside the page."""
 
     def initialize(self, code: int) -> None:
-        """Store the code of the answer."""
+        """Store the HTTP code of the answer."""
         self._code = code
 
     def prepare(self) -> None:

@@ -47,7 +47,7 @@ class Played:
 
     Attributes:
         label: the filter's label.
-        values: the values of parameters that were set.
+        values: the values of the parameters that were set.
         cases: the curves, by the name of the estimated object.
         verdicts: the verdicts, by the same names.
         seconds: the time in s that the replay and its judgement took.
@@ -137,7 +137,7 @@ class Session:
         return Session(self.source, self.filters, self.gap_limit_s, sigmas)
 
     def play(self, label: str, values: Values) -> Played:
-        """Replay one filter with some parameters set, and judge it.
+        """Replay one filter with these parameters, and judge it.
 
         The log-likelihood is computed with an open gate, as in `likelihoods`. Raises BadInput if the
         filter refuses the parameters, or cannot begin.

@@ -24,7 +24,7 @@ MOTION, GATE = "motion", "gate"
 
 
 class Slider(Parameter):
-    """A parameter that can be dragged; `default` is its own value on the log.
+    """A parameter that can be dragged; `default` is its value without a setting.
 
     Its group is a topic, `MOTION`, `GATE`, or the label of an estimator without a model.
     """
@@ -46,7 +46,7 @@ class Slider(Parameter):
         return (value - low) / (high - low)
 
     def value(self, place: float) -> float:
-        """Compute the value at a position from 0 to 1, with four digits unless it is the own value."""
+        """Compute the value at a position from 0 to 1, with four digits unless it is the default."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
         value = float(f"{math.exp(there) if self.is_log else there:.4g}")
@@ -134,7 +134,7 @@ def _groups(label: str, bound: Bound) -> dict[str, str]:
 
 
 def _order(group: str, topics: Sequence[str]) -> int:
-    """Order sensors as they are read, with the motion at the end."""
+    """Return a sort key for groups: sensors in the order in which they are read, then the motion."""
     return topics.index(group) if group in topics else len(topics)
 
 

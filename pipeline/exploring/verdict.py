@@ -32,7 +32,7 @@ class Summary(NamedTuple):
 
 
 def verdict_of(case: Case, alarms: Sequence[Finding], failures: Sequence[str]) -> Summary:
-    """Judge a filter on a log by NEES, NIS and the warnings about its replay for this case."""
+    """Judge a filter by its NEES, NIS and warnings in one case of a log."""
     if failures:
         return Summary("failed", "It stopped.", failures[0])
     own = [each for each in alarms if each.part in ("", case.name)]
@@ -73,7 +73,11 @@ def _evidence(case: Case) -> str:
     words = {"innovations": "NIS is {:.2f} per component", "errors": "NEES is {:.2f} for {:.0f}"}
     facts = [words[each.name].format(each.found.value, each.aim) for each in _squares_of(case)[::-1]]
     within = "within its interval" if len(facts) == 1 else "within their intervals"
-    return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge it by."
+    return (
+        f"{' and '.join(facts)}, {within}."
+        if facts
+        else "The log has neither truth nor innovations to judge it."
+    )
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

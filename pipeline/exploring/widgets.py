@@ -36,7 +36,7 @@ view.render = function () {
 
 
 def widget_of(slider: Slider, value: float) -> Any:
-    """Make the slider of a parameter, from 0 to 1, at its value."""
+    """Make the slider of a parameter, with positions from 0 to 1."""
     return SliderWidget(
         start=0.0,
         end=1.0,

@@ -1,4 +1,4 @@
-"""Studies of single families, in one package each, with the tables, figures and claims of experiments.
+"""Studies by family of scenarios, with the tables, figures and claims of their experiments.
 
 The packages register themselves, and nothing outside imports them. Begin with a small one,
 `ranging.study`. `fuselog.pipeline.studies.toolkit` contains the parts that several studies use. Verdicts

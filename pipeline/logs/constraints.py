@@ -19,7 +19,7 @@ class ConstraintParameters(Parameters):
         standing_hz: rate of messages that state whether the body is at rest; 0 for none.
         rolling_hz: rate of messages that the body moves neither sideways nor up, as on wheels; 0 for
             none.
-        window_s: length of the window, up to the current time, by which rest is detected.
+        window_s: length of the window before the current time in which rest is detected.
         still_mps2: threshold for the standard deviation of the specific force; the body is at rest if
             this is below it and the turn rate is below `still_radps`.
         still_radps: threshold for the root mean square of the turn rate; the body is at rest if this is
@@ -36,7 +36,7 @@ class ConstraintParameters(Parameters):
 def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
     """Make the topics `standing` and `rolling` next to that of a unit.
 
-    The value of a message is 1 if the body is at rest, or on wheels, and 0 otherwise.
+    A message has the value 1 if its constraint applies, and 0 otherwise.
 
     Args:
         inertial: the samples of the unit.

@@ -364,7 +364,7 @@ def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
 
 
 def _check_components(log: Log, components: Mapping[str, str]) -> None:
-    """Raise BadInput if no topic has a component, or a topic would have two components of one name."""
+    """Raise BadInput if a component does not exist, or a topic would have two components of one name."""
     stated = {
         topic: found["components"].split(",")
         for topic, found in ((name, each.metadata) for name, each in log.topics.items())

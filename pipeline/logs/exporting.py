@@ -166,7 +166,7 @@ def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: 
 
 
 def _new(to: To) -> Kind:
-    """Return the kind of an output file that must not exist."""
+    """Return the `Kind` of an output file that must not exist yet."""
     return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 

@@ -49,7 +49,7 @@ def mirrors(stream: Stream) -> Iterator[Mirror]:
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
     FrameTransforms. Orientations without a position become poses at the origin. Lines of sight of moving
-    sensors become poses at the sensor whose x axis is the line. Ellipses of 95 %, tracks and landmarks
+    sensors become poses at the sensor whose x axis is the line. 95 % ellipses, tracks and landmarks
     become SceneUpdate, particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is
     `/foxglove`, followed by the stream's topic and a word for the content. Priors have no mirror.
     """
@@ -76,7 +76,7 @@ def left_out(log: Log) -> str:
 
 
 def sentence_of(topics: Sequence[str]) -> str:
-    """Write the sentence that the topics have no Foxglove mirror."""
+    """Write a sentence that these topics have no Foxglove mirror."""
     return f"omitted, because Foxglove has no message for them: {some_of(topics)}"
 
 
@@ -250,7 +250,7 @@ def _by_stamp(stream: Stream) -> Iterator[list[int]]:
 
 
 def _outlines(stream: Stream) -> Floats:
-    """Compute the ellipses (n, vertices, 2) in the plane with a probability of 95 %."""
+    """Compute the 95 % ellipses (n, vertices, 2) in the plane."""
     columns = [stream.components.index(name) for name in PLANE]
     return ellipses(stream["mean"][:, columns], covariances_of(stream, PLANE))
 

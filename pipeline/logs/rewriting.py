@@ -33,7 +33,7 @@ class Changed(NamedTuple):
 def stream_blocks(
     log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
 ) -> Blocks:
-    """Yield the blocks of a span, with streams in the order of `topics`, which orders equal stamps."""
+    """Yield the blocks of a span; the order of `topics` is that of messages with equal stamps."""
     for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
         yield [block[topic] for topic in topics if topic in block]
 

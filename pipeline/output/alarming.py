@@ -72,7 +72,7 @@ def alarms_of(
 
     Args:
         judge: of all runs.
-        parameters: of the estimators by label, if known.
+        parameters: parameters of the estimators by label, if known.
         coverage: how many measurements of each topic were used.
     """
     uninformed = [*_of_components(judge)]
@@ -102,9 +102,8 @@ def _of_components(judge: Judge) -> Iterator[Finding]:
     for (estimator, case), names in judge.uninformed.items():
         them, keep = ("it", "keeps its") if len(names) == 1 else ("them", "keep their")
         words = (
-            f"{_name(estimator, case)}: {', '.join(names)} {keep} initial value and prior uncertainty: "
-            f"no "
-            f"measurement informs this method about {them}"
+            f"{_name(estimator, case)}: {', '.join(names)} {keep} initial value and prior uncertainty, "
+            f"because no measurement informs this method about {them}"
         )
         other = "use another method that fits the log; fuselog info LOG lists them"
         yield Finding("uninformed", estimator, case, LARGEST, words, otherwise=other)

@@ -174,7 +174,7 @@ def curve(
         x: (n,), numbers or names.
         y: (n,), its values at x.
         style: how it is drawn.
-        reference: whether it is what others are compared with.
+        reference: whether the others are compared with it.
 
     Returns:
         The series, for `Panel.series`.
@@ -207,7 +207,7 @@ def path(
         label: its name in the legend.
         points: (n, 2), x and y.
         style: how it is drawn.
-        reference: whether it is what others are compared with.
+        reference: whether the others are compared with it.
 
     Returns:
         The series, for `Panel.series`.
@@ -223,7 +223,7 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
         x: (n,), numbers or names.
         low: (n,), its lower end at x.
         high: (n,), its upper end at x.
-        reference: whether it is what others are compared with.
+        reference: whether the others are compared with it.
 
     Returns:
         The band, for `Panel.bands`.

@@ -41,13 +41,13 @@ TOO_FEW = f"too few runs for a 95 % interval, which needs {FEWEST_RUNS}"
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a paper: what the paper prints, what we measured, our verdict and its reason.
+    """A statement of a paper, with the paper's result, ours, our verdict and its reason.
 
     A claim about another recording has no verdict.
 
     Attributes:
         claim: the statement.
-        paper: what the paper prints, or where.
+        paper: the result in the paper, or its place there.
         ours: what we measured.
         verdict: a `Claimed`, or its word.
         why: the reason for the verdict; for a refuted claim at least the numbers that contradict it.
@@ -70,7 +70,7 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
         claim: as in `Claim`.
         paper: as in `Claim`.
         ours: as in `Claim`.
-        holds: whether what was measured confirms the claim.
+        holds: whether the measurement confirms the claim.
         why: as in `Claim`.
 
     Returns:
@@ -102,16 +102,17 @@ class StatedClaim(Parameters):
         paper: what the paper says, or the source of the limit.
         holds: the comparison that decides: confirmed, refuted, or inconclusive if an interval allows
             both; without it the claim is not reproducible.
-        value: the expression that texts and comparison refer to as `value`.
+        value: the expression that is named `value` in texts and in the comparison.
         ours: what we found.
         why: the reason for the verdict, or a remark. If a refuted claim has neither this nor
             `unless`, the reason lists the numbers that refute it.
         unless: a remark for every verdict except `confirmed`.
         reproducible: a comparison; if it is false, the claim is not reproducible, whatever `holds`
             says.
-        each: names and their values; one claim is made for each value, or each combination. A table
-            as a value sets several names; `nees[ekf, *]` stands for everything that its `*` matches.
-        given: numbers or expressions, by the names that texts and comparison use.
+        each: names and lists of their values; a claim is made for every value, or every combination. A
+            table as a value sets several names; `nees[ekf, *]` is a list of everything that its `*`
+            matches.
+        given: numbers or expressions, by their names in texts and in the comparison.
         optional: whether the claim is left out, instead of not reproducible, if the result lacks one
             of its metrics.
         least_runs: the number of runs below which the claim is inconclusive, unless each number that
@@ -143,7 +144,7 @@ class StatedClaim(Parameters):
         return self
 
     def decided_from(self, runs: int) -> "StatedClaim":
-        """Return the claim with this minimum number of runs, unless it has one."""
+        """Return the claim with this minimum number of runs, unless it already has one."""
         return self if self.least_runs else self.model_copy(update={"least_runs": runs})
 
     @property
@@ -220,7 +221,7 @@ def decide(
 
 
 def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
-    """Return the claim, or remove its verdict if it is about another recording; "" is the first."""
+    """Return the claim, without its verdict if it is about another recording; "" is the first."""
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim

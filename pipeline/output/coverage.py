@@ -96,7 +96,7 @@ def recounted(
     stated: Mapping[str, Any],
     doubts: Mapping[str, Doubt],
 ) -> list[Row]:
-    """Compute the coverage table from estimates logs and their source logs, as the replay did.
+    """Compute the coverage table of a replay from its estimates logs and their source logs.
 
     `stated` contains the estimators' settings by label, `doubts` the doubts about truths. If an
     estimator cannot be bound to the logs, its row states this.
@@ -125,7 +125,7 @@ def recounted(
 
 
 def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock]:
-    """Return the span of a log that its estimates cover, and the clock of their replay."""
+    """Return the span of a log that was replayed, and the clock of the replay."""
     notes = estimates.run.notes if estimates.run else {}
     start_ns, end_ns, order = _noted(notes.get(REPLAYED, ""))
     return replace(source, start_ns=start_ns, end_ns=end_ns), order
@@ -233,7 +233,7 @@ def rows_of(
 
 
 def _whole(row: Row, left_out: Rejections) -> Row:
-    """Add messages that were dropped before an estimator received them to the row."""
+    """Add to the row the messages that were dropped before an estimator received them."""
     if row.topic not in left_out:
         return row
     why = "; ".join(filter(None, (row.why, left_out.sentence(row.topic))))
@@ -241,7 +241,7 @@ def _whole(row: Row, left_out: Rejections) -> Row:
 
 
 def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
-    """Add rows on unused topics of further runs to those of earlier ones."""
+    """Add rows on unused topics of later runs to the rows of earlier runs."""
     counts = {(row.estimator, row.topic): row for row in rows}
     for row in more:
         before = counts.get((row.estimator, row.topic))

@@ -6,7 +6,7 @@
     gain[ekf, wind][0]         an entry of a list
     rmse_m[ekf] < 2 * limit    a comparison: true, false, or open if an interval allows both
 
-Numbers are named after what `*` and `|` match. The functions are `numbers.FUNCTIONS`.
+Numbers are named after the names that `*` and `|` match. The functions are `numbers.FUNCTIONS`.
 """
 
 import ast
@@ -39,7 +39,7 @@ from fuselog.replay.judging.intervals import Interval
 
 
 class NoMetric(Exception):
-    """The result lacks a metric that an expression names."""
+    """An expression names a metric that the result does not contain."""
 
 
 class Values(NamedTuple):
@@ -65,7 +65,7 @@ def evaluate(expression: str, values: Values) -> Value:
         return value_of(parse(expression), values)
     except (TypeError, AttributeError, ValueError, OverflowError):
         raise BadInput(
-            f"'{expression}' uses a number, a list or a comparison where one of the others is expected"
+            f"'{expression}' uses a number, a list or a comparison in the wrong place"
         ) from None
 
 
@@ -164,8 +164,8 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
 
     Args:
         expression: the comparison.
-        stated: expressions by the names that stand for them.
-        values: everything that it may name.
+        stated: expressions by name.
+        values: everything that the comparison may name.
     """
     tree = _expanded(expression, stated)
     for node in ast.walk(tree):
@@ -195,13 +195,13 @@ def _keys_in(tree: ast.expr, values: Values) -> list[str]:
 
 
 def _expanded(expression: str, stated: Mapping[str, str]) -> ast.expr:
-    """Parse an expression, and replace names by the expressions that they stand for."""
+    """Parse an expression, and replace names by their expressions."""
     tree: ast.expr = _Expanded(stated).visit(deepcopy(parse(expression)))
     return tree
 
 
 class _Expanded(ast.NodeTransformer):
-    """A transformer that replaces names by the expressions that they stand for."""
+    """A transformer that replaces names by their expressions."""
 
     def __init__(self, stated: Mapping[str, str]) -> None:
         self.stated = stated

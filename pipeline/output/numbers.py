@@ -1,7 +1,7 @@
 """Arithmetic with numbers that have intervals, for the evaluation of expressions.
 
-A comparison that an interval leaves open is neither true nor false. Operations and comparisons on lists
-apply to each entry.
+A comparison is neither true nor false if the interval of a number does not decide it. Operations and
+comparisons on lists apply to each entry.
 """
 
 import ast

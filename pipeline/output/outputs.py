@@ -37,7 +37,7 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
 
     Args:
         outputs: the files to write.
-        inputs: the files to read, by their role for the user: `{"log": [...]}`.
+        inputs: the files to read, by their role in messages: `{"log": [...]}`.
     """
     taken = {_identity(path): f"{role} {path}" for role, paths in inputs.items() for path in paths}
     for named, kind in outputs:
@@ -90,7 +90,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def _is_of_result(path: Path) -> bool:
-    """Test whether a result folder lists a file as its own."""
+    """Test whether the result folder that contains a file lists it."""
     place = Path(os.path.realpath(path))
     for folder in place.parents:
         if (folder / RESULT_FILE).is_file():

@@ -62,7 +62,7 @@ class Outcome:
         alarms: warnings about the metrics.
         causes: why an estimator is inconsistent, if it was diagnosed.
         stress: the effect of changes that should not matter, if it was tested.
-        timings: the seconds and messages of each estimator.
+        timings: run time in s and number of messages of each estimator.
         kind: the command that made the result.
     """
 
@@ -172,7 +172,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one case, by quantity and then estimator, always in the same order."""
+    """The metrics of one case, by quantity and then by estimator, always in the same order."""
 
     case: str
     estimators: list[str]
@@ -232,8 +232,8 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
     """Open a temporary folder next to `folder`, which replaces an earlier result after success.
 
-    Raises BadInput if `folder` is not a result of fuselog, if another process is filling it, or if it
-    cannot be written.
+    Raises BadInput if `folder` exists and is not a result of fuselog, if another process is filling it,
+    or if it cannot be written.
     """
     return whole_folder(folder, lambda found: require_ours(found, folder))
 
@@ -271,7 +271,7 @@ def require_ours(found: Path, place: Path) -> None:
 
 
 def _sealed(result: Result) -> Result:
-    """Add the SHA-256 of the result's own text to its files."""
+    """Add the SHA-256 of the result's text to the list of its files."""
     digest = _digest(result.model_dump(mode="json"))
     return result.model_copy(update={"files": {**result.files, RESULT_FILE: digest}})
 

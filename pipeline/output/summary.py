@@ -196,7 +196,7 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
 def late_counts(late: pd.DataFrame) -> pd.DataFrame:
     """Count out-of-sequence messages, with a row per estimator, case and outcome; see `Judge.late`.
 
-    Each row contains the mean delay in seconds, and how many messages were reprocessed because of them.
+    Each row contains the mean delay in seconds, and how many messages were reprocessed as a result.
     """
     rows = late.assign(late_s=late["late_s"] * late["messages"])
     if "repeated" in late:

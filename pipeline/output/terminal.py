@@ -64,7 +64,7 @@ class OnceAMinute:
         self.begin()
 
     def begin(self) -> None:
-        """Start the first minute; commands call this when they begin."""
+        """Start the first minute, at the beginning of a command."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
@@ -323,7 +323,7 @@ def print_parameters(
 
 
 def print_worst(alarms: Sequence[Finding]) -> None:
-    """Print the worst warning about the numbers that are printed next."""
+    """Print the worst warning about the numbers that follow."""
     for alarm in alarms[:1]:
         say(f"doubtful: {alarm.sentence}")
 

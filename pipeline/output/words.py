@@ -173,7 +173,7 @@ class Scale(NamedTuple):
         return text if text == MISSING else self.signed(text)
 
     def signed(self, text: str) -> str:
-        """Append the unit's sign to a number that was formatted in this unit."""
+        """Append the unit to a number that was formatted in this unit."""
         return f"{text}{self.sign}" if self.sign in ("", "°", "°/s") else f"{text} {self.sign}"
 
 
@@ -236,12 +236,12 @@ def _exponent(value: float, digits: int) -> int:
 
 
 def _bare(text: str) -> str:
-    """Remove trailing zeros that add nothing to a whole number."""
+    """Remove trailing zeros after the decimal point of a whole number."""
     return re.sub(r"\.0+$", "", text)
 
 
 def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
-    """Format two ends in one unit, without the unit."""
+    """Format the two ends of an interval in one unit, without the unit."""
     return " to ".join(alike([low, high], own, digits))
 
 
@@ -265,7 +265,7 @@ def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str
 
 
 def count(number_of: int, one: str, many: str = "") -> str:
-    """Format a number of things with the singular or the plural.
+    """Format a number with the singular or plural of a noun.
 
     >>> count(1, "run"), count(1200, "run")
     ('1 run', '1,200 runs')

@@ -1,8 +1,8 @@
 """Cells of an experiment, which are processed in any order and merged in a fixed order.
 
 A cell is a part of the runs. Its result depends only on its description and on the code, so it can be
-computed anywhere, and only once. Finished cells are kept until all are done, and after an interruption
-the same command continues with them; see `fuselog.pipeline.runs.checkpoints`.
+computed anywhere and needs to be computed only once. Finished cells are kept until all are done, and
+after an interruption the same command continues with them; see `fuselog.pipeline.runs.checkpoints`.
 """
 
 import hashlib
@@ -169,7 +169,7 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
-    """Divide an experiment into cells, which depend only on the number of runs."""
+    """Divide an experiment into cells; the division depends only on the number of runs."""
     require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)

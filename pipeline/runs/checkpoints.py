@@ -80,7 +80,7 @@ class Checkpoints:
         return self.folder / key
 
     def has(self, key: str) -> bool:
-        """Test whether a cell is done and has all its files."""
+        """Test whether a cell is finished and all its files exist."""
         return self._left(key) is not None
 
     def read(self, key: str) -> Any:
@@ -173,7 +173,7 @@ class _Left(NamedTuple):
 
 @contextmanager
 def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
-    """Store the cells of the experiment with this result folder, until they have succeeded."""
+    """Store the cells of an experiment next to its result folder, and remove them after success."""
     place = settled(place)
     folder = place.with_name(f"{place.name}.unfinished")
     checkpoints = Checkpoints(folder, FileLock(folder / _LOCK, timeout=0))

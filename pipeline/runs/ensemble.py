@@ -58,7 +58,7 @@ class RunGroup:
     Attributes:
         sources: the runs.
         first_run: the number of the first run.
-        estimates: for the first runs, the path of the estimates and the source log.
+        estimates: paths of estimates and source log, for the first runs.
         origins: initial states of runs whose spans begin after their priors; empty, or one per run.
         is_all: whether these are all runs of the ensemble.
     """
@@ -123,7 +123,7 @@ class Pass:
 
     @property
     def timings(self) -> dict[str, dict[str, float]]:
-        """Return the time of each estimator in seconds, and the number of its messages."""
+        """Return the run time of each estimator in seconds, and its number of messages."""
         messages: Counter[str] = Counter()
         for name, usage in self.usages.items():
             messages[name.partition("/")[0]] += usage.given.total()
@@ -133,7 +133,7 @@ class Pass:
         }
 
     def merge(self, other: "Pass") -> None:
-        """Merge the result of a pass over later runs into this one."""
+        """Add the result of a pass over later runs to this one."""
         self.judge.merge(other.judge)
         self.seconds = plus(self.seconds, other.seconds)
         for name, usage in other.usages.items():
@@ -293,7 +293,7 @@ def bind_from(
 def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
     """Return the parameters of estimators by label as JSON values, without values that are None.
 
-    Parameters of individual topics are in a table per topic.
+    Parameters of single topics are in one table per topic.
     """
     return {
         each.name.partition("/")[0]: _as_set(each.parameters)

@@ -46,8 +46,8 @@ class Experiment(Parameters):
         record: what to simulate.
         import_: what to import.
         logs: logs to replay.
-        estimators: parameters by label; `kind` names the estimator if the label is not its name, `like`
-            names another label whose kind and parameters are the defaults.
+        estimators: parameters by label; `kind` names the estimator if the label is not its name; `like`
+            names another label from which kind and parameters are taken unless they are set.
         alterations: changes of topics before the replay, as for `--set /TOPIC.WHAT`.
         metrics: names of the metrics; by default all registered ones.
         gap_limit_s: longest gap over which truth is interpolated.
@@ -151,7 +151,7 @@ class Setting:
         logs: number of runs whose logs are kept.
         draws: whether the first run's timeline is drawn.
         errors: whether all individual errors are kept.
-        options: of the study's own type.
+        options: options of the study, of the type that it defines.
         progress: function that reports progress.
         open_pool: function that opens the workers for the cells; by default this process.
         checkpoints: storage of finished cells until all are done.
@@ -245,8 +245,8 @@ def load_experiment(
     """Load an experiment by its shipped name or TOML file, and apply settings and then `over`.
 
     A setting applies to the entry of the experiment or to the estimator that its first word names.
-    Otherwise it applies to the parameters of the scenario or importer, or else to all estimators with
-    such a parameter: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`,
+    Otherwise it applies to a parameter of the scenario or importer, or else to all estimators with such
+    a parameter: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`,
     `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)

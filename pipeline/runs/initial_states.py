@@ -90,7 +90,8 @@ def origins_of(
         order: the clock of the replay.
         gap_limit_s: the longest gap over which the truth is interpolated.
 
-    Raises BadInput if the replay begins where the runs begin, or an estimates log is of another run.
+    Raises BadInput if the replay starts at the beginning of the runs, or an estimates log is of another
+    run.
     """
     if origins and sources[0].start_ns is None:
         raise BadInput(f"--start-from {origins[0]}: also give the start time with --start")

@@ -42,7 +42,7 @@ class Logs(Parameters):
 
     Attributes:
         files: files or patterns such as `drive-*.mcap`, relative to the folder of the experiment's file;
-            estimates logs among several matches are left out.
+            estimates logs are ignored if a pattern has several matches.
     """
 
     files: list[str] = []
@@ -103,7 +103,7 @@ def shipped(kind: str) -> dict[str, Path]:
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
-    """Find a scenario by registered name, shipped file or TOML file: recorder, parameters, label.
+    """Find a scenario by its registered name, shipped file or TOML file: recorder, parameters, label.
 
     A scenario file has `recorder` and a table `parameters`.
     """

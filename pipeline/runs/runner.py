@@ -28,7 +28,7 @@ from fuselog.replay.judging.judge import Judge
 
 @dataclass(frozen=True)
 class Runner:
-    """The runs of an experiment in its setting.
+    """The runs of an experiment, and where and how it runs.
 
     Attributes:
         experiment: the experiment.
@@ -103,8 +103,8 @@ class Runner:
             sources: the runs.
             outputs: the outputs of the estimators, by topic.
             folder: the folder for logs and estimates, in the setting's folder.
-            drawn: the folder for the timeline of the first run, also in the setting's folder; None for
-                no timeline.
+            drawn: the folder for the timeline of the first run, in the setting's folder; None for no
+                timeline.
             first_run: the number of the first of these runs, if they are only a part of all runs.
         """
         count = max(0, min(self.setting.logs - first_run, len(sources)))
@@ -136,7 +136,7 @@ class Runner:
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """Run all `cases`, which map names to different scenario parameters, as `run` does.
+        """Replay each of the `cases`, which map names to different scenario parameters, as `run` does.
 
         Files are written to a folder per case; the first case's timeline is that of the experiment.
         """

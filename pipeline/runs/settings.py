@@ -40,7 +40,7 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
 
 
 def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """Split KEY=VALUE texts into settings of topics, by `/TOPIC.WHAT`, and all other texts."""
+    """Split KEY=VALUE texts: return settings of topics by `/TOPIC.WHAT`, and all other texts."""
     of_topics = [text for text in texts if _alters(text)]
     return parse_settings(of_topics), [text for text in texts if text not in of_topics]
 
@@ -55,8 +55,8 @@ def settings_of_estimators(
 ) -> dict[str, dict[str, Any]]:
     """Combine parameters by estimator label: a settings file, then KEY=VALUE texts, then options.
 
-    `ekf.gate_probability=1` applies to ekf, `gate_probability=1` to all estimators with such a
-    parameter, and so do options that are not None. Raises BadInput if no estimator has the parameter.
+    `ekf.gate_probability=1` applies to ekf; `gate_probability=1`, like options that are not None,
+    applies to all estimators with such a parameter. Raises BadInput if no estimator has the parameter.
     """
     named = named_by(labels)
     base = read_settings(file, named)
@@ -112,7 +112,7 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 
 
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
-    """Return the names of the parameters of estimators, from their settings by label.
+    """Return the names of the estimators' parameters by label; the arguments are their settings.
 
     Raises BadInput if there is no such estimator.
     """

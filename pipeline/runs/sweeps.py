@@ -188,8 +188,9 @@ def run_sweep(
 ) -> Result:
     """Run an experiment at every point, and write a result folder; return result.json.
 
-    Its metrics are lists with a number for each point; the table has a row for each. Raises BadInput if
-    the study of the experiment does more than judge, or if the experiment cannot be run.
+    The metrics in the result are lists with a number for each point; the table has a row for each.
+    Raises BadInput if the study of the experiment does more than judge, or if the experiment cannot be
+    run.
     """
     for experiment in experiments:
         if experiment.study != "localization":
@@ -227,7 +228,7 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """Tabulate the metrics at a point, with the value over all runs and the range of the middle 90 %.
+    """Tabulate the metrics at a point, with the value over all runs and the range of their middle 90 %.
 
     NEES and NIS also have their expected value, and the 95 % range of a consistent estimator.
     """
@@ -254,7 +255,7 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
 
 
 def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
-    """Select the errors of every run at a point, with which points are compared run by run."""
+    """Select the errors of every run at a point, so that points can be compared run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
     kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
@@ -285,7 +286,7 @@ def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
 
 
 def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
-    """Draw each quantity and case: a heat map over two numbers, or curves over every parameter."""
+    """Draw each quantity in each case, as a heat map if two numbers are swept, otherwise as curves."""
     numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
     grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
     figures: dict[str, Chart | Figure] = {}

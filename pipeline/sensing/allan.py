@@ -21,7 +21,7 @@ _A_WINDOW = 1000  # number of differences per window in this case, which are as 
 
 
 class Curve(NamedTuple):
-    """An Allan deviation: times (n,), deviations (n,), and numbers of differences (n,)."""
+    """An Allan deviation, with times (n,), deviations (n,), and numbers of differences (n,)."""
 
     taus_s: Floats
     deviations: Floats
@@ -29,7 +29,7 @@ class Curve(NamedTuple):
 
 
 def multiples_of(count: int) -> Integers:
-    """Choose the window lengths, in samples, for the curve of `count` samples, up to a third of it."""
+    """Choose window lengths, in samples, for a curve of `count` samples, up to a third of `count`."""
     decades = np.log10(max(count // 3, 1))
     spread = np.logspace(0, decades, int(PER_DECADE * decades) + 1)
     return np.unique(np.floor(spread + 1e-9).astype(np.int64))

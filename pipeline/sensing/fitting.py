@@ -51,7 +51,7 @@ class Fit(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """Return the log-likelihood minus half of BIC's penalty: larger is better."""
+        """Return the log-likelihood minus half of the penalty in BIC; larger is better."""
         return self.log_likelihood - 0.5 * len(self.free) * math.log(self.size)
 
     @property

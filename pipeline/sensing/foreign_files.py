@@ -35,7 +35,7 @@ def explained(path: Path) -> list[str]:
             if path.stem.endswith("t")
             else "an Allan deviation, of a gyro in deg/h"
         )
-        return [f"{path}: this is a column of imu_utils: {what}; it gives no interval"]
+        return [f"{path}: this file was written by imu_utils ({what}) and has no intervals"]
     return []
 
 
@@ -73,7 +73,7 @@ def _number(text: str) -> float:
 
 
 def _deviation_at_1_s(path: Path) -> float | None:
-    """Average the Allan deviations at 1 s of the gyroscope's axes, in rad/s, from a file's curves."""
+    """Average the gyroscope axes' Allan deviations at 1 s, in rad/s, from the curves next to a file."""
     name = path.name.partition("_imu_param")[0]
     times = path.with_name(f"data_{name}_gyr_t.txt")
     curves = [path.with_name(f"data_{name}_gyr_{axis}.txt") for axis in "xyz"]

@@ -38,7 +38,7 @@ class Likelihood(NamedTuple):
 
     Attributes:
         log_likelihood: the log-likelihood of these terms.
-        mean_square: of the normalised innovations; one if the terms have the right size.
+        mean_square: mean square of the normalised innovations; one if the terms have the right size.
         coefficients, sigmas: (regressors,) the best coefficients, and their standard deviations.
     """
 
@@ -90,12 +90,12 @@ def filter_samples(
 
     Args:
         values: (n, m) the columns.
-        steps: (n,) in steps of the grid.
+        steps: (n,) the number of grid steps since the previous sample.
         step_s: the step of the grid.
         noise: (5,) the terms.
-        means: (m, 4) work memory: b, g, e of the previous sample and the innovation, per column.
+        means: (m, 4) work memory, for b, g, e of the previous sample and the innovation of each column.
         moments: (m, m) filled with the sums of products of normalised innovations.
-        found: (n, m) filled with the normalised innovations; or no rows.
+        found: (n, m) filled with the normalised innovations; without rows if they are not needed.
     """
     white = noise[0] * noise[0] / step_s
     walk = noise[1] * noise[1] * step_s

@@ -172,7 +172,7 @@ def _analysed(
     values, step_s, notes = preparing.on_grid(column, grid), grid.step_s, []
     preparing.check_at_rest(title, name, values, step_s)
     if grid.lost:
-        notes.append(f"{100 * grid.lost:.2g} % of the messages are lost; gaps are found by the stamps")
+        notes.append(f"{100 * grid.lost:.2g} % of the messages are lost; gaps are found from the stamps")
     if line := preparing.find_vibration(values, step_s):
         notes.append(f"vibrates at {line[0]:.4g} Hz with {line[1]:.2g} {unit}; the numbers include this")
     values = values - values[np.isfinite(values)][0]

@@ -164,7 +164,7 @@ class SensorNoise:
         return Chart(title=title, panels=panels, columns=min(3, len(panels)))
 
     def draw(self, rrd: Path) -> None:
-        """Write the curves to the file `rrd` for the viewer."""
+        """Write the curves to the .rrd file `rrd`, for the viewer."""
         from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE
         from fuselog.replay.timeline.drawing.curves import CurvePanel, save_curves
         from fuselog.replay.timeline.drawing.plane import Stroke

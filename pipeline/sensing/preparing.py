@@ -93,7 +93,7 @@ def grid_of(stream: Stream) -> Grid:
 
 
 def on_grid(values: Floats, grid: Grid) -> Floats:
-    """Put samples at their places on the grid.
+    """Arrange samples at their places on the grid.
 
     Args:
         values: (n,), those of all messages, in the order of the stream.
@@ -180,7 +180,7 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
         step_s: the grid's step.
 
     Returns:
-        The drift; None if it explains too little.
+        The drift; None if it does not explain the samples significantly better.
     """
     block = -(-len(values) // _DRIFT_SAMPLES)
     means, step_s = block_means(values, block), step_s * block
@@ -219,7 +219,7 @@ def white_block(values: Floats, step_s: float) -> int:
         step_s: the grid's step.
 
     Returns:
-        The size of a block, for `block_means`.
+        The number of samples in a block, for `block_means`.
     """
     block = fewest_block(len(values))
     while len(values) // (2 * block) >= FEWEST:

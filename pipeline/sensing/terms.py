@@ -33,7 +33,7 @@ class Terms(NamedTuple):
     def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
         """Compute the autocovariance of second differences, at lags 0, 1, ... below `count`.
 
-        They are differences of the phases (sums of samples times `step_s`) at a distance of
+        The differences are those of the phases (sums of samples times `step_s`) at a distance of
         `multiple` samples; the Allan variance is their mean square. Beyond twice that distance only the
         Gauss-Markov term remains; the result ends where this term has decayed.
         """

@@ -1,4 +1,4 @@
-"""Changes of a run that should not matter; each copies the run and changes its topics by a seed.
+"""Changes of a run that should not matter; each one copies the run with changed topics.
 
 Most changes have a size, 1 or 0.5, to test whether the difference shrinks with the change.
 """
@@ -35,7 +35,7 @@ Changed = Callable[[MemorySource, Inputs, float, int], MemorySource]
 
 
 class Change(NamedTuple):
-    """A change, with its description, its function of a run, and whether half of it is defined."""
+    """A change, with its description, its function, and whether it can be halved."""
 
     words: str
     of_run: Changed | None
@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """Return the group of a topic; topics of one scan get the same sign, and are dropped together."""
+    """Return the group of a topic; the topics of a scan have the same sign and are dropped together."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -103,7 +103,7 @@ def _order(source: MemorySource, inputs: Inputs, _: float, __: int) -> MemorySou
 
 
 def _inputs(change: Callable[[NDArray[np.float64], np.random.Generator], NDArray]) -> Changed:
-    """Make a change of every floating-point number of sensors."""
+    """Make a change that applies `change` to every floating-point number of sensors."""
 
     def changed(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
         rng, streams = np.random.default_rng(seed), {}
@@ -132,7 +132,7 @@ def _by_an_ulp(column: NDArray[np.float64], rng: np.random.Generator) -> NDArray
 
 
 def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move the start by START_SIGMAS of the prior's sigma along all its axes, which is also its A."""
+    """Move the start by START_SIGMAS of the prior's sigma along every axis, so that A has this value."""
     rng, streams = np.random.default_rng(seed), {}
     for topic in inputs.priors:
         stream = source.streams[topic]
@@ -148,7 +148,7 @@ def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> Memo
 
 
 def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Move states in their tangent space, by (rows, tangent components)."""
+    """Move states in their tangent space by steps (rows, tangent components)."""
     mean, place = stream["mean"].copy(), 0
     for kind, columns in manifold_blocks(kinds):
         if kind == "quaternion":

@@ -97,7 +97,7 @@ class Replayed:
         return found
 
     def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """Return the known metrics of a run by case and quantity."""
+        """Return the metrics of a run that are known, by case and quantity."""
         return self._metrics.get(run, {})
 
 

@@ -31,8 +31,8 @@ class _Part(NamedTuple):
 
     Attributes:
         experiment: the whole experiment.
-        data: the folder that it imports from.
-        first, end: the range of runs.
+        data: the folder from which it imports data.
+        first, end: the range of runs; `end` is exclusive.
     """
 
     experiment: Experiment

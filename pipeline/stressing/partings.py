@@ -27,7 +27,7 @@ class Parting(NamedTuple):
 
     Attributes:
         topic: the topic of the estimate.
-        stamps_ns: (n,) of the unchanged replay.
+        stamps_ns: stamps (n,) of the unchanged replay.
         amplification: (n,) A.
         metres, degrees: (n,) distances of positions and of angles; NaN if the state has none.
         spread: the largest relative difference of standard deviations; NaN if none is known.
@@ -149,8 +149,8 @@ class Undetermined(NamedTuple):
     Attributes:
         components: the names of its components, which have the same unit.
         direction: (n,) the unit vector, with a positive largest entry.
-        sigma: the standard deviation along it, at the end.
-        next_sigma: the largest standard deviation perpendicular to it.
+        sigma: the standard deviation along the direction, at the end.
+        next_sigma: the largest standard deviation perpendicular to the direction.
         since_ns: the last stamp at which a measurement reduced the standard deviation.
     """
 
@@ -172,7 +172,7 @@ class Undetermined(NamedTuple):
 
 
 def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermined | None:
-    """Find the least certain direction among components of one unit, if it is much worse than others.
+    """Find the most uncertain direction among components of one unit, if it is much worse than others.
 
     Components of different units have no common length, so they are not combined.
 

@@ -44,8 +44,8 @@ def stress(
     """Replay under changes that should not matter, and report their effect on the result.
 
     At most twelve replays are made per run and estimator: one without changes, one for each change, one
-    with half the change for the three with the largest effect, and one with a quarter if half the change
-    has neither half the effect nor the whole effect.
+    with half of each of the three changes with the largest effect, and one with a quarter if half a
+    change has neither half the effect nor the whole effect.
 
     Args:
         logs: paths, opened logs, or recordings.
@@ -163,7 +163,7 @@ def _stressed(
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
 
     def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
-        """Try these changes of these runs with a smaller size."""
+        """Try smaller versions of these changes of these runs."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
             again = replayed(copies(own, size), label, settings, how)
@@ -199,7 +199,7 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Choose the changes to quarter, whose half has less effect, but not half of it; worst first.
+    """Choose the changes to quarter: their half has less effect, but not half as much.
 
     A nonlinear effect is proportional if the change is small enough. No run is replayed more than twelve
     times.

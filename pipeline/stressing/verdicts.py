@@ -40,8 +40,8 @@ class Tried(NamedTuple):
         moved: by (case, metric), the change of a metric from the unchanged replay.
         beyond: the change of the main metric, in words; "" within the margin.
         why: the reason why it was not tried.
-        failed: when and why the copy ends although the unchanged replay does not; for a change that was
-            not tried, that of the unchanged replay if it ends before its first estimate.
+        failed: when and why the copy fails although the unchanged replay does not. For a change that was
+            not tried, when and why the unchanged replay fails before its first estimate.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Tried(NamedTuple):
 
     @property
     def is_wider(self) -> bool:
-        """Test whether moved stamps change a covariance by more than noise per second usually does."""
+        """Test whether moved stamps change a covariance by more than is usual for noise per second."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -109,7 +109,7 @@ class Stressed:
 
     @property
     def failed(self) -> str:
-        """Return when and why the unchanged replay ends before its first estimate; "" otherwise."""
+        """Return when and why the unchanged replay fails before its first estimate; "" otherwise."""
         said = [each.failed for each in self.tried.values() if each.why]
         return next(filter(None, said), "")
 
@@ -119,7 +119,7 @@ class Stressed:
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
-        """Test whether a change without a half moves the estimate no further than allowed.
+        """Test whether a change that cannot be halved moves the estimate no further than allowed.
 
         The limit is a sigma or, for lost messages, the largest distance due to chance.
         """
@@ -236,7 +236,7 @@ class Stressed:
             return f"{begin}the copy fails {each.failed}"
         begin += each.far
         if self.worst == "harmless":
-            return f"{begin}; every other change that was tried does less"
+            return f"{begin}; every other change that was tried has less effect"
         if not np.isfinite(self.ratio(name)):
             return begin
         return f"{begin}; {self._shrinking(name)}"

@@ -68,7 +68,7 @@ def _part_of_runs(parts: Sequence[Initialized], first: Mapping[str, Ragged], *_:
 
 
 def begun_broadly(bound: Bound, begins_ns: Sequence[int], count: int) -> Bound:
-    """Make an estimator for trials that are repeated `count` times each, once for each of their parts.
+    """Make an estimator for trials that are repeated `count` times, once for each of their parts.
 
     Each trial finds its own starts from its own first messages, because measurements may be altered. The
     starts have the stamps `begins_ns`. An estimator that finds no broad starts is not changed.
@@ -107,7 +107,7 @@ def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def initialization_of(bound: Bound) -> Initialization | None:
-    """Return an estimator's search for its start, or None if it needs none."""
+    """Return the function with which an estimator finds its start, or None if it needs no search."""
     return bound.initialization if isinstance(bound, Recursive) else None
 
 

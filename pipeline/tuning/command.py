@@ -40,7 +40,7 @@ def tune_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Tune on logs, write the result folder, and print the used logs and the result.
+    """Tune on logs, write the result folder, and print the names of the logs and the result.
 
     If `search` is given, it determines the free parameters and the criterion, and `free`, `by` and
     `grid` are ignored.

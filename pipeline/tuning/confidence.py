@@ -24,12 +24,13 @@ WIDEST = 3.0  # in coordinates: a factor of 20
 
 
 class Confidence(NamedTuple):
-    """The confidence in m of k parameters, which are those that are not at a bound.
+    """The confidence in those m of k parameters that are not at a bound.
 
     Attributes:
         places: (m,) the indices of these parameters.
         curvature: (m, m) the second derivatives of the cost in coordinates.
-        covariance: (m, m) its inverse; variances are infinite in directions without a rise.
+        covariance: (m, m) its inverse; variances are infinite in directions in which the cost does not
+            rise.
     """
 
     places: Sequence[int]
@@ -59,11 +60,11 @@ class SearchOutcome(NamedTuple):
         evaluations: the number of points tried.
         has_converged, was_stopped: how the search ended.
         is_spike: whether a search from a second start does not find this minimum.
-        at_edge: parameters near whose values a run fails or uses fewer measurements.
-        begins_alike: whether filters begin at the optimum where they began in the search.
+        at_edge: parameters for which a run fails or uses fewer measurements near the optimum.
+        begins_alike: whether filters begin at the same stamps at the optimum as in the search.
         held: calibration parameters that the motion does not determine, and that keep their start
             values.
-        lacks: sentences that report these parameters, and which other values depend on them.
+        lacks: sentences on these parameters, and on other values that depend on them.
     """
 
     coordinates: Coordinates
@@ -102,8 +103,8 @@ def with_noise(curvature: Floats, noise: Floats) -> Floats:
 
     If slopes vary more than the curvature implies, the covariance of the estimates is that of the slopes
     multiplied by the inverse curvature from both sides: White, Maximum likelihood estimation of
-    misspecified models, Econometrica 50, 1982. The curvature already contains noise in which slopes are
-    linear, so the larger of the two is used in each direction.
+    misspecified models, Econometrica 50, 1982. The curvature already contains noise that affects slopes
+    linearly, so the larger of the two is used in each direction.
 
     Args:
         curvature: (m, m), the second derivatives of the cost.
@@ -149,8 +150,9 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
     """Yield unit directions (m,) in which the cost rises too little, with the curvature there.
 
-    They are eigenvectors of the curvature in useful units. Two useful standard errors are a factor of
-    2.7, or, for a parameter without a useful error, `UNIT` standard errors if all others are fixed.
+    They are eigenvectors of the curvature in useful units. The useful unit of a parameter is two useful
+    standard errors or a factor of 2.7; without a useful error, it is `UNIT` standard errors with all
+    others fixed.
     """
     places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]
@@ -186,8 +188,8 @@ def _in_words(direction: Floats, value: float, free: Sequence[Parameter]) -> str
         return f"{names[first]}: the logs determine it within a factor of {_factor(value):.2g} (95 %)"
     if not others:
         return (
-            f"{names[first]}: the logs do not determine it; they only fit worse with the start value, "
-            f"{free[first].default:g}"
+            f"{names[first]}: the logs do not determine it; they only show that the start value, "
+            f"{free[first].default:g}, fits less well"
         )
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"

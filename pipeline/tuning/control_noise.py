@@ -36,7 +36,7 @@ MAD = 1.4826  # standard deviation of a normal distribution divided by its media
 
 
 class _Noise(NamedTuple):
-    """The noise of one number of a control."""
+    """The noise of one measured number of a control."""
 
     topic: str
     field: str

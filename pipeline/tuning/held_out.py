@@ -20,7 +20,7 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
-    """Options of the study: the free parameters, and the vehicles that tune and that judge.
+    """Options of the study: the free parameters, and the vehicles for tuning and for judging.
 
     Attributes:
         free: names of the parameters that are searched for.

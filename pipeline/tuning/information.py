@@ -2,8 +2,9 @@
 
 With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives by the parameters. In useful units, a direction with an eigenvalue below one is not
-determined. A pseudo-inverse is not used: it would give such a direction a small standard error. Such
-directions by kind of motion: Yang et al., arXiv 2201.09170; for wheels: Censi et al., IEEE T-RO 2013.
+determined. A pseudo-inverse is not used, because it would assign a small standard error to such a
+direction. Yang et al., arXiv 2201.09170, list such directions by kind of motion; Censi et al., IEEE T-RO
+2013, for wheels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,7 +35,7 @@ class Undetermined(NamedTuple):
     Attributes:
         eigenvalues: (m,) of the information in useful units, in ascending order.
         directions: (d, m) undetermined directions in useful units, each with few parameters.
-        places: indices of the parameters involved in them.
+        places: indices of the parameters that are involved in these directions.
     """
 
     eigenvalues: Floats

@@ -15,7 +15,7 @@ def until_last_measured(
 ) -> LogSource | MemorySource:
     """Cut a log a second after its last measurement if the controls continue for longer.
 
-    Later there are no estimates to compare, which is not a failure.
+    Missing estimates after this time are not a failure.
     """
     readings = [
         (each, each.reading())

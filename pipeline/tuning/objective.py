@@ -159,7 +159,7 @@ class Criterion(NamedTuple):
         cost: function that computes the cost from the sums; a run without values contributes nothing.
         is_smooth: whether it uses innovations. The gate is then open, because it could change which
             innovations are used.
-        lacks: what is missing in a log without such sums.
+        lacks: description of what is missing in a log without such sums.
     """
 
     sums: Callable[[Run, Mapping[str, Ragged], float], Sums]
@@ -259,7 +259,7 @@ class Objective:
         return replace(self, runs=(), on_best=silent, pool=None)
 
     def begin(self, start: Floats) -> None:
-        """Record the number of messages of every log at the start (k,), and where filters begin there.
+        """Record every log's number of messages and the filters' initial states at the start (k,).
 
         Both stay fixed, because likelihoods of different measurements cannot be compared. Raises
         BadInput if a run fails, if a log lacks the quantity that is minimised, or if the estimator
@@ -428,7 +428,7 @@ class Objective:
         return collect(replay(run.trial.runs, bound))
 
     def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
-        """Compute a log's sums at points (n, k); None if the number of messages changes at a point."""
+        """Compute a log's sums at points (n, k); None at points where the number of messages changes."""
         return [self._sums(point, run, count) for point in points]
 
     def _sums(self, values: Floats, run: Run, count: int) -> Sums | None:

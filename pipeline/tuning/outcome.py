@@ -46,9 +46,10 @@ class Tuning:
         logs, held_out_logs: the logs of the search, and other logs on which the values are judged.
         settings: the estimator's settings with the start values, and with the tuned values.
         objective: the cost that was minimised.
-        found: the end of the search.
-        costs: (2,) those of the logs with the start and the tuned values: minus the log-likelihood if
-            that was optimised, corrected for the noise of the controls if a note says so.
+        found: the outcome of the search.
+        costs: (2,) costs of the logs with the start and the tuned values. If the likelihood was
+            optimised, they are minus the log-likelihoods, corrected for the noise of the controls if a
+            note says so.
         held_out_costs: (2,) the same for the held-out logs, if any.
         folds: a row per fold: the values found on all other logs, and the costs of its own logs.
         gate: the probability of the gate that was open in the search.
@@ -129,7 +130,7 @@ class Tuning:
 
     @cached_property
     def whiteness(self) -> pd.DataFrame:
-        """Return a table with a row per measured component and set of values, on whiteness.
+        """Return a table on whiteness, with a row per measured component and set of values.
 
         The columns are the number of innovations, the mean square of the normalised innovations, their
         correlation with the next one, the Ljung-Box statistic Q, and the probability of a larger Q if

@@ -1,7 +1,7 @@
 """Search for the parameters with the lowest cost.
 
-Positive parameters, such as standard deviations, are searched as logarithms. Other parameters have an
-individual unit.
+Positive parameters, such as standard deviations, are searched as logarithms. Every other parameter has
+its own unit.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ MOST_GRID_POINTS = 10_000
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of k parameters, which are logarithms or values in individual units."""
+    """Coordinates of k parameters: logarithms, or values in the parameters' own units."""
 
     free: Sequence[Parameter]
     units: Floats
@@ -112,7 +112,7 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
-    """Find `UNIT` standard errors of a parameter from the curvature around a value, and three costs."""
+    """Compute `UNIT` standard errors of a parameter from the curvature at a value, and three costs."""
     step = 1e-3 * max(abs(value), 1.0)
     for _ in range(LOOKS):  # the cost is not a parabola here, so a smaller or larger step is used
         costs = near([-step, 0.0, step])

@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _rows(
     source: MemorySource, label: str, settings: Mapping[str, Any], true: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Tune on a log and return per parameter: true and tuned value, interval, standard error, doubt."""
+    """Tune on a log; return per parameter true and tuned value, interval, standard error, doubt."""
     found = tune(source, {label: settings}, list(true))
     tables, errors = found.parameters.to_dict("records"), found.standard_errors
     return [

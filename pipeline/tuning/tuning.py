@@ -318,7 +318,7 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
 
 
 def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
-    """Return the reach of calibration parameters that lose measurements near values (k,).
+    """Return the largest values of calibration parameters whose increase loses measurements.
 
     This happens if a delay moves a message to before the start of the filter.
     """
@@ -365,12 +365,12 @@ def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
 
 
 def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> SearchOutcome:
-    """Search until filters begin with the values found where they began in the search.
+    """Search until filters begin at the same stamps with the found values as in the search.
 
     Without a prior in the log, the stamp at which a filter begins depends on the values, for example on
     how much it trusts its path between the first fixes. This stamp is fixed during a search, because
-    likelihoods of different measurements cannot be compared; in the next search, filters begin where the
-    values found by the previous one put them.
+    likelihoods of different measurements cannot be compared. In the next search, it is determined by the
+    values that the previous search found.
     """
     start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)
@@ -485,7 +485,7 @@ def _confidence_at(
 def _noisy_steps(
     objective: Objective, coordinates: Coordinates, point: Floats, places: Sequence[int]
 ) -> Floats:
-    """Choose the steps (m,) of the differences of a cost that the noise of the controls makes jagged.
+    """Choose the difference steps (m,) for a cost that the noise of the controls makes jagged.
 
     The cost has an edge, randomly up or down, where shifted stamps coincide with those of a control.
     Differences for calibration parameters are therefore as wide as the useful error, but at most

@@ -58,7 +58,7 @@ def _words(
             yield f"again {known[id(value)]}"
             return
         yield f"def {value.__name__} {value.__defaults__!r}"
-        yield from _code(value.__code__)
+        yield from _code(value.__code__, value.__doc__)
         names = sorted(set(_names(value.__code__)))
         for cell in value.__closure__ or ():
             yield from of(cell.cell_contents)
@@ -101,13 +101,14 @@ def _is_known(value: Value, known: dict[int, int], kept: list[Value]) -> bool:
     return False
 
 
-def _code(code: CodeType) -> Iterator[str]:
+def _code(code: CodeType, description: str | None = None) -> Iterator[str]:
+    """Yield the bytecode and the constants of a function, except its docstring."""
     yield code.co_code.hex()
     yield f"{code.co_names} {code.co_varnames} {code.co_freevars} {code.co_argcount}"
     for each in code.co_consts:
         if isinstance(each, CodeType):
             yield from _code(each)
-        else:
+        elif each is not description:
             yield repr(each)
 
 

@@ -68,7 +68,7 @@ def test_what_a_method_cannot_estimate_is_named_in_place_of_its_consequences() -
         ("uninformed", "lrkf"),
     ]
     assert found[0].sentence.startswith(
-        "ukf: half_x_m, half_y_m keep their initial value and prior uncertainty: no"
+        "ukf: half_x_m, half_y_m keep their initial value and prior uncertainty, because no"
     )
     [biased, *_] = replay(record("moving-los", seed=1, duration_s=10.0), ["ekf"]).alarms
     assert biased.kind == "errors"

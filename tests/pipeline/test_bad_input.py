@@ -309,7 +309,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "evaluate line.tum line.tum --truth line.tum": ("line.tum", "one trajectory", "at a time"),
     "evaluate line.tum --truth line.tum --log log.mcap": (
         "--log",
-        "--truth applies to trajectory files",
+        "--truth to trajectory files",
     ),
     "evaluate line.tum --truth line.tum --align se3": (
         "line.tum",

@@ -567,7 +567,7 @@ def test_output_in_a_narrow_terminal_and_beyond_its_encoding(
     assert process.returncode == 0
     assert err == ""
     *lines, written, _ = out.splitlines()
-    assert max(len(line) for line in lines if not line.startswith("nees: of one run; ")) <= 60
+    assert max(len(line) for line in lines if not line.startswith("nees: it is that of one run, ")) <= 60
     assert written == r"\xe4 \u2603.estimates.mcap"
 
 

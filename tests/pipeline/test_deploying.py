@@ -400,7 +400,7 @@ def test_a_filter_is_written_where_it_was_asked_for_and_nowhere_else(
         assert written.items() >= before.items()
         assert said.out.splitlines() == [
             f"{Path(out)}: {', '.join(sorted(files))}",
-            f"{Path(out, 'README.md')} says how to build, test and replay it",
+            f"{Path(out, 'README.md')} explains how to build, test and replay it",
         ]
         assert f"{name}_init(" in written[str(Path(out, f"{name}.h"))].decode()
         readme = written[str(Path(out, "README.md"))].decode()

@@ -93,7 +93,7 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
         assert found.sentences[0].setting == setting
         assert re.search(words, found.sentences[0].sentence)
         assert found.replay.failures == []
-        assert found.notes[0].startswith("everything else is about the log with --set /")
+        assert found.notes[0].startswith("all other findings are about the log with --set /")
     for mended in sought:
         assert mended.streams["/fix"].publish_time_ns[0] == walk.streams["/fix"].publish_time_ns[0]
         rates, right = (each.streams["/inertial"]["turn_rate_radps"] for each in (mended, walk))

@@ -76,7 +76,7 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
     assert [card.look for card in told.cards] == ["best", "best", "broken"]
     assert told.cards[2].consistency == "Its errors are 3 times what it states"
     assert told.cards[2].numbers.startswith("NEES 27")
-    assert told.cards[2].numbers.endswith("; 3 is right")
+    assert told.cards[2].numbers.endswith("; 3 is ideal")
     assert told.doubts == ["the covariances of c, which are too small"]
     [difference] = told.differences
     assert re.match(
@@ -646,7 +646,7 @@ def test_a_gauge_goes_by_the_logarithm_and_a_state_by_chance(
     assert drawn.usual == pytest.approx((29.2, 37.66), abs=0.01)
     if value == 6.0:
         assert drawn.spread == pytest.approx((61.5, 67.4), abs=0.01)
-        assert drawn.words.startswith("NEES 6.00 (95 % 5.40 to 6.60); 2 is right")
+        assert drawn.words.startswith("NEES 6.00 (95 % 5.40 to 6.60); 2 is ideal")
     assert drawn.is_beyond == (value == 0.2)
     assert by.verdict == state
     assert by.factor == pytest.approx(factor)

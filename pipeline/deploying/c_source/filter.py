@@ -213,7 +213,7 @@ def _moments(made: CFilter) -> list[str]:
 
 
 def _factorising(made: CFilter) -> str:
-    """Write the factorisation of rows, with room for the largest step."""
+    """Write the factorisation of rows, with arrays that are large enough for every step."""
     t, m, number = made.tangent, made.most if made.sensors else 0, made.precision.number
     counts = [len(each.points) if each is not None else t for each in made.steps.sampled]
     columns = [counts[0] + t, *(count + m for count in counts[1:])]

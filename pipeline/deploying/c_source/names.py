@@ -64,7 +64,7 @@ class CFilter(NamedTuple):
 
     @property
     def is_interpolated(self) -> bool:
-        """Test whether the motion uses the mean of the controls at both ends of a step."""
+        """Test whether the motion uses the mean of the controls at the two ends of a step."""
         control = self.filtering.bound_model.model.control
         return control is not None and control.interpolated
 

@@ -112,12 +112,12 @@ _TIMES_FACTOR = """\
 
 
 def slope_text(*, is_root: bool) -> str:
-    """Write the direction in which the curved state changes, from a covariance or its factor."""
+    """Write the code that finds how a curved state changes, from a covariance or its factor."""
     return SLOPE.replace("PRODUCT", _TIMES_FACTOR if is_root else _TIMES)
 
 
 def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
-    """Write the sums of noise that enters through at most `gains` gains, for matrices of these sizes."""
+    """Write the code that adds noise with at most `gains` gains, for matrices of these sizes."""
     if not sizes:
         return []
     texts = [ADD_THROUGH.replace("WHAT", what).replace("SIZE", size) for what, size in sizes.items()]

@@ -1,7 +1,7 @@
 """Functions at weighted samples in C, as in `fuselog.replay.inference.kalman.regression`.
 
-Placeholders are those of `algebra`. SAMPLES is the largest number of samples, DRAWN of numbers in a
-sample, VALUES of tangent components, and PLACES of components of a function's values.
+Placeholders are those of `algebra`. SAMPLES, DRAWN, VALUES and PLACES are the largest numbers of
+samples, of entries in a sample, of tangent components of a function's values, and of their components.
 """
 
 import re
@@ -189,7 +189,7 @@ def samples_text(made: CFilter) -> list[str]:
 
 
 def _narrowing(made: CFilter, sampled: SampledFunction) -> list[str]:
-    """Write the functions that keep angles of samples within half a turn; none without angles."""
+    """Write the functions that keep angles of samples within half a turn; [] without angles."""
     if not sampled.turns:
         return []
     first, width, times = zip(*sampled.turns, strict=True)

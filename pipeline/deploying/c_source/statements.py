@@ -26,7 +26,7 @@ class Inputs:
 
         Args:
             step: the step.
-            arrays: the inputs after mean and covariance; "" for one that is absent.
+            arrays: the inputs after mean and covariance; "" for a missing one.
         """
         names: dict[Any, str] = {}
         lines: dict[str, str] = {}
@@ -100,7 +100,7 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
 
 
 def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
-    """Write the sum of a matrix and a step's noise, given as G and u and as N; see `jacobian_loops`."""
+    """Write the sum of a matrix and a step's noise, defined by G, u and N; see `jacobian_loops`."""
     size = "T" if what == "states" else "M"
     declared: list[str] = []
     named: dict[str, Node] = {}
@@ -130,7 +130,7 @@ def entries(step: Step, array: str) -> dict[str, Node]:
 
 
 def count_gains(step: Step) -> int:
-    """Count the numbers of noise that enter a step."""
+    """Count the independent noises of a step."""
     return sum(name == "u" for name, _ in step.outputs)
 
 

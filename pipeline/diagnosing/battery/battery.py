@@ -237,7 +237,7 @@ def results(
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Count each cell's runs and the correct ones, with median gain, mean value and spread."""
+    """Count the runs and the correct diagnoses of each cell, with median gain, mean value and spread."""
     by = rows.groupby("cell", sort=False)
     return by.agg(
         runs=("seed", "size"),

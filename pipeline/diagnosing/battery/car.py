@@ -1,7 +1,7 @@
 """Faults in logs of a car that drives after 10 s at rest, with or without a prior.
 
-Faults of the car and of its inertial unit are selected by name. They change the columns directly, not
-with the alterations with which a diagnosis corrects them.
+Faults of the car and of its inertial unit are selected by name. They change the columns directly,
+without the alterations that a diagnosis uses for corrections.
 """
 
 from collections.abc import Callable

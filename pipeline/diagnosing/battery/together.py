@@ -50,7 +50,7 @@ class TogetherOptions(Parameters):
     """Options of the study: the number of sets of faults.
 
     Attributes:
-        pairs: the number of pairs, from the first on.
+        pairs: the number of pairs, counted from the first.
         triples: the number of triples.
     """
 
@@ -144,7 +144,7 @@ def _seeds(experiment: Experiment, case: int) -> range:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Count over all logs, over pairs and triples, and by planted faults."""
+    """Count named faults over all logs, over pairs and triples, and by planted faults."""
     metrics = dict[str, float]()
     for case, own in (("pairs", rows[rows["planted"] == 2]), ("triples", rows[rows["planted"] == 3])):
         metrics |= {

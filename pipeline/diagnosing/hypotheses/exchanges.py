@@ -62,7 +62,7 @@ def _back(first: str, second: str, trial: Trial, _: float) -> Trial:
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Choose the parts with the largest mean NIS, if it is too large."""
+    """Choose the parts with the largest mean NIS, or none if no mean is too large."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

@@ -119,7 +119,7 @@ def has(parameters: Parameters | None, name: str) -> bool:
 
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
-    """Return a parameter of a topic, as it is set, as the channel states it, or zero."""
+    """Return a parameter of a topic: the set value, or that of the channel, or zero."""
     if not has(parameters, field_of(name)):
         return 0.0
     value = getattr(parameters, field_of(name))
@@ -215,7 +215,7 @@ def noise_gain_over(
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute the costs (pairs,) in log-likelihood of pairs of opposite noises on the first trial."""
+    """Compute how much log-likelihood opposite noises cost in the first trial, (pairs,)."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)

@@ -100,7 +100,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
-    """Return the value of a number, as it is set, stated by a channel, or assumed; else NaN."""
+    """Return the value of a number: the set value, or that of a channel, or the default; else NaN."""
     for each in bound:
         with suppress(BadInput):
             value, _ = value_at_start(name, source, each)
@@ -235,7 +235,7 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
 
     def words(reopens_s: float, *_: float) -> str:
         which = "some measurements" if reopens_s == REOPENS_S else "whole stretches of measurements"
-        return f"{which} are outliers: false, or of something else"
+        return f"{which} are outliers, which are false or measure something else"
 
     found = supposed("outliers", "gate_probability", "", without, "", Advice("gate_probability", GATE))
     yield replace(found, words=words, specials=(REOPENS_S, NEVER_S) if reopens else (REOPENS_S,))

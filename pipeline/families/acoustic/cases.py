@@ -87,7 +87,7 @@ class Mode:
 
     Attributes:
         components: names of the n parameters.
-        bound: the CRLB (n, n) at the truth.
+        bound: CRLB (n, n) at the true parameters.
         error: errors (repetitions, shots of a repetition, n).
         nees: NEES of the shooter's position, (repetitions, shots of a repetition).
         converged: share of solutions that converged.
@@ -137,7 +137,7 @@ class Mode:
 
     @property
     def far_per_1000(self) -> float:
-        """Return how many of a thousand solutions are missing or more than 50 m off."""
+        """Return the number of missing or distant (over 50 m) solutions per thousand."""
         return 1000.0 * float(np.mean(~(self.distance_m <= FAR_M)))
 
     @property
@@ -245,7 +245,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Compute the ratio of ellipse areas, bearings only over a mode, on a grid of shooters (x, y)."""
+    """Compute how much larger ellipses are with bearings only than in a mode, on a grid of shooters."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

@@ -71,7 +71,7 @@ def _sweep(
     value: Callable[[Mode], float],
     interval_runs: int | None,
 ) -> Chart:
-    """Draw a value over the noise level, with the interval of NEES or else the CRLB, figures 15-20."""
+    """Draw NEES with its interval, or another value with its CRLB, by noise level, figures 15-20."""
     numbers = sorted({case.number for case in cases})
     panels = []
     for number in numbers:
@@ -92,7 +92,7 @@ def _sweep(
 
 
 def _maps(options: AcousticOptions) -> Figure:
-    """Draw the ratio of ellipse areas, bearings only over a mode, figures 22 and 23."""
+    """Draw how much larger ellipses are with bearings only than in a mode, figures 22 and 23."""
     aims = options.maps.aims
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, (label, aim) in zip(figure.subplots(1, len(aims)), aims.items(), strict=True):

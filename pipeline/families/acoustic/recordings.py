@@ -162,10 +162,10 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
 
 
 def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
-    """Compute how well one position explains a sound's differences, and the number of redundant ones.
+    """Compute how well one position explains the differences of a sound, and how many are redundant.
 
-    The sum of squared innovations, except those that the start uses, has as many degrees of freedom as
-    there are more differences than coordinates.
+    The degrees of freedom of the sum of squared innovations, without those that the start uses, are the
+    number of differences minus the number of coordinates.
     """
     heights_m = table["z_m"][table["sound"] == name]
     extra = len(squared) - (2 if np.ptp(heights_m) == 0.0 else 3)

@@ -122,7 +122,7 @@ def of_runs(shots: pd.DataFrame) -> pd.DataFrame:
 
 
 def log_ratio(runs: pd.DataFrame, case: str, label: str, other: str) -> Interval:
-    """Compute the mean log ratio of two estimators' RMSEs, over runs in which both located shots."""
+    """Compute the mean log ratio of two RMSEs, over runs in which both estimators located shots."""
     rmse: Any = runs[runs["case"] == case].pivot_table("rmse_m", "run", "estimator")
     return mean_interval(np.log(rmse[label] / rmse[other]).dropna())
 

@@ -146,7 +146,7 @@ def _matrix(fused: Fused) -> Floats:
 def wald_tests(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate Wald's test: error rates and numbers of probes, by way, matcher and specified rates."""
+    """Evaluate the error rates and numbers of probes of Wald's test, by way, matcher and rates."""
     count, most = options.sequences, options.most_probes
     for stated in options.rates:
         rates = Rates(*stated)
@@ -315,7 +315,7 @@ def _tell_tests(
     outcome: Outcome,
     rng: np.random.Generator,
 ) -> None:
-    """Add metrics and the figure of Wald's tests."""
+    """Add metrics and a figure of Wald's tests to the outcome."""
     for row in records(table):
         quantity, case = row["quantity"], f"{row['matcher']}-{_case(row['rates'])}"
         is_share = quantity in ("false_accept", "false_reject", "undecided")
@@ -337,7 +337,7 @@ def _tell_tests(
 
 
 def _tell_watches(table: pd.DataFrame, outcome: Outcome) -> None:
-    """Add metrics of the monitoring of matchers."""
+    """Add metrics of the monitoring of matchers to the outcome."""
     outcome.tables["watch"] = table
     for row in records(table):
         name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)

@@ -1,7 +1,7 @@
 """Study of biometric score fusion by modality, method and process, with verification of all pairs.
 
 Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
-seeds. Fusions of all pairs have confidence intervals, from resampled users.
+seeds. Fusions of all pairs have confidence intervals, which are computed by resampling users.
 """
 
 from collections.abc import Mapping, Sequence
@@ -127,7 +127,7 @@ def printed_metrics() -> dict[str, float]:
 
 
 def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFrame:
-    """Tabulate each subset's rate and relative increase by each fusion next to the paper's, tables 2-4.
+    """Tabulate our and the paper's rates and relative increases, by subset and fusion, tables 2-4.
 
     Rates of single matchers and of arithmetic fusion are identification rates, as in the paper. The
     paper's relative increases are computed from its printed rates, with the swapped rates corrected.
@@ -161,7 +161,7 @@ def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFr
 
 
 def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate the mean relative increase from fusing one modality, two, and all, table 5."""
+    """Tabulate the mean relative increase by fusing one, two or all modalities, table 5."""
     kinds = {case: "one modality" if case in METHODS else "two modalities" for case in CASES[:-1]}
     judged = factors[factors["fusion"].isin(PAPER_FUSED) & factors["subset"].isin(CASES)]
     kind = judged["subset"].map(kinds).fillna("all").rename("fused")

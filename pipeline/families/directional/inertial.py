@@ -58,7 +58,7 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
 
 
 def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Test at which stamps a trial is marked as movement; the topic has a message at every change.
+    """Test at which stamps a trial is marked as movement; a message in the log marks every change.
 
     Args:
         source: the log.

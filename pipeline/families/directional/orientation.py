@@ -45,7 +45,7 @@ class OrientationOptions(Parameters):
     Attributes:
         magnet_ut: field of the magnet in the unit's axes (x, y, z).
         magnet_s: time spans of a trial in which the magnet is near.
-        limit_ut: difference from the local field above which the field is disturbed.
+        limit_ut: difference from the local field above which the field counts as disturbed.
         estimator: label of the estimator to compare with the others.
     """
 

@@ -238,7 +238,7 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
 
 
 def filter_figure(errors_rad: dict[str, dict[str, Floats]]) -> Figure:
-    """Draw the runs' errors of every filter, case by case."""
+    """Draw the errors of every filter over the runs, case by case."""
     figure = Figure(figsize=(2.8 * len(errors_rad) + 1, 4), layout="constrained")
     plots = np.atleast_1d(figure.subplots(1, len(errors_rad), sharey=True))
     for axes, (case, found) in zip(plots, errors_rad.items(), strict=True):

@@ -114,7 +114,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame:
     """Compute the log density of every pair of angles by fits to the other parts of the chain.
 
-    The number of components of a mixture is the best one on held-out pieces of the training parts.
+    The number of components of a mixture is chosen by cross-validation within the training parts.
 
     Args:
         angles: (n, 2), in rad, in the order of the chain.
@@ -325,7 +325,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
     Args:
         wind: (hours,), directions in rad.
-        half: number of hours, from the first, to which the width is fitted.
+        half: number of hours from the start to which the width is fitted.
 
     Returns:
         Two predictions by name, with wrapped normal noise only, and with occasional arbitrary jumps.

@@ -234,7 +234,7 @@ def _judged(
 
 
 def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
-    """Return what an estimator knows about a scenario: sensors, attitudes, noise, known biases."""
+    """Return the known part of a scenario: sensors, attitudes, noise, known biases."""
     sensors = np.array(parameters.sensor_position_m)
     sigma = np.full((len(sensors), 2), parameters.sigma_rad)
     known = known_biases(range(1, len(sensors) + 1), estimator)

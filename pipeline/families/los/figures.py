@@ -42,7 +42,7 @@ def _scenes(cases: Sequence[Case]) -> Chart:
 
 
 def _nees(by_condition: dict[str, list[Case]], runs: int) -> Chart:
-    """Draw each repetition's mean NEES by the CRLB at truth and at the estimate, figures 7 and 16."""
+    """Draw the mean NEES of each repetition, with the CRLB at truth and estimate, figures 7 and 16."""
     panels = []
     for name, cases in by_condition.items():
         numbers = [case.number for case in cases]

@@ -102,8 +102,9 @@ def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
 def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -> pd.DataFrame:
     """Find the least observable direction of each run, and its eigenvalue relative to the prior.
 
-    Rounding gives a singular information matrix an eigenvalue of either sign, of up to the precision of
-    its largest eigenvalue. The smallest eigenvalue is therefore at least that precision.
+    By rounding, the zero eigenvalue of a singular information matrix becomes positive or negative, with
+    a magnitude of up to the precision of the largest eigenvalue. Therefore this precision is the lower
+    limit of the smallest eigenvalue.
     """
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})

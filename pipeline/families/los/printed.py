@@ -31,7 +31,7 @@ def metrics_of_print(paper: Printed) -> dict[str, Any]:
 
 
 def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
-    """Compute biases' sigmas relative to printed ones, shares that satisfy the rules, and positions."""
+    """Compute sigmas of biases relative to the paper's, shares that satisfy its rules, and positions."""
     name, error = f"{case.condition}-{case.number}", case.bias_error_mrad
     runs, sigma = error.shape[1], case.sigma_mrad
     rule = RULE * np.sqrt(paper.runs / runs)

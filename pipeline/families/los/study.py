@@ -172,7 +172,7 @@ def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_one_bias_known(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate standard deviations in mrad of all biases (columns) by the known bias (rows)."""
+    """Tabulate standard deviations of all biases (columns) in mrad, if one of them (row) is known."""
     parts = []
     for case in cases:
         if case.condition == cases[0].condition:

@@ -115,7 +115,7 @@ def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemoryS
 
 
 def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Booleans:
-    """Select at most one sighting of each robot per interval."""
+    """Select at most one sighting of each other robot per interval."""
     kept = np.zeros(len(stream), bool)
     for target in np.unique(stream["target_id"][fellow]):
         last_ns = -np.inf

@@ -60,7 +60,7 @@ class QuadInertialOptions(Parameters):
         smoother: label of the smoother.
         offsets_s: offset to add to the stamps of the units, in s, by the recording's folder; the most
             likely offset for other folders.
-        search_s: smallest and largest offset of the first search, and its step, in s; the search is
+        search_s: smallest offset, largest offset and step of the first search, in s; the search is
             extended if the best offset is at an end.
         truth_sigma_m: standard deviation of the truth's positions if these are used as fixes in that
             search.
@@ -170,7 +170,7 @@ def flight_of(name: str, source: MemorySource) -> Flight:
 
 
 def log_of(flight: Flight, samples: Stream, offset_s: float, fix: Stream | None = None) -> MemorySource:
-    """Make a log of one unit with shifted stamps that begins at the first fix that the unit covers."""
+    """Make a log of one unit with shifted stamps, beginning at the first fix within its samples."""
     fix = flight.fix if fix is None else fix
     moved = np.int64(round(1e9 * offset_s))
     unit_ns = samples.publish_time_ns + moved

@@ -34,11 +34,12 @@ class StressOptions(Parameters):
     Attributes:
         settle_s: time from the beginning after which errors are evaluated.
         cases: changes to the scenario's parameters, by the name of a case.
-        intervals_s: minimum times in s between two messages of a node to try.
-        divergences: differences in nats from its last message at which a node sends, to try.
+        intervals_s: minimum times in s between two messages of a node, one case for each.
+        divergences: differences in nats from its last message at which a node sends a new one; one
+            experiment for each.
         liar: number of the node that sends false estimates.
         lie_after_s: time after which it sends false estimates.
-        lies_m: offsets that it adds to its estimates to try, in m.
+        lies_m: offsets in m that it adds to its estimates, one case for each.
         gate_probability: consistent estimates pass the gate with at least this probability.
     """
 
@@ -173,7 +174,7 @@ def _of(outputs: Mapping[str, Ragged], estimator: str, leaf: str) -> list[Ragged
 
 
 def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Tabulate the other nodes' errors while one lies, by run, offset, and with or without a gate."""
+    """Tabulate errors of the other nodes while one lies, by run, offset and gate (with or without)."""
     parts = []
     own = runner.experiment.estimators[CI]
     for lie_m in (0.0, *options.lies_m):
@@ -190,7 +191,7 @@ def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFra
 
 
 def _refused(replayed: Replayed, options: StressOptions) -> dict[str, dict[int, float]]:
-    """Compute the shares of rejected messages of the liar and of the other nodes, by run."""
+    """Compute the shares of the liar's and of other nodes' messages that were rejected, by run."""
     [refused] = _of(replayed.outputs, "gated", "/refused")
     shares: dict[str, dict[int, float]] = {"liar_refused": {}, "honest_refused": {}}
     for run, source in enumerate(replayed.sources):

@@ -162,7 +162,7 @@ def _loss_chart(table: pd.DataFrame) -> Chart:
 def traces_of_equation_17() -> dict[str, float]:
     """Compute the trace of (17) as printed and of the fused covariance, for independent errors.
 
-    The paper equates P_c^-1 with the bracket, which belongs between two factors P.
+    The paper equates P_c^-1 with the expression in brackets, but two factors P around it are missing.
     """
     stated = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
     fused = fuse(CI, np.zeros((2, 2)), stated)

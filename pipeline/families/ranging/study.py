@@ -102,7 +102,7 @@ def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
 
 
 def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
-    """Tabulate results by estimator and recording, and make metrics of them."""
+    """Tabulate results by estimator and recording, and add them as metrics."""
     table = pd.DataFrame(rows)
     outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
     for row in rows:

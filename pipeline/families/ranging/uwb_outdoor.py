@@ -1,8 +1,8 @@
 """Study of positions from ranges outdoors: uwb_outdoor, compared with published tracks.
 
 Published errors are for a part of each path, which begins and ends when the path enters given regions.
-The truth is interpolated linearly between its rows, except rows whose height differs by half a metre.
-Published tracks are evaluated at their stamps, ours at the rows of the truth.
+The truth is interpolated linearly between its rows, without rows whose height is off by half a metre.
+Published tracks are evaluated at their stamps, our estimates at the rows of the truth.
 """
 
 import re

@@ -66,8 +66,9 @@ def step_errors(ensemble: Ensemble) -> pd.DataFrame:
     """Tabulate errors by estimator and step.
 
     The columns are the RMSE of area and position relative to the filter with exact moments (as in the
-    paper) and to the truth, and the median area. A half side of -l is the same rectangle as l but has a
-    negative area. Such runs are counted, and `size` is the absolute area. Failed runs are also counted.
+    paper) and to the truth, and the median area. A half side of -l means the same rectangle as l, but
+    with a negative area. Such runs are counted, and `size` is the absolute area. Failed runs are also
+    counted.
     """
     exact = ensemble.tracks[REFERENCE].mean
     parts = []
@@ -106,7 +107,7 @@ def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
-    """Return every column at every key step; for rotated sets as a list with an entry per rotation."""
+    """Return every column at every key step; for rotated sets, lists with an entry per rotation."""
     found: dict[str, MetricValue] = {}
     columns = [name for name in at_keys.columns if name not in ("estimator", "step")]
     own = at_keys[~at_keys["estimator"].str.contains(TURNED)]

@@ -1,4 +1,4 @@
-"""Study of samplings of N(0, I): their distance to it, the cost of LCD sets, and pictures of them.
+"""Study of samplings of N(0, I): their distance to N(0, I), pictures, and the cost of LCD sets.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V, Figs. 1 and 5. No filter runs here; the logs contain the sample sets.

@@ -94,7 +94,7 @@ def ensembles(
 
 
 def track(estimates: Ragged, steps: int) -> Track:
-    """Arrange the estimates of all runs in arrays; a run's estimates end when it fails."""
+    """Arrange the estimates of all runs in arrays, NaN after a run failed."""
     counts = np.diff(estimates.offsets)
     there = np.arange(steps) < counts[:, None]
     size = estimates["mean"].shape[1]

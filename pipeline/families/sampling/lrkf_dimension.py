@@ -40,7 +40,7 @@ X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
 class Options(Parameters):
-    """Functions in several dimensions, and drives.
+    """Options of the tests with functions of several dimensions, and of the drives.
 
     Attributes:
         dimensions: dimensions of the state.
@@ -136,8 +136,8 @@ def moment_errors(
 ) -> pd.DataFrame:
     """Tabulate the relative errors of moments by sampling, dimension, direction and function.
 
-    The error of the mean is a root mean square in standard deviations of the function's values; the
-    errors of covariances are relative in the Frobenius norm.
+    The error of the mean is a root mean square, in standard deviations of the function's values. The
+    errors of covariances are relative, in the Frobenius norm.
     """
     rows = []
     for dimension in options.dimensions:

@@ -44,7 +44,7 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """The errors of a robot: of bearings and differences (n,); largest of odometry (spans, 2)."""
+    """The errors (n,) of a robot's bearings, and its largest odometry errors (spans, 2)."""
 
     bearing_rad: Floats
     relative_rad: Floats
@@ -54,7 +54,7 @@ class RobotErrors:
 def state_bounds(
     sources: Sequence[MemorySource], options: BoundOptions, gap_limit_s: float
 ) -> list[MemorySource]:
-    """Write bounds of the other robots' errors, over all runs, to each robot's channels.
+    """Write to each robot's channels the bounds of the other robots' errors over all runs.
 
     Raises BadInput if fewer than two robots have odometry, bearings and truth.
     """

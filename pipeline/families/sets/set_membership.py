@@ -93,7 +93,7 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
 
 
 def _without_errors(runner: Runner) -> dict[str, MetricValue]:
-    """Compute the ratios for the same scenes without errors, in which the exact sets are largest."""
+    """Compute the ratios of areas in the same scenes without errors; exact sets are largest there."""
     replayed = runner.replay(runner.obtain({"error_share": 0.0}))
     gap_limit_s = runner.experiment.gap_limit_s
     return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)

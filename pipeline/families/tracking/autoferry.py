@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """Find the scenarios in the data's folder by number, or the folder itself."""
+    """Find the folders of scenarios in the data's folder by number; else return that folder itself."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []
@@ -101,8 +101,8 @@ def _late_table(
 ) -> pd.DataFrame:
     """Tabulate by estimator, policy for late scans, and scenario.
 
-    `from_in_order_m` is the largest distance between the tracks after the last late scan and those in
-    stamp order; infinite if the tracks differ.
+    `from_in_order_m` is the largest distance from the tracks in stamp order, after the last late scan;
+    infinite if there are different tracks.
     """
     tables = []
     known = experiment.estimators

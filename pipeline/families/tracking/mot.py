@@ -55,7 +55,7 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
             sizes = f"{topic.rpartition('/')[0]}/set"
             if sizes not in log.topics:
                 raise BadInput(
-                    f"{log.path}: topic {topic} has no topic {sizes} with the number of tracks at each "
+                    f"{log.path}: topic {topic} lacks the topic {sizes} with its number of tracks over "
                     "time; export it as csv"
                 )
             streams = source.read([sizes, topic])

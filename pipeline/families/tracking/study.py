@@ -57,9 +57,9 @@ def figures_of(
 ) -> dict[str, float]:
     """Compute performance measures of the tracks of a run.
 
-    If truths cover only some targets, measures of whole tracks ignore tracks that are never within the
-    cutoff of a target. A track's length is the time from its first to its last instant. Trajectory GOSPA
-    is divided by the square root of the number of instants, so that it is comparable to GOSPA.
+    If only some targets have a truth, measures of whole tracks ignore tracks that are never within the
+    cutoff of such a target. A track's length is the time from its first to its last instant. Trajectory
+    GOSPA is divided by the square root of the number of instants, to be comparable with GOSPA.
 
     Args:
         tracked: the tracks at k instants.

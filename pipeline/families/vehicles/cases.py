@@ -36,7 +36,7 @@ class VehiclesOptions(Parameters):
     Attributes:
         cases: changes to the scenario's parameters, by the name of a case.
         reference: label of the Kalman filter.
-        few: parameters of estimators that are too slow for all runs, by label.
+        few: parameters of estimators that are too slow to replay all runs, by label.
         few_runs: number of runs of the first case for these estimators.
     """
 

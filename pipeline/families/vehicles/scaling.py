@@ -1,6 +1,6 @@
 """Study of how time and error of vehicles' filters grow with the number of vehicles.
 
-Vehicles start at random in a square. Its area grows with their number, so that their density is
+Vehicles start at random in a square. Either its area grows with their number, so that their density is
 constant, or it is so small that any fix may belong to any vehicle. Growth is described by a factor per
 vehicle for exponential methods, and by a power otherwise.
 """

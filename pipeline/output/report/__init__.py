@@ -54,7 +54,7 @@ _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
 
 class _Timings(Parameters):
-    """The content of timings.json: seconds and messages by estimator."""
+    """The content of timings.json: run time in s and number of messages by estimator."""
 
     of: dict[str, dict[str, float]]
 
@@ -99,8 +99,8 @@ def write_report(
 ) -> None:
     """Render result folders, in the given order, as one HTML page.
 
-    The same folders give the same bytes, except for screenshots of their timelines (`viewer`).
-    `diagnose` finds the likeliest causes for a result that has none yet.
+    The page of the same folders always has the same bytes, except for screenshots (`viewer`).
+    With `diagnose`, results without a diagnosis are diagnosed first.
 
     Raises BadInput if a folder has no result or a damaged one, the page cannot be written, or the
     viewer has no graphics driver.

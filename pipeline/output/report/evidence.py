@@ -49,7 +49,7 @@ class Evidence:
         failed: the number of failed runs; None if unknown.
         runs: the number of runs, over all cases.
         share: the share of the time with estimates.
-        outside: the number of cases in which it is inconsistent, and the number of cases.
+        outside: the number of cases in which it is inconsistent, and the number of all cases.
     """
 
     estimator: str
@@ -108,7 +108,7 @@ class Findings:
         labels: the estimators in order, without bounds.
         bounds: labels of bounds, which cannot be chosen.
         stress: the effect of changes that should not matter, by estimator; empty if not tested.
-        pairs: what a study measured for two estimators together.
+        pairs: quantities that a study measured for pairs of estimators.
     """
 
     tables: list[MetricTable]
@@ -233,7 +233,7 @@ class Findings:
         return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
     def _squares(self, label: str, key: str, name: str) -> Squares | None:
-        """Average squares over the cases, with the widest of their intervals; None without any."""
+        """Average NEES or NIS over the cases, with the widest of their intervals; None without cases."""
         measured = [
             each
             for table in self.tables
@@ -251,7 +251,7 @@ class Findings:
         return Squares(name, over_cases, aim, usual)
 
     def size_of(self, usual: tuple[float, float]) -> float:
-        """Find the number of components whose NEES has this chi-square interval."""
+        """Find the number of components for which the NEES has this chi-square interval."""
         from fuselog.replay.judging.errors.evaluation import chi_square_interval
 
         sizes = range(1, 100)
@@ -260,7 +260,7 @@ class Findings:
 
 
 def relation(found: Findings, first: str, second: str) -> Comparison | None:
-    """Compare the error of the second estimator with that of the first by the runs; None with too few.
+    """Compare the second estimator's error with the first's, run by run; None if there are too few runs.
 
     With few runs, two errors within the margin count as a tie.
     """
@@ -283,7 +283,7 @@ def is_withheld(found: Findings, first: str, second: str, difference: float) -> 
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
-    """Collect what a result knows about its estimators; `tables` are those of its folder, by name."""
+    """Collect the findings about a result's estimators; `tables` are those of its folder, by name."""
     rows = tables.get("runs", pd.DataFrame())
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()

@@ -32,7 +32,7 @@ _TERMS = {
         "NIS",
         "Normalised innovation squared: the squared difference between measured and predicted values, "
         "normalised by the covariance that the filter predicts. It needs no truth; 1 per component is "
-        "right.",
+        "ideal.",
         f"{_WIKI}/Innovation_(signal_processing)",
     ),
     "interval": Term(

@@ -59,9 +59,9 @@ class Opening:
     """The beginning of a page.
 
     Attributes:
-        tried: one sentence on what was tried.
+        tried: a sentence on the runs and estimators.
         story: the outcome.
-        found: what is known about the estimators.
+        found: the findings about the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture specific to this kind of result.
         numbers_of: the part of the runs that the table of numbers shows, if not all.
@@ -234,7 +234,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
-    """Represent the sides of a comparison as estimators, with means over their common runs."""
+    """Convert the candidates of a comparison to estimators, with means over their common runs."""
     quantities: dict[str, dict[str, dict[str, Measured]]] = {}
     for row in tables["differences"].to_dict("records"):
         if row["case"] == "all":

@@ -146,7 +146,7 @@ def _extent(points: Floats) -> float:
 
 
 def _half_axis(each: Followed) -> float:
-    """Compute the median longer half axis of the ellipses."""
+    """Compute the median of the ellipses' longer half axes."""
     return float(np.sqrt(INSIDE * np.nanmedian(np.linalg.eigvalsh(each.covariance)[:, 1].clip(0.0))))
 
 
@@ -238,8 +238,8 @@ def tracked(
     Args:
         folder: the result's folder.
         labels: the trackers in order.
-        errors: the errors of one of them by case.
-        of_what: the name of the error and of that tracker.
+        errors: the errors of one tracker by case.
+        of_what: the names of the error and of this tracker.
     """
     for case, log in _median_first(folder, errors).items():
         source = LogSource(open_log(log))

@@ -178,7 +178,7 @@ def _row(
 
 
 def _is_out(found: Findings, key: str, each: Measured) -> bool:
-    """Test whether a NEES or NIS with bounds is outside those of a consistent estimator."""
+    """Test whether a NEES or NIS is outside the bounds of a consistent estimator, if it has bounds."""
     if each.bounds is None or not isinstance(each.value, int | float):
         return False
     aim = 1.0 if key == "nis_per_component" else found.size_of(each.bounds)

@@ -67,7 +67,7 @@ Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
 class Gauge(NamedTuple):
-    """The position of a mean of squares on a scale from conservative to overconfident, in percent.
+    """The position of a mean NEES or NIS, in percent of a scale from conservative to overconfident.
 
     Attributes:
         usual: the range that counts as consistent, which is the 95 % range or a small deviation.
@@ -330,7 +330,7 @@ def _card(
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
-    """Return a card's look, its mark, and its label."""
+    """Return the look, the mark and the label of a card."""
     verdict = each.verdict
     if each.has_failed:
         return "broken", "✕", "Fails in every run"
@@ -368,7 +368,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
     if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
         nis = number(each.squares[1].found.value)
-        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is right.")
+        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is ideal.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes
@@ -630,16 +630,16 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
 
 
 def numbers_of(by: Squares) -> str:
-    """Write the mean of squares with its interval, and the ideal value."""
+    """Write a mean NEES or NIS with its interval, and the ideal value."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_bounded:
-        return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
+        return f"{name} {number(by.found.value)}; {number(by.aim)} is ideal"
     found, low, high = alike(by.found[:3], Scale())
-    return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is right"
+    return f"{name} {found} (95 % {low} to {high}); {number(by.aim)} is ideal"
 
 
 def gauge(by: Squares) -> Gauge:
-    """Locate a mean of squares on the scale of a gauge."""
+    """Find the position of a mean NEES or NIS on the scale of a gauge."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)

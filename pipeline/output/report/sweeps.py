@@ -196,7 +196,7 @@ def _with_points(
     best: Mapping[str, int],
     still: list[str],
 ) -> Story:
-    """Add the best points to the story of the estimators."""
+    """Add the best points of the estimators to the story."""
     moved = [label for label in errors if label not in still]
     sentences = []
     for point in dict.fromkeys(best[label] for label in moved):

@@ -54,7 +54,7 @@ class GnssInsOptions(Parameters):
     Attributes:
         filter: label of the filter that is compared.
         smoother: label of the smoother that is compared.
-        delayed: label of a smoother that compensates the mapping's delay of the velocity, or "".
+        delayed: label of a smoother that reverses the mapping's correction of the velocity delay, or "".
         lengths_s: lengths of the outages, in s.
         first_s: start of the first window, in s after the receiver's first row.
         every_s: time between the starts of successive windows.

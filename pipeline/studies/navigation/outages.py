@@ -32,7 +32,7 @@ class Rows(NamedTuple):
 
     Attributes:
         time_ns: stamps as written by the receiver, (n,).
-        place: positions in m, (n, 2); NaN if they are not accurate enough to be a truth.
+        place: positions in m, (n, 2); NaN if they are not accurate enough for a truth.
         velocity: velocities in m/s, (n, 2), as written in the row, without correction of a delay.
     """
 
@@ -117,7 +117,7 @@ def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> Mem
 
 
 def coasted(rows: Rows, window: Window) -> Floats:
-    """Compute the errors (m, 2) of extrapolation from the row before, with its written velocity."""
+    """Compute the errors (m, 2) of an extrapolation from the row before, with its recorded velocity."""
     before = window.rows[0] - 1
     ahead_s = (rows.since_s[window.rows] - rows.since_s[before])[:, None]
     return rows.place[before] + ahead_s * rows.velocity[before] - rows.place[window.rows]
@@ -151,7 +151,7 @@ def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float
 def error_table(
     rows: Rows, runs: Sequence[Sequence[Window]], outputs: Mapping[str, Ragged], labels: Sequence[str]
 ) -> pd.DataFrame:
-    """Tabulate window, time since its start, error and final NEES by withheld row and estimator.
+    """Tabulate the window, the time since its start, the error and the final NEES, by row and estimator.
 
     `runs` contains the windows of each run of the outputs.
     """

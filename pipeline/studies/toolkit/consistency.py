@@ -1,8 +1,9 @@
 """A study of consistency: whether errors agree with the covariances after an estimator is aligned.
 
-In addition to the metrics of `localization`, it has the share of stamps from `aligned_s` on at which
-the mean NEES of the runs is within its 95 % interval, and the mean of these NEES. Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
+In addition to the metrics of `localization`, it computes the mean NEES of the runs at stamps from
+`aligned_s` on: the share of these stamps at which it is within its 95 % interval, and its mean.
+Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section
+5.4.2.
 """
 
 from pydantic import NonNegativeFloat

@@ -137,6 +137,14 @@ def test_closures_classes_and_defaults_are_part_of_a_key(monkeypatch: pytest.Mon
     assert identity(closing_over(2.0, doubled)) == keys[0]
 
 
+def test_a_docstring_is_not_part_of_a_key() -> None:
+    made: dict[str, Any] = {}
+    for text in ("Double a number.", "Compute twice a number."):
+        exec(f'def twice(x):\n    """{text}"""\n    return 2.0 * x', made)
+        made[text] = identity(made["twice"])
+    assert made["Double a number."] == made["Compute twice a number."]
+
+
 @varying(1, grid=2)
 class Scene(NamedTuple):
     """Rows of which the number varies, and a grid of any size."""
