@@ -359,7 +359,7 @@ def _solve(fuse: Callable[..., Stream], given: Given[Any]) -> list[Ragged]:
     users = {len(each.scores) for each in compared}
     if len(users) > 1:
         raise BadInput(
-            f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its own"
+            f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay them separately"
         )
 
     def fused(case: str, chosen: list[int]) -> Ragged:
