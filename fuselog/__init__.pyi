@@ -1,4 +1,4 @@
-"""The public names, and where each comes from; `__init__.py` reads this list."""
+"""Public names and their modules; `__init__.py` reads this list."""
 
 from fuselog.pipeline.api.api import ResultFolder as ResultFolder
 from fuselog.pipeline.api.api import estimators as estimators

@@ -93,8 +93,8 @@ _ENDS, _HEIGHTS, _SHARES = _ziggurat()
 def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int:
     """Fill an array with draws from N(0, 1).
 
-    The blocks after number `counter` provide one word per draw. About one draw in 67 needs more than its
-    word; it uses further blocks after these.
+    The blocks after number `counter` provide one word per draw. About one draw in 67 needs more than one
+    word and uses further blocks.
 
     Args:
         numbers: (n,), overwritten; n is a multiple of four.

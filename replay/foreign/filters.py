@@ -329,7 +329,7 @@ def description_of_library(label: str, settings: Mapping[str, Any]) -> Descripti
 
 @dataclass(frozen=True)
 class _OfLibraries(Estimator[Any]):
-    """Estimator that makes the estimator of the library named in settings."""
+    """Placeholder for estimators of libraries; the settings name the library."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
         """Return the estimator of the library named in `settings` of `label`."""

@@ -61,7 +61,7 @@ class ProgramParameters(StreamParameters):
 
 @dataclass(frozen=True)
 class _OfPrograms(Estimator[Any]):
-    """Estimator that makes the estimator of the command named in settings."""
+    """Placeholder for estimators of programs; the settings name the command."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
         """Return the estimator of the command in `settings` of `label`; with {out}, it reads a log."""

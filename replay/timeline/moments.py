@@ -35,7 +35,7 @@ def read_moments(rrd: Path) -> list[Moment]:
 def worst_at(moments: Sequence[Moment], at: str) -> Moment:
     """Return the moment that `worst` or `worst:ESTIMATOR` selects.
 
-    Raises BadInput if there are no errors, or none of that estimator.
+    Raises BadInput if there are no errors, or no errors of this estimator.
     """
     estimator = at.partition(":")[2]
     if not moments:

@@ -88,7 +88,7 @@ def reads_of(function: Any) -> Reads | None:
 
 
 def _sees(reads: Reads, value: Any) -> bool:
-    """Record what a value reads; return False if anything may change unnoticed."""
+    """Record the places that a value reads; return False if one of them may change unnoticed."""
     if type(value) in _IMMUTABLE or id(value) in _PURE:
         return True
     if type(value) is tuple:

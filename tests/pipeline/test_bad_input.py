@@ -46,7 +46,7 @@ TABLE: dict[str, tuple[str, ...]] = {
         "--arrival-order",
     ),
     "replay log.mcap -e ekf --arrival-order --late drp": ("wait:SECONDS", "did you mean 'drop'"),
-    "replay log.mcap -e ekf --arrival-order --late drop:1": ("takes no seconds", "give --late drop"),
+    "replay log.mcap -e ekf --arrival-order --late drop:1": ("has no duration", "give --late drop"),
     "replay log.mcap -e ekf --arrival-order --late wait": ("zero or more seconds", "wait:0.5"),
     "replay log.mcap -e ekf --arrival-order --late rewind:-1": ("zero or more seconds", "rewind:0.5"),
     "replay log.mcap -e ekf --arrival-order --late wait:soon": ("--late wait:soon", "seconds"),

@@ -53,7 +53,7 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
 
     Attributes:
         parameters: the estimator's parameters.
-        topics: all topics that the estimator is bound to.
+        topics: all topics to which the estimator is bound.
         static: the streams, see above.
         runs: number of runs.
         name: the estimator's name, with the suffix of its binding.

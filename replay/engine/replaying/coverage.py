@@ -22,7 +22,7 @@ class Coverage:
 
     BINS = 64
     SECOND = 30  # the bin of intervals about one second long, 2^30 ns
-    GAP = 4  # gaps are more than this many bins above the median: 16 to 32 times as long or longer
+    GAP = 4  # a gap is more bins than this above the median, so at least 16 times as long
 
     def __init__(self, topic: str, starts_ns: Integers) -> None:
         self.topic = topic

@@ -97,7 +97,7 @@ class Reading:
     control_noise: Callable[[float], Mapping[tuple[str, int], float]]
 
 
-# The state that a recursion carries from block to block; its type is up to the recursion.
+# The state that a recursion carries from block to block; the recursion defines its type.
 Carried = Any  # type: ignore[explicit-any]
 # The value of a setting: a number, a string, a list or a table.
 Setting = Any  # type: ignore[explicit-any]
@@ -231,7 +231,7 @@ class Estimator(Generic[ParametersType]):
         bind: bind(name, topics, parameters) -> one bound estimator for everything that it can estimate
             in a log with these topics (for each robot, say); empty if the log does not fit.
         variant: the parameter that is set by the second part of a name such as `lrkf:s2kf-50`.
-        label: its name if it is given without one.
+        label: label of the estimator if the user gives none.
     """
 
     summary: str

@@ -67,7 +67,7 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
         )
     if policy == "drop":
         if text != policy:
-            raise BadInput(f"--late {text}: drop takes no seconds; give --late drop")
+            raise BadInput(f"--late {text}: drop has no duration; give --late drop")
         return Late(policy, 0)
     try:
         window_s = float(seconds)

@@ -317,10 +317,10 @@ class RunMonitor:
         last_ns = reduce(np.maximum, (coverage.last_ns for coverage in coverages))
         for run in set(np.flatnonzero(found).tolist()) - failed:
             if mute[run]:
-                self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
+                self._failed[run] = Failure(int(self._first_ns[run]), "there is no estimate")
                 continue
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
-            reason = f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
+            reason = f"there is no estimate in the last {silent_s:.1f} s of the measurements"
             self._failed[run] = Failure(int(last_ns[run]), reason)
 
 

@@ -31,9 +31,9 @@ def refuse_truths(label: str, read: Collection[str], truths: Collection[str], ho
     for topic in read:
         if topic in truths:
             raise BadInput(
-                f"estimator {label}: {how}{topic} is a truth, by which estimates are judged, and a "
-                "filter must not read it; to use it as a measurement, import it under a name of its "
-                'own, such as topic = "/survey/fix", becomes = "PositionFix" in a mapping'
+                f"estimator {label}: {how}{topic} is a truth, against which estimates are judged, so "
+                "filters must not read it; to use it as a measurement, import it under another name, "
+                'such as topic = "/survey/fix", becomes = "PositionFix" in a mapping'
             )
 
 

@@ -74,7 +74,7 @@ class Usage:
         skipped: number of skipped messages, by reason.
         speaks: whether the estimator has innovations.
         doubtful: by topic that it starts from, a sentence about a problem with the topic.
-        shares: the innovations by topic.
+        shares: counts of innovations by topic.
         begins_ns: (runs,) the stamp of the first prior; None if there are no priors.
     """
 

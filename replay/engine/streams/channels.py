@@ -50,7 +50,7 @@ _POWERS = {"sigma_m": ("variance_m2", 0.5), "variance_m2": ("sigma_m", 2.0)}
 
 
 class _Noise(Parameters):  # type: ignore[explicit-any]
-    """Validator of these numbers, which must be positive."""
+    """Validator of stated noise, which must be positive."""
 
     sigma_m: PositiveFloat = 1.0
     variance_m2: PositiveFloat = 1.0

@@ -135,7 +135,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
 def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
     """Transform the fields that are vectors or directions in the axes of the tangent plane."""
     field, covariance = _FIELDS[stream.schema.full_name]
-    if not len(stream):  # vectors have no width here
+    if not len(stream):  # the width of vectors is unknown here
         return {}
     size = stream[field].shape[1]
     turn = movement.rotation[:size, :size]

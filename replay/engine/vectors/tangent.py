@@ -70,7 +70,7 @@ def _tangent_components(
         name = components[columns.start]
         stem = name.rpartition("_")[0] or _common(components[columns])
         if (f"{stem}_x_rad", "rotation") in found or (f"{stem}_rad", "angle") in found:
-            stem = name  # there are several without a stem
+            stem = name  # several rotations or angles have this stem
         if kind == "quaternion":
             found += [(f"{stem}_{axis}_rad", "rotation") for axis in "xyz"]
         else:

@@ -58,7 +58,7 @@ def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     worlds = {_world(topics[each]) for each in streams}
     if len(worlds) > 1:
         raise BadInput(
-            f"estimator {name}: the sensors state different noise or air; all must state the same"
+            f"estimator {name}: the sensors state different noise or air properties; these must be equal"
         )
     noise, medium = worlds.pop()
     setting = Setting(

@@ -163,12 +163,12 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
             )
             mean = np.append(shot, [0.0, 0.0])
             return Started(
-                int(time_ns[begin]), mean, np.diag(sigma**2), "where its first shot fits best"
+                int(time_ns[begin]), mean, np.diag(sigma**2), "at the best fit to its first shot"
             )
     raise BadInput(
-        f"topic {reports.topic}: no span of {parameters.start_s:g} s has a shockwave, and muzzle blasts "
-        f"of two sensors of {SENSORS.topic} whose directions meet; use a longer start_s, or add a prior "
-        "to the log"
+        f"topic {reports.topic}: no span of {parameters.start_s:g} s has a shockwave and two muzzle "
+        f"blasts whose directions from sensors of {SENSORS.topic} intersect; use a longer start_s, or "
+        "add a prior to the log"
     )
 
 

@@ -151,7 +151,7 @@ def _settled(
     return place, (slopes(place).T * weight) @ slopes(place)
 
 
-HOW = "where its differences fit best"
+HOW = "at the best fit to its differences"
 MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
 REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
 SOUND_SOURCE = Model(

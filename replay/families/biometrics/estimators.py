@@ -142,7 +142,7 @@ def learn_classifier(
     Args:
         parameters: the classifier and its settings.
         vectors: the training scores (rows, matchers), in z units, NaN if missing.
-        genuine: (rows,), which of them compare the same user.
+        genuine: (rows,), whether each of them compares the same user.
         rng: random numbers for classifiers that need them.
 
     Raises BadInput if the classifier cannot be fitted to these scores.
@@ -210,7 +210,7 @@ def learn_mixture(
         components: Gaussians per state of the genuine and of the impostor model.
         sequence: (n, m), the shape of the sequence that a vector of n * m scores contains.
         vectors: the training scores, (rows, n * m).
-        genuine: (rows,), which of them compare the same user.
+        genuine: (rows,), whether each of them compares the same user.
         rng: random numbers for k-means.
     """
     models = []
@@ -359,7 +359,7 @@ def _solve(fuse: Callable[..., Stream], given: Given[Any]) -> list[Ragged]:
     users = {len(each.scores) for each in compared}
     if len(users) > 1:
         raise BadInput(
-            f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its own"
+            f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay them separately"
         )
 
     def fused(case: str, chosen: list[int]) -> Ragged:

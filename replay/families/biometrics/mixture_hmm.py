@@ -46,7 +46,7 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
     The means start from k-means of the vectors at the state's position in the sequence.
 
-    Raises BadInput if there are not more sequences than components.
+    Raises BadInput unless there are more sequences than components.
 
     Args:
         sequences: (count, n, m), NaN if a score is missing.

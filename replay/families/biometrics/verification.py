@@ -154,9 +154,9 @@ def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, 
 def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
     """Compute the GAR at three FARs and the EER (replicates, 4) for users resampled with replacement.
 
-    A comparison counts as often as its probe's user was drawn times its gallery's user; a genuine
-    comparison counts as often as its user was drawn. This preserves the dependence of scores of the same
-    user (Bolle, Ratha & Pankanti 2004).
+    The weight of a comparison is the number of draws of its probe's user times that of its gallery's
+    user; the weight of a genuine comparison is the number of draws of its user. This preserves the
+    dependence of scores of the same user (Bolle, Ratha & Pankanti 2004).
     """
     users = int(fused.gallery.max()) + 1
     order = np.argsort(-fused.score, kind="stable")

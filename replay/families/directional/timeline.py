@@ -99,7 +99,7 @@ def _draw_with(
 
 
 def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield spans in which the magnetic field is disturbed, by estimators of the local field."""
+    """Yield spans in which estimators of the local magnetic field find a disturbance."""
     topic = f"/{case}/inertial".replace("//", "/")
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if topic in scene.source.topics and set(COMPONENTS) <= set(stream.components):

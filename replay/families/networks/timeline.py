@@ -154,7 +154,7 @@ def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
     """Draw the trajectory of one node's estimates; return its entity."""
     stroke = stroke_of(scene, errors.estimator)
     for name, stream in scene.outputs_of(errors.case, schemas.GAUSSIAN_ESTIMATE):
-        # sent messages are Gaussians too, but without a truth to compare with
+        # sent messages are also Gaussians, but they have no truth
         if name == errors.estimator and "truth" in stream.metadata:
             places = stream["mean"][:, [stream.components.index(name) for name in PLACE]]
             draw_path(canvas, f"{root}/{errors.case}", stream.publish_time_ns, places, stroke)

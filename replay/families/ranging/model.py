@@ -241,7 +241,7 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
     return min(fits, key=lambda fit: float(fit.cost)).x
 
 
-HOW = "where its first ranges fit best"
+HOW = "at the best fit to its first ranges"
 VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear"}
 ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "height_m": "linear"}
 # Default for logs that do not state it: a radio outdoors, on an object that is pushed or driven slowly.

@@ -76,7 +76,7 @@ def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 
 def _draw_live(canvas: Canvas, scene: Scene, tracks: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:
-    """Plot how many tracks and vessels were heard within the last ten minutes."""
+    """Plot the numbers of tracks and vessels heard within the last ten minutes."""
     identity = scene.read(IDENTITY)
     curves = [("vessels", TRUTH, identity.publish_time_ns, identity["thing_id"])]
     for name, stream in tracks:

@@ -92,7 +92,7 @@ def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 def _assigned(gain: Floats) -> Integers:
     """Find the map (vehicles,) with the largest total gain (vehicles, detections); a miss has gain 0."""
-    from scipy.optimize import linear_sum_assignment  # which takes long to import
+    from scipy.optimize import linear_sum_assignment  # slow to import
 
     vehicle, detection = linear_sum_assignment(-np.maximum(gain, 0.0))
     chosen = np.full(len(gain), MISSED)
@@ -163,7 +163,7 @@ def log_permanents(logs: Floats) -> Floats:
         shared[columns] = sum(shared[columns ^ (1 << last)] * entries[row, last] for last in taken)
     with np.errstate(divide="ignore"):
         found: Floats = np.log(shared[-1]) + greatest[..., 0].sum(axis=1)
-    from scipy.optimize import linear_sum_assignment  # which takes long to import
+    from scipy.optimize import linear_sum_assignment  # slow to import
 
     for index in np.flatnonzero(np.isneginf(found)):
         found[index] = flat[index][linear_sum_assignment(-flat[index])].sum()

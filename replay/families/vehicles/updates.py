@@ -45,7 +45,7 @@ FIXES = {
     "known": "fixes with known vehicles",
     "hungarian": "unordered fixes, most probable map",
     "set": "unordered fixes, exact collapse over all maps",
-    "axes": "unordered x and unordered y, exact collapse of each: what separate sums of powers contain",
+    "axes": "unordered x and unordered y, exact collapse of each, as with separate sums of powers",
     "powers": "sums of powers of x and of y, linearized",
     "unscented-powers": "sums of powers of x and of y, sampled",
     "products": "sums of products of x and of y, linearized",

@@ -35,9 +35,7 @@ def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Str
     if first and first[0].startswith("time_"):
         stream = _of_table(path, f"/estimates/{label}{case}/state", truth)
     elif truth is None:
-        raise BadInput(
-            "the program wrote a trajectory, but the log has no truth that states what it is of"
-        )
+        raise BadInput("the program wrote a trajectory, but the log has no truth of the same object")
     else:
         like = empty_stream(truth.name, schemas.TRUTH_STATE, truth.metadata)
         try:

@@ -45,11 +45,11 @@ FUSELOG_FILTER_EXPORT const char *fuselog_filter_describe(void);
 FUSELOG_FILTER_EXPORT void *fuselog_filter_create(const double *parameters, uint64_t seed);
 
 /* Starts from a prior. If the log has no prior, both pointers are NULL and the time is that of the first
- * message. The messages of static topics, such as a map, are passed before. */
+ * message. The messages of static topics, such as a map, are passed before it. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_start(void *filter, int64_t time_ns, const double *mean,
                                                    const double *covariance);
 
-/* Processes one message: the index of its topic in the description, from 0 on, the time of measurement,
+/* Processes one message: the index of its topic in the description, from 0, the time of measurement,
  * and its fields in the order of the description. Times never go back; several messages may have the same
  * time. */
 FUSELOG_FILTER_EXPORT int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns,

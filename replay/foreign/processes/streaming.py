@@ -144,7 +144,7 @@ def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Descrip
         found = read_description(stream.next(b"D"), where)
     except Ended as ended:
         why = str(ended).rstrip(",")
-        raise BadInput(f"{where}: the program {why} before it gave its description") from None
+        raise BadInput(f"{where}: the program {why} before it sent its description") from None
     finally:
         stream.end()
     if found.protocol != PROTOCOL:

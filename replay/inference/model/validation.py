@@ -152,8 +152,9 @@ def _check_interpolated(where: str, model: Model, control: Control) -> None:
         )
     if not driving.interpolated:
         raise BadInput(
-            f"{where}: reads the control {control.topic} at its stamp, but the control is held between "
-            "messages; give the model's Control interpolated=True, or the sensor no `control`"
+            f"{where}: reads the control {control.topic} at its stamp, but the control is constant "
+            "between messages; set interpolated=True in the model's Control, or leave out the sensor's "
+            "`control`"
         )
 
 

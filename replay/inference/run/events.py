@@ -361,7 +361,7 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 def passed_over(
     name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
-    """Report messages that were skipped because they lack a covariance; empty if none can lack it.
+    """Report messages that were skipped because they lack a covariance; [] if none can lack one.
 
     Args:
         name: name of the filter.

@@ -36,7 +36,7 @@ def sample_sets(
 
     Args:
         samplers: one for each sampled function.
-        generators: by function and run; see `seeded_generators`.
+        generators: random generators by function and run; see `seeded_generators`.
         offsets: (runs + 1,) offsets of the events.
     """
     drawn = [index for index, each in enumerate(samplers) if each.redrawn]

@@ -160,8 +160,8 @@ def interpolate_control(
 ) -> tuple[FilterEvents, FilterEvents]:
     """Interpolate the control linearly at all events; return ready and waiting events.
 
-    Events after a run's last control message wait for the next one, together with that message. In a
-    gap, the control is NaN after the last message before it, up to and including the next message.
+    Events after a run's last control message wait for the next one, together with that message. During a
+    gap, the control is NaN, from just after the last message up to and including the next message.
 
     Args:
         events: events in order; control messages have the control in their last columns.

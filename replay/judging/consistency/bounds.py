@@ -53,7 +53,7 @@ class Bounds:
         sums: sums of the products by step, rows of 4 t^2.
         stamps: (steps,) ns since the epoch.
         steps: number of steps of every run, by number of the run.
-        reason: reason why there is no mean over the ensemble; empty if there is one.
+        reason: why there is no mean over the ensemble; empty if there is one.
     """
 
     components: list[tuple[str, str]] = field(default_factory=list)

@@ -185,7 +185,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """Find the times that have another time within a limit, and the nearest other time of each."""
+    """Pair times with the nearest other times within a limit; return the indices of both."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)

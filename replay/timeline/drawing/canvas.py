@@ -272,7 +272,7 @@ class Timeline:
 def draw_cases(
     scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
 ) -> rrb.Container | rrb.View:
-    """Draw all cases and return their layouts, in tabs if there are several, an estimated case first."""
+    """Draw all cases; return their layouts, in tabs if there are several, estimated cases first."""
     layouts = [draw_case(case) for case in scene.cases]
     if len(layouts) == 1:
         return layouts[0]

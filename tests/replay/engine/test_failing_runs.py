@@ -114,7 +114,7 @@ def run(
 CASES = {
     NAN_COVARIANCE: "the estimate is no longer finite",
     INDEFINITE: "the covariance is no longer positive definite",
-    SILENT: "it gave no estimate in the last 8.0 s of its measurements",
+    SILENT: "there is no estimate in the last 8.0 s of the measurements",
     RAISE: "ZeroDivisionError",
     BEYOND: "IndexError: index 5 is out of bounds",
 }

@@ -107,7 +107,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "a sensor that reads a control that is held": (
         replace(with_sensor(SPEED, control=HELD), control=HELD),
-        ("sensor speed", "held between messages", "interpolated=True"),
+        ("sensor speed", "constant between messages", "interpolated=True"),
     ),
     "what it reads": (
         with_sensor(SPEED, read=lambda stream: np.zeros((len(stream), 2))),

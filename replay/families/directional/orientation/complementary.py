@@ -245,7 +245,7 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     samples = streams["inertial"]
     is_last = (
         np.diff(samples.publish_time_ns, append=-1) != 0
-    )  # samples with equal stamps hold their mean
+    )  # samples with equal stamps have their mean
     force, rate, field = (np.ascontiguousarray(samples[name][is_last]) for name in FIELDS)
     time_ns = samples.publish_time_ns[is_last]
     step_s, has_field = float(np.median(np.diff(time_ns))) * 1e-9, np.isfinite(field).all(axis=1)

@@ -208,7 +208,7 @@ def _means(sums: Sums) -> dict[str, float]:
 
 
 SETS = metric_of_sums(
-    "OSPA and GOSPA of estimated sets, cutoff 10 m; area of regions, and whether they hold the truth",
+    "OSPA and GOSPA of estimated sets, cutoff 10 m; area of regions, and whether they contain the truth",
     AnySets,
     _sums,
     _means,

@@ -61,8 +61,8 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
     above 0 and below pi / 2 (with a larger bound, the set is not an intersection of discs).
 
     Args:
-        first: (n, 2), a landmark of each pair, in m.
-        second: (n, 2), the other one.
+        first: (n, 2), the first landmark of each pair, in m.
+        second: (n, 2), the second landmark of each pair, in m.
         angle_rad: (n,), bearing of the first minus bearing of the second.
         bound_rad: the largest error of an angle.
     """

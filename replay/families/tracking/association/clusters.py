@@ -267,7 +267,7 @@ def propagate_beliefs(
             for j in range(columns):
                 column = memory.columns[j]
                 weight = weights.detected[row, column]
-                # the message from a track to a detection, kept where the marginals will be
+                # messages from tracks to detections, stored in the array of the marginals
                 rest = total - weight * memory.message[row, column]
                 probability[row, 1 + column] = weight / rest
         for j in range(columns):

@@ -265,7 +265,7 @@ def figures_of_whole_tracks(
 
 
 def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int]:
-    """Find the tracks that are ever within the cutoff of a target.
+    """Find the tracks that come within the cutoff of a target.
 
     Args:
         tracks: the tracks at each of k instants.

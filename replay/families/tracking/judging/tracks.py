@@ -172,7 +172,7 @@ def _finish(reports: Reports) -> dict[str, float]:
 
 
 TRACKS = Metric(
-    "how well targets with more than 50 reports kept a track of their own",
+    "share of reports in a single track, for targets with more than 50 reports",
     Output,
     dict,
     _add,

@@ -47,5 +47,5 @@ def test_an_estimator_without_estimates_is_told():
     judge = replay_parts([RunGroup([source])], {"bingham-inertial": {}}, gap_limit_s=1).judge
     at_s = f"{SIMULATION_EPOCH_NS * 1e-9:.3f} s"
     assert judge.failures == [
-        f"{source.name}: bingham-inertial trial failed at {at_s}: it gave no estimate"
+        f"{source.name}: bingham-inertial trial failed at {at_s}: there is no estimate"
     ]

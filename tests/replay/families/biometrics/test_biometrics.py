@@ -366,7 +366,7 @@ def test_runs_of_different_users_are_refused():
     """The folds stand in the metadata of the topic, which all runs share."""
     settings = ({"users": users, "low_galleries": 1} for users in (20, 30))
     sources = [memory_source(*record_run("biometric-scores", each, 0)) for each in settings]
-    with pytest.raises(BadInput, match="the logs have 20 to 30 users; replay each on its own"):
+    with pytest.raises(BadInput, match="the logs have 20 to 30 users; replay them separately"):
         replay_ensemble(sources, {"score-rule": {}}, gap_limit_s=1)
 
 

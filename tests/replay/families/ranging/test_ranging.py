@@ -227,7 +227,8 @@ def test_a_log_without_a_prior_begins_where_its_ranges_fit_best() -> None:
     error = found["state"]["mean"][-1, :2] - source.streams["/trolley/truth"]["state"][-1, :2]
     assert np.hypot(*error) < 0.1
     assert any(
-        "where its first ranges fit best" in text for text in found["started"].stream.metadata.values()
+        "at the best fit to its first ranges" in text
+        for text in found["started"].stream.metadata.values()
     )
 
 
