@@ -31,24 +31,27 @@ WHATS = {
     "delay_s": "The delay of the stamps, which is subtracted; messages that would be before 1970 "
     "are left out.",
     "clock_gain": "The clock of the stamps gains this many s per s from the start of the run.",
-    "FIELD_scale": "The field is multiplied by this factor; covariance_scale is a factor of variances.",
+    "FIELD_scale": "The field is multiplied by this factor; covariance_scale multiplies variances.",
     "FIELD_bias": "The field is too large by this bias, which is subtracted.",
     "FIELD_drift": "The field's bias grows by this much per second from the start of the run, and is "
     "subtracted.",
     "FIELD_axes": "The order of the vector's entries: yx if x and y are swapped.",
     "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, such as `fuselog "
     "ellipsoid` finds.",
-    "FIELD_turn": "The vector is rotated about the vertical by this angle (rad), and is rotated back.",
+    "FIELD_turn": "The vector is rotated about the vertical by this angle (rad); the rotation is "
+    "reversed.",
     "heading_bias": "The heading of orientations, or of a prior, is too large by this angle (rad); "
     "orientations have heading_scale and heading_drift as well.",
-    "heading_convention": "north, if headings of orientations are a compass's, clockwise from north.",
+    "heading_convention": "north, if the headings of orientations are those of a compass, clockwise "
+    "from north.",
     "origin": "For geodetic fixes, the origin of the tangent plane: latitude and longitude in deg, "
     "altitude in m. For positions, the position of their origin in the plane, in m, which is added.",
     "plane": "For positions and states, the origin of their tangent plane, as if the log stated it: "
     "latitude and longitude in deg, altitude in m. /*.plane sets all such topics that state none.",
-    "covers": "For a truth: some, if the log has targets without a truth, so that their tracks are not "
-    "false; or all, whatever the log states.",
-    "exchanged": "Two numbers that are swapped, such as 3,9; or the topic to swap this one with.",
+    "covers": "For a truth: some, if the log has targets without a truth, whose tracks are then not "
+    "counted as false; or all, whatever the log states.",
+    "exchanged": "Two numbers that are swapped, such as 3,9; or the topic with which this one is "
+    "swapped.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 

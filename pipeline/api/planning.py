@@ -186,7 +186,8 @@ def settings_of(
             raise BadInput('a model without a method is not an estimator; give modelled(model, "ekf")')
         if not isinstance(each, str | Mapping | Estimator):
             raise BadInput(
-                f'expected an estimator, got {type(each).__name__}; give a name, or {{"mine": it}}'
+                f"expected an estimator, got {type(each).__name__}; give a name, or "
+                '{"mine": estimator}'
             )
         if isinstance(each, Mapping) and "kind" in each:
             raise BadInput(

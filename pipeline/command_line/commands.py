@@ -177,7 +177,7 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
-            raise BadInput(f"--out {out}: {len(logs)} logs give one estimates log each; give a folder")
+            raise BadInput(f"--out {out}: {len(logs)} logs have one estimates log each; give a folder")
         return [out]
     if out is not None and out.suffix and not out.is_dir():
         raise BadInput(f"--out {out}: expected a name that ends in .mcap, or an existing folder")

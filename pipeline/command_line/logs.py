@@ -301,7 +301,11 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 )
 @click.argument("path", type=ANY_PATH)
 @out_log_option
-@click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only inertial unit].")
+@click.option(
+    "--unit",
+    metavar="TOPIC",
+    help="The topic of the inertial samples [default: the only inertial unit].",
+)
 @set_option("constraints")
 @recover_option
 def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:

@@ -29,7 +29,7 @@ from fuselog.recorders.errors import BadInput, printable
 @click.argument("scenario", required=False, type=SCENARIO)
 @click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
-@click.option("--run", type=COUNT, help="Number of the run of that seed [default: 0].")
+@click.option("--run", type=COUNT, help="Number of the run with this seed [default: 0].")
 @click.option("--again", type=ANY_PATH, help="Record the run of this log again, from its metadata.")
 @click.option(
     "--compression",

@@ -36,15 +36,15 @@ validate_option = click.option(
     "held_out",
     multiple=True,
     type=ANY_PATH,
-    help="A log or folder of logs to validate the values on; they are not used in the search "
+    help="A log or folder of logs on which to validate the values; it is not used in the search "
     "(repeatable).",
 )
 folds_option = click.option(
     "--folds",
     type=COUNT,
     default=0,
-    help="Cross-validate: divide the logs into N parts, and validate on each the values found from the "
-    "others.",
+    help="Cross-validate: divide the logs into N parts, and validate each part with the values from "
+    "the others.",
 )
 
 
@@ -192,7 +192,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("label", "The estimator.", required=True)
 @click.option(
-    "--fixed", multiple=True, help="A calibration parameter to leave as it is set (repeatable)."
+    "--fixed", multiple=True, help="A calibration parameter that keeps its value (repeatable)."
 )
 @click.option(
     "--next",

@@ -185,7 +185,9 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
             f"{run.name}: {several}: several estimators fit the log; cut it to the topics of one first"
         )
     if filtering.parameters.every_s is not None:
-        raise BadInput(f"estimator {label}: every_s: C predicts whenever you call it; remove it")
+        raise BadInput(
+            f"estimator {label}: every_s: the C code predicts whenever you call it; remove this setting"
+        )
     if filtering.delays_ns.any():
         raise BadInput(
             f"estimator {label}: messages of a sensor are delayed; subtract the delay from their stamps "

@@ -68,7 +68,7 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
 |---|---|---|---|
 {table}
 
-These are upper bounds: both sides of every condition count{iterated}.{saved}
+These are upper bounds: both branches of every condition are counted{iterated}.{saved}
 
 {bytes_in_words}"""
 
@@ -86,8 +86,8 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
     else:
         sentence = (
             f"Over the first {single.estimates} estimates of {log}, means and covariances are within "
-            f"{single.furthest:.1g} of those in double precision; larger numbers than one, relative to "
-            "the number."
+            f"{single.furthest:.1g} of those in double precision, relative to the number if it is "
+            "larger than one."
         )
     more = (
         "To compare libraries of both precisions over whole logs, with intervals, use "

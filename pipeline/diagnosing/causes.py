@@ -97,9 +97,9 @@ class Cause(NamedTuple):
     def words(self) -> str:
         """Describe the fault, its size, the alternatives and the gain."""
         or_else = "".join(
-            f"; this log does not determine it, equally likely: {each.statement}"
+            f"; this log does not determine it; equally likely: {each.statement}"
             if each.hypothesis is self.hypothesis
-            else f"; or, which this log does not distinguish from it, {each.statement}"
+            else f"; or, indistinguishable in this log, {each.statement}"
             for each in self.others
         )
         first, second = self.of_halves

@@ -111,7 +111,7 @@ class Diagnosis:
         """Return the numbered sentences, or a sentence that no fault was found."""
         if not self.sentences:
             why = (
-                f"none of {self.hypotheses} faults reaches the gain in log-likelihood needed, "
+                f"none of {self.hypotheses} faults reaches the required gain in log-likelihood, "
                 f"{self.least_gain:.3g}"
             )
             return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]

@@ -159,7 +159,7 @@ def _finding(
     remedy = of.remedy(cause.value)
     found = CauseFinding(of.kind, of.topic, of.part, cause.numbers[0].value, words, cause=cause)
     if remedy is None or trying.is_set(remedy):
-        return replace(found, evidence=f"{words}; the gate that is set rejects these")
+        return replace(found, evidence=f"{words}; the gate in the settings rejects these")
     advice = trying.over(remedy)
     words += rest(remedy.settings) if rest is not None else ""
     if before and of.kind in CONSEQUENCES:

@@ -10,9 +10,9 @@ Work = Callable[[Callable[[], bool]], None]
 class NewestFirst:
     """A thread that does the newest task and drops older ones that have not begun.
 
-    A task receives a function that tests whether a newer task is waiting, so that it can give up. One
-    thread calls `ask` and `end`. At exit, Python waits for the current task, because interrupting a
-    thread in NumPy's C++ code aborts the process.
+    A task receives a function that tests whether a newer task is waiting, so that it can give up. `ask`
+    and `end` must be called from a single thread. At exit, Python waits for the current task, because
+    interrupting a thread in NumPy's C++ code aborts the process.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:

@@ -93,7 +93,7 @@ QUANTITIES: dict[str, Quantity] = {
     ),
     "log_likelihood": Quantity(
         "log-likelihood per run",
-        "How probable the filter predicted the measurements to be; higher is better.",
+        "How probable the measurements were according to the filter's predictions; higher is better.",
         CONSISTENCY,
     ),
     "gated_share": Quantity(

@@ -87,7 +87,7 @@ def parse_over(text: str) -> Over:
 
 
 def over_of(key: str, values: Sequence[Any]) -> Over:
-    """Make a list of values, logarithmic if evenly spaced so; raise BadInput for duplicates."""
+    """Make a swept parameter from a list of values; raise BadInput for duplicates."""
     if len({*map(str, values)}) < len(values) or not values:
         raise BadInput(f"sweep over {key}: give at least one value, and each only once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]

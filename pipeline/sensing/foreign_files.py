@@ -33,7 +33,7 @@ def explained(path: Path) -> list[str]:
         what = (
             "averaging times in s"
             if path.stem.endswith("t")
-            else "an Allan deviation, of a gyro in deg/h"
+            else "an Allan deviation, in deg/h for a gyroscope"
         )
         return [f"{path}: this file was written by imu_utils ({what}) and has no intervals"]
     return []

@@ -280,6 +280,6 @@ def _against(stated: tuple[str, str, float], numbers: Mapping[str, Interval], un
     ends = f"{yours.low:.3g} to {yours.high:.3g}"
     kind = "sqrt(Hz)" if term == "white" else "sqrt(s)"
     return (
-        f"the data sheet states {text} ({value:.4g} {unit}/{kind}); yours is {yours.value:.3g} ({ends}) "
-        "times that"
+        f"the data sheet states {text} ({value:.4g} {unit}/{kind}); the estimate is {yours.value:.3g} "
+        f"({ends}) times this value"
     )

@@ -200,7 +200,7 @@ def with_parameters(
     changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
     changed = {name: value for name, value in changed.items() if value != known[name]}
     if not changed:
-        return "no parameter is a number other than zero"
+        return "all numeric parameters are zero"
     refused = ""
     for name in [*changed]:
         try:

@@ -236,7 +236,7 @@ def test_a_delay_on_equal_laps_is_not_determined() -> None:
     cause = seek(log, "ekf", OPEN, 1).causes[0]
     values = [cause.value, *(each.value for each in cause.others if each.hypothesis is cause.hypothesis)]
     assert sorted(map(abs, values)) == pytest.approx([7.0, 27.0], abs=0.3)
-    assert "this log does not determine it, equally likely: /car/" in cause.words
+    assert "this log does not determine it; equally likely: /car/" in cause.words
 
 
 def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
@@ -315,7 +315,7 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     words = found.sentences[0].sentence
     assert "turn_radps has the wrong sign" in words
     assert "x and y of position_m are swapped" in words
-    assert "which this log does not distinguish from it" in words
+    assert "or, indistinguishable in this log, " in words
     assert len(found.sentences) == 1
     assert found.tried["gain"].iloc[0] == pytest.approx(found.tried["gain"].iloc[3])
     assert found.sentences[0].setting == "/car/odometry.turn_scale=-1"
@@ -375,9 +375,7 @@ def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_
     assert nothing == []
     assert cause.hypothesis.topic == "mounting_yaw_rad"
     assert cause.value == pytest.approx(-0.5 * np.pi, abs=0.1)
-    assert (
-        "which this log does not distinguish from it, /body/prior: heading at the start" in cause.words
-    )
+    assert "or, indistinguishable in this log, /body/prior: heading at the start" in cause.words
 
 
 def test_the_battery_is_counted_by_cell() -> None:

@@ -290,7 +290,7 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
         ("place", "/robot1/fix"),
     ]
     assert not found[0].setting
-    assert "the gate that is set rejects these" in found[0].sentence
+    assert "the gate in the settings rejects these" in found[0].sentence
 
 
 @pytest.mark.paper
@@ -374,10 +374,7 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     alike = [each for each in tried if each.part == "x_m"]
     [cause], listed, _ = find_causes(likelihood, base, [*alike, replace(alike[0])], 5)
     assert len(cause.others) == 1
-    assert (
-        "; or, which this log does not distinguish from it, /robot1/prior: x_m at the start"
-        in cause.words
-    )
+    assert "; or, indistinguishable in this log, /robot1/prior: x_m at the start" in cause.words
     assert [each.at.gain for each in listed] == pytest.approx([cause.gain] * 2)
 
 

@@ -192,7 +192,7 @@ def test_what_another_number_explains_as_well_is_not_determined(
     tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), 10.0, lambda _, at: at, late, lambda _: None)  # type: ignore[arg-type,return-value]
     [[cause], *_] = find_causes(likelihood, 0.0, [tried], 1)  # type: ignore[arg-type]
     assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
-    other = f"; this log does not determine it, equally likely: {values[-1]:.2f} late;"
+    other = f"; this log does not determine it; equally likely: {values[-1]:.2f} late;"
     assert (other in cause.words) == (len(values) > 1)
 
 
@@ -315,8 +315,8 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     fl.write(log, car(2000))
     found = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert found["found"] == [
-        f"nothing found: none of {found['hypotheses']} faults reaches the gain in log-likelihood "
-        f"needed, {found['least_gain']:.3g}"
+        f"nothing found: none of {found['hypotheses']} faults reaches the required gain in "
+        f"log-likelihood, {found['least_gain']:.3g}"
     ]
     fl.write(log, car(2000, 1 / 256))
     wrong = fuselog("diagnose", log, "-e", "ekf", "--json").json

@@ -128,7 +128,7 @@ def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
 
 
 def times(at: float, low: float, high: float) -> str:
-    """Describe the factor by which a standard deviation is wrong, from logarithms."""
+    """Describe the factor by which a standard deviation is wrong; the arguments are logarithms."""
     least, most = (
         "1" if at * end <= 0 else number(np.exp(abs(end))) for end in sorted((low, high), key=abs)
     )

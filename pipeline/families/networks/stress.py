@@ -35,8 +35,8 @@ class StressOptions(Parameters):
         settle_s: time from the beginning after which errors are evaluated.
         cases: changes to the scenario's parameters, by the name of a case.
         intervals_s: minimum times in s between two messages of a node, one case for each.
-        divergences: differences in nats from its last message at which a node sends a new one; one
-            experiment for each.
+        divergences: differences in nats from its last message at which a node sends a new one; one case
+            for each.
         liar: number of the node that sends false estimates.
         lie_after_s: time after which it sends false estimates.
         lies_m: offsets in m that it adds to its estimates, one case for each.

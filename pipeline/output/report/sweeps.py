@@ -102,7 +102,7 @@ class Sweep:
 
     @property
     def of_world(self) -> bool:
-        """Test whether the sweep changes the scenario too, so that no point is better than another."""
+        """Test whether the sweep also changes the scenario, so that its points cannot be compared."""
         estimators: Mapping[str, Any] = self.result.settings.get("estimators") or {}
         of_all = {key for values in estimators.values() for key in values}
         return any(

@@ -180,7 +180,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """Import the recording; return it without fixes before `settle_s`, and the receiver's rows."""
+    """Import the recording; return it without fixes before `settle_s`, and with the receiver's rows."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))
