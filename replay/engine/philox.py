@@ -12,6 +12,7 @@ from hashlib import sha256
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.kernels.words import high_word
 from fuselog.replay.engine.arrays import AnyArray, Floats
 
 Words = NDArray[np.uint64]
@@ -37,15 +38,6 @@ def run_key(seed: int, first: Iterable[AnyArray]) -> Words:
     """
     words = [str(seed).encode(), *(part.tobytes() for part in first)]
     return np.frombuffer(sha256(b" ".join(words)).digest()[:16], np.uint64)
-
-
-def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
-    """Return the upper 64 bits of a 128-bit product."""
-    low, half = np.uint64(0xFFFFFFFF), np.uint64(32)
-    a_low, a_high, b_low, b_high = a & low, a >> half, b & low, b >> half
-    first = a_high * b_low + ((a_low * b_low) >> half)
-    second = a_low * b_high + (first & low)
-    return a_high * b_high + (first >> half) + (second >> half)
 
 
 def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:

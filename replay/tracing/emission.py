@@ -25,10 +25,21 @@ _COMPARISONS = (operator.lt, operator.le, operator.gt, operator.ge, operator.eq,
 _LOGICAL = (operator.and_, operator.or_, operator.xor)
 
 
-def emit(emitter: Emitter, outputs: Sequence[Node], inputs: dict[Any, Number]) -> list[Number]:
-    """Write the instructions of a graph; `inputs` are the numbers of its inputs, by place."""
-    found: dict[Node, Number] = {}
-    for node in needed(outputs):
+def emit(
+    emitter: Emitter, outputs: Sequence[Node], inputs: dict[Any, Number], known: dict[Node, Number]
+) -> list[Number]:
+    """Write the instructions of a graph.
+
+    Args:
+        emitter: destination of the instructions.
+        outputs: nodes to compute.
+        inputs: numbers of the graph's inputs, by place.
+        known: numbers of nodes that are computed elsewhere.
+    """
+    found = dict(known)
+    for node in needed(outputs, known):
+        if node in known:
+            continue
         given = [found[each] for each in node.arguments]
         operation = node.operation
         if operation is INPUT:

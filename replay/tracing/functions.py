@@ -18,12 +18,12 @@ import numpy as np
 
 from fuselog.recorders.compiling.identity import digest_of
 from fuselog.recorders.compiling.kernels.numbers import REAL, Emitter, Number, constant
-from fuselog.recorders.compiling.kernels.program import Instance, Program, called
+from fuselog.recorders.compiling.kernels.program import FEW_OF_GRAPH, Instance, Program, called
 from fuselog.recorders.compiling.kernels.values import Array, Record, entries, load, part_of, store
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.tracing.derivatives import slopes_of
 from fuselog.replay.tracing.emission import emit, python_of
-from fuselog.replay.tracing.graph import INPUT, Graph, Node, described, needed
+from fuselog.replay.tracing.graph import INPUT, Graph, Node, described, needed, steady
 from fuselog.replay.tracing.inlining import Parameters, inlined, trace_of, tracing
 from fuselog.replay.tracing.reads import Reads, reads_of
 from fuselog.replay.tracing.traced import (
@@ -202,18 +202,49 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """Return the output numbers of a graph, by a call of a separate function of the needed inputs."""
-    places = [node.value for node in needed(outputs) if node.operation == INPUT]
-    key = "graph", *places, *described(outputs)
+    """Return the output numbers of a graph, by a call of a separate function of the needed inputs.
+
+    Calls of functions that depend only on parameters are computed by another function, which the
+    compiler moves out of loops over samples or particles.
+    """
+
+    def is_changing(place: Any) -> bool:
+        return not isinstance(function.arguments[place[0]], tuple)
+
+    known: dict[Node, Number] = {}
+    for wanted in (steady(outputs, is_changing), outputs):
+        numbers = _computed(program, emitter, function, wanted, arguments, known)
+        known = dict(zip(wanted, numbers, strict=True))
+    return numbers
+
+
+def _computed(
+    program: Program,
+    emitter: Emitter,
+    function: TracedFunction,
+    outputs: Sequence[Node],
+    arguments: Sequence[Any],
+    known: dict[Node, Number],
+) -> list[Number]:
+    """Call a function that computes a graph's outputs from its inputs and from known nodes."""
+    if not outputs:
+        return []
+    nodes = needed(outputs, known)
+    places = [node.value for node in nodes if node.operation == INPUT]
+    used = [node for node in nodes if node in known]
+    key = "graph", *places, *described(used), *described(outputs)
     if key not in program.instances:
         body = Emitter()
-        inputs = {place: Number(REAL, f"%a{index}") for index, place in enumerate(places)}
-        found = emit(body, outputs, inputs)
-        parameters = [[(REAL, each.code)] for each in inputs.values()]
-        program.instances[key] = program.define(function.__name__, body, parameters, tuple(found))
+        names = [Number(REAL, f"%a{index}") for index in range(len(places) + len(used))]
+        inputs = dict(zip(places, names, strict=False))
+        found = emit(body, outputs, inputs, dict(zip(used, names[len(places) :], strict=True)))
+        parameters = [[(REAL, each.code)] for each in names]
+        program.instances[key] = program.define(
+            function.__name__, body, parameters, tuple(found), FEW_OF_GRAPH
+        )
     instance: Instance = program.instances[key]
     given = [_number(emitter, function.arguments, arguments, place) for place in places]
-    return list(called(emitter, instance, given))
+    return list(called(emitter, instance, [*given, *(known[node] for node in used)]))
 
 
 def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any], place: Any) -> Number:

@@ -1,4 +1,4 @@
-"""Functions of numbers from NumPy, Python and libm, lowered to LLVM IR: `FUNCTIONS`."""
+"""Functions of numbers from NumPy, Python and libm, and `high_word`, lowered to LLVM IR: `FUNCTIONS`."""
 
 import math
 import operator
@@ -23,6 +23,7 @@ from fuselog.recorders.compiling.kernels.numbers import (
     kind_of,
     negative,
 )
+from fuselog.recorders.compiling.kernels.words import emit_high_word, high_word
 from fuselog.recorders.compiling.kinds import KernelFunction, Value
 
 
@@ -227,6 +228,7 @@ FUNCTIONS: dict[Value, KernelFunction] = {
     np.int64: lambda emitter, x: emitter.as_kind(x, WHOLE),
     np.uint64: lambda emitter, x: emitter.as_kind(x, WORD),
     bool: lambda emitter, x: emitter.truth(x),
+    high_word: emit_high_word,
 }
 # Python's functions with the same names.
 FUNCTIONS |= {

@@ -24,6 +24,7 @@ from fuselog.recorders.compiling.kinds import AnyArray, Value
 from fuselog.recorders.errors import BadInput
 
 FEW = 30  # functions with fewer lines are always inlined
+FEW_OF_GRAPH = 500  # so are graphs, whose many arguments and results cost as much as their operations
 
 
 class DoesNotCompile(BadInput):
@@ -102,15 +103,20 @@ class Program:
         return placed(result, is_local=True) if any(map(is_local, arguments)) else result
 
     def define(
-        self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Value
+        self,
+        stem: str,
+        body: Emitter,
+        parameters: Sequence[Sequence[tuple[str, str]]],
+        returned: Value,
+        few: int = FEW,
     ) -> Instance:
-        """Add a function with this body and result."""
+        """Add a function with this body and result, which is always inlined below `few` lines."""
         found = list(leaves(returned))
         results = [*found, ("i64", "0")] if body.can_fail else found
         kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"
         name = self.name(stem)
         given = ", ".join(f"{kind} {code}" for each in parameters for kind, code in each)
-        inlined = " alwaysinline" if len(body.lines) < FEW else ""
+        inlined = " alwaysinline" if len(body.lines) < few else ""
         lines = [
             f"define internal fastcc {kind} {name}({given}) nounwind{inlined} {{",
             "entry:",

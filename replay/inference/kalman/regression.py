@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import AnyArgument, Floats, Numbers, varying
+from fuselog.replay.engine.arrays import AnyArgument, Floats, Integers, Numbers, varying
 from fuselog.replay.inference.kalman.predict import (
     AddMotionNoise,
     LineariseMotion,
@@ -32,21 +32,28 @@ from fuselog.replay.inference.linear_algebra.gaussian import cholesky
 from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
+    curved_blocks,
     is_flat,
+    manifold_blocks,
     recentring,
     tangent_size,
 )
 from fuselog.replay.inference.linear_algebra.moments import (
+    REGISTERS,
+    axis_moments_of,
+    axis_offset_of,
     lower_of,
     moments_of,
     offset_of,
     weighted_mean_of,
 )
-from fuselog.replay.inference.linear_algebra.tuples import filling, tuple_of
+from fuselog.replay.inference.linear_algebra.tuples import filling, range_of, tuple_of
 from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.functions import MotionNoise, OfParameters
 from fuselog.replay.inference.model.model import Motion, Sensor
 from fuselog.replay.inference.sampling.sets import SampleSets
+from fuselog.replay.tracing.functions import TracedFunction
+from fuselog.replay.tracing.graph import INPUT
 
 MEANS = 30  # maximum number of iterations of an intrinsic mean
 
@@ -57,6 +64,8 @@ class SampleMemory(NamedTuple):
 
     Attributes:
         points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
+        axes: (L,) index of the only entry of each point that may differ from zero, as in the unscented
+            transform; empty if points have several.
         unsuspected: largest standard deviation of angles that need no special treatment; see
             `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
@@ -65,12 +74,14 @@ class SampleMemory(NamedTuple):
         values: (L, v) values of the function, as tangent vectors from a centre.
         centre, shift: (n of the values,) and (v,): the mean of the values, and the weighted mean of
         their tangent vectors.
+        joint: (N, v) covariance of points and values, if points are on axes.
     """
 
     points: Floats
     weights: Floats
     first: int
     stride: int
+    axes: Integers
     unsuspected: float
     factor: Floats
     offsets: Floats
@@ -79,6 +90,7 @@ class SampleMemory(NamedTuple):
     values: Floats
     centre: Floats
     shift: Floats
+    joint: Floats
 
 
 def sample_memory(
@@ -92,10 +104,13 @@ def sample_memory(
         noises: number of noise components of the function.
         outputs: kinds of the function's values.
     """
-    _, count, dimension = sets.points.shape
+    count_of_sets, count, dimension = sets.points.shape
     values = tangent_size(outputs)
+    is_on_axes = count_of_sets == 1 and np.all(np.count_nonzero(sets.points[0], axis=1) <= 1)
+    axes = np.argmax(sets.points[0] != 0.0, axis=1)[: count if is_on_axes else 0]
     return SampleMemory(
         *sets,
+        axes=axes,
         unsuspected=unsuspected_rad(sets.points),
         factor=np.zeros((dimension, dimension)),
         offsets=np.empty((count, dimension)),
@@ -104,6 +119,7 @@ def sample_memory(
         values=np.empty((count, values)),
         centre=np.empty(len(outputs)),
         shift=np.empty(values),
+        joint=np.empty((dimension if is_on_axes else 0, values)),
     )
 
 
@@ -182,9 +198,14 @@ def sampling(
     t, components = tangent_size(kinds), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
-    add, subtract = boxplus(kinds), boxminus(outputs)
+    add_curved, subtract = boxplus(kinds, is_curved=True), boxminus(outputs)
+    straight = {c: first for kind, c, first, _ in manifold_blocks(kinds) if kind == "linear"}
+    tangents = tuple(straight.get(c, -1) for c in range(components))
+    # the factor is a lower triangle, so that points on later axes move only linear numbers
+    end = max((first + width for _, _, first, width in curved_blocks(kinds)), default=0)
+    fill_point = filling(components)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
-    lower, offset = lower_of(size), offset_of(size)
+    lower, offset, along = lower_of(size), offset_of(size), axis_offset_of(size)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
     turns, narrow = bool(turning(kinds)), narrowing(kinds, size, bounded=is_motion)
 
@@ -196,15 +217,21 @@ def sampling(
         centre = function(state, no_noise, arguments)
         fill(memory.centre, centre)
         for index in range(len(points)):
-            away = offset(triangle, points, index)
+            if len(memory.axes):
+                away = along(memory.factor, memory.axes[index], points[index])
+            else:
+                away = offset(triangle, points, index)
             fill_offset(offsets[index], away)
             if flat_states:
                 point = tuple(state[row] + away[row] for row in range(components))
             else:
-                for row in range(components):
-                    memory.point[row] = mean[row]
-                add(memory.point, away)
-                point = read_state(memory.point)
+                fill_point(memory.point, state)
+                if not len(memory.axes) or memory.axes[index] < end:
+                    add_curved(memory.point, away)
+                point = tuple(
+                    memory.point[c] if row < 0 else state[c] + away[row]
+                    for c, row in enumerate(tangents)
+                )
             value = function(point, read_noise(away), arguments)
             subtract(value, centre, memory.values, index)
 
@@ -237,6 +264,7 @@ def regression(
     outputs: tuple[str, ...],
     *,
     is_motion: bool = False,
+    kept: tuple[int, ...] = (),
 ) -> Regress:
     """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
 
@@ -246,6 +274,7 @@ def regression(
         noises: number of noise components.
         outputs: kinds of the function's values.
         is_motion: whether the function is a motion.
+        kept: tangent components of the state that the function returns unchanged, in the same place.
 
     Returns:
         `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It fills
@@ -255,7 +284,8 @@ def regression(
     """
     t, v = tangent_size(kinds), tangent_size(outputs)
     sample = sampling(function, kinds, noises, outputs, is_motion=is_motion)
-    moments = moments_of(t, v)
+    moments = moments_of(t, range_of(v))
+    on_axes = axis_moments_of(t, v, kept)
 
     def regress(
         mean: Floats,
@@ -270,7 +300,11 @@ def regression(
         if not cholesky(memory.factor, covariance, t):
             return False
         weights = sample(mean, arguments, variances, sample_index, memory)
-        moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
+        if len(memory.axes) and t * v > REGISTERS:
+            chosen = (weights, memory.points[0], memory.axes)
+            on_axes(chosen, memory.factor, memory.values, memory.shift, memory.joint, spread, cross)
+        else:
+            moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
         return True
 
     return regress
@@ -283,19 +317,26 @@ def settling(kinds: tuple[str, ...]) -> Settle:
     The values (L, v) are tangent vectors from the centre, and the mean is intrinsic. Afterwards, the
     tangent vectors from the mean are `values` minus `shift` (v,).
     """
-    v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
-    add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
+    places = tuple(t + i for _, _, t, width in curved_blocks(kinds) for i in range(width))
+    add, add_curved, recentre = boxplus(kinds), boxplus(kinds, is_curved=True), recentring(kinds)
+    mean_of_all, mean_of_curved = (
+        weighted_mean_of(range_of(tangent_size(kinds))),
+        weighted_mean_of(places),
+    )
 
     def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
+        mean_of_all(weights, values, shift)
+        add(centre, shift)
+        if not places:
+            return
         for _ in range(MEANS):
-            weighted_mean(weights, values, shift)
-            add(centre, shift)
-            if straight:
-                return
             again = recentre(values, shift)
-            shift[:] = 0.0
+            for place in places:
+                shift[place] = 0.0
             if not again:
                 return
+            mean_of_curved(weights, values, shift)
+            add_curved(centre, shift)
 
     return settle
 
@@ -318,7 +359,8 @@ def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
     model, motion = bound_model.model, bound_model.motion
     entering = motion.noise if motion.noises else None
     moved = moved_with_noise(motion)
-    regress = regression(moved, model.kinds, motion.noises, model.kinds, is_motion=True)
+    kept = kept_components(motion, model.kinds)
+    regress = regression(moved, model.kinds, motion.noises, model.kinds, is_motion=True, kept=kept)
     variances_of: MotionNoise = entering or no_variances
     add_noise: AddMotionNoise = nothing if entering else motion_noise(model, motion)
     linearise: LineariseMotion = nothing
@@ -341,6 +383,19 @@ def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
         return True
 
     return predict
+
+
+def kept_components(motion: Motion, kinds: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the tangent components of linear numbers that a motion does not change, such as biases."""
+    assert isinstance(motion.move, TracedFunction)
+    returned = motion.move.result.returned
+    return tuple(
+        tangent
+        for kind, component, tangent, _ in manifold_blocks(kinds)
+        if kind == "linear"
+        and returned[component].operation is INPUT
+        and returned[component].value == (0, component)
+    )
 
 
 def moved_with_noise(motion: Motion) -> Sampled:

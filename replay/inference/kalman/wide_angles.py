@@ -74,6 +74,8 @@ class Regressed(Protocol):
     """Samples and their images; see `regression.SampleMemory`."""
 
     @property
+    def factor(self) -> Floats: ...
+    @property
     def offsets(self) -> Floats: ...
     @property
     def values(self) -> Floats: ...
@@ -149,7 +151,10 @@ def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
 
 
 def widen(share: float, memory: Regressed) -> None:
-    """Divide the offsets and values of narrowed samples by c."""
+    """Divide the factor, the offsets and the values of narrowed samples by c."""
+    for row in range(len(memory.factor)):
+        for k in range(row + 1):
+            memory.factor[row, k] /= share
     for index in range(len(memory.offsets)):
         for row in range(memory.offsets.shape[1]):
             memory.offsets[index, row] /= share

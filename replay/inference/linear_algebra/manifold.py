@@ -16,8 +16,10 @@ from fuselog.recorders.models.planar import wrap_angle
 from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
 
+Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 SETTLED = 1e-15  # rad: smallest change of a mean of rotations that needs another iteration
+SLIGHT = 1e-7  # rad: up to here, what is of second order in a change is below rounding
 
 
 class Boxplus(Protocol):
@@ -62,15 +64,23 @@ def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
     return found
 
 
+def curved_blocks(kinds: Sequence[str]) -> tuple[tuple[str, int, int, int], ...]:
+    """Return the angles, axes and quaternions of `manifold_blocks`."""
+    return tuple(each for each in manifold_blocks(kinds) if each[0] != "linear")
+
+
 def is_flat(kinds: Sequence[str]) -> bool:
     """Test whether the tangent space equals the space itself, except for the wrapping of angles."""
     return set(kinds) <= {"linear", "angle"}
 
 
 @lru_cache(maxsize=64)
-def boxplus(kinds: tuple[str, ...]) -> Boxplus:
-    """Make `add(x, d)`, which moves the state x (n,) in place to x boxplus d, with d (t,)."""
-    parts = tuple(manifold_blocks(kinds))
+def boxplus(kinds: tuple[str, ...], *, is_curved: bool = False) -> Boxplus:
+    """Make `add(x, d)`, which moves the state x (n,) in place to x boxplus d, with d (t,).
+
+    With `is_curved`, numbers that are linear stay as they are.
+    """
+    parts = curved_blocks(kinds) if is_curved else tuple(manifold_blocks(kinds))
 
     def add(x: Floats, d: Sequence[float] | Floats) -> None:
         for kind, c, t, _ in parts:
@@ -165,18 +175,15 @@ def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
 def recentring(kinds: tuple[str, ...]) -> Recentre:
     """Make `recentre(values, shift)`, which changes the centre of tangent vectors (L, t) by a shift.
 
-    It returns whether the weighted sum of the values may still differ from zero, because an angle was
-    wrapped or rotations have not converged.
+    Numbers that are linear stay as they are. It returns whether the weighted sum of the values may still
+    differ from zero, because an angle was wrapped or rotations have not converged.
     """
-    parts = tuple(manifold_blocks(kinds))
+    parts = curved_blocks(kinds)
 
     def recentre(values: Floats, shift: Floats) -> bool:
         again = False
         for kind, _, t, _ in parts:
-            if kind == "linear":
-                for index in range(len(values)):
-                    values[index, t] -= shift[t]
-            elif kind == "angle":
+            if kind == "angle":
                 for index in range(len(values)):
                     change = values[index, t] - shift[t]
                     if not abs(change) < np.pi:
@@ -192,16 +199,38 @@ def recentring(kinds: tuple[str, ...]) -> Recentre:
                     values[index, t] = change
             else:
                 x, y, z = shift[t], shift[t + 1], shift[t + 2]
-                if max(abs(x), abs(y), abs(z)) > SETTLED:  # otherwise they do not change
+                most = max(abs(x), abs(y), abs(z))
+                if most > SETTLED:  # otherwise they do not change
                     again = True
                     turned_back = conjugate(from_vector(x, y, z))
                     for index in range(len(values)):
-                        q = from_vector(values[index, t], values[index, t + 1], values[index, t + 2])
-                        turn = to_vector(*product(turned_back, q))
+                        a, b, c = values[index, t], values[index, t + 1], values[index, t + 2]
+                        squared = a * a + b * b + c * c
+                        if most < SLIGHT and squared < 1.0:
+                            turn = slightly_turned_back((a, b, c), squared, (x, y, z))
+                        else:
+                            turn = to_vector(*product(turned_back, from_vector(a, b, c)))
                         values[index, t], values[index, t + 1], values[index, t + 2] = turn
         return again
 
     return recentre
+
+
+def slightly_turned_back(v: Vector, squared: float, d: Vector) -> Vector:
+    """Return the rotation vector of exp(-d) exp(v), for |v|^2 < 1 and a slight rotation d.
+
+    It is v - d + v x d / 2 - g v x (v x d), with g of `inverse_right_jacobian_factors` as a series.
+    """
+    (a, b, c), (x, y, z) = v, d
+    second = (1.0 / 12.0) + squared * (
+        (1.0 / 720.0) + squared * ((1.0 / 30240.0) + squared * (1.0 / 1209600.0))
+    )
+    i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
+    return (
+        a - (x - 0.5 * i + second * (b * k - c * j)),
+        b - (y - 0.5 * j + second * (c * i - a * k)),
+        c - (z - 0.5 * k + second * (a * j - b * i)),
+    )
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Protocol
 
-from fuselog.replay.engine.arrays import Floats, Numbers
+from fuselog.replay.engine.arrays import Floats, Integers, Numbers
 from fuselog.replay.inference.linear_algebra.tuples import total
 
 REGISTERS = 32  # number of a processor's registers; further sums are kept in memory
@@ -21,6 +21,12 @@ class Offset(Protocol):
     def __call__(self, lower: Numbers, points: Floats, index: int, /) -> Numbers: ...
 
 
+class AxisOffset(Protocol):
+    """Function that multiplies a lower triangle (N, N) by a point (N,) on an axis."""
+
+    def __call__(self, factor: Floats, axis: int, point: Floats, /) -> Numbers: ...
+
+
 class Moments(Protocol):
     """Function that fills weighted covariances of values; see `moments_of`."""
 
@@ -30,6 +36,22 @@ class Moments(Protocol):
         offsets: Floats,
         found: Floats,
         shift: Floats,
+        spread: Floats,
+        cross: Floats,
+        /,
+    ) -> None: ...
+
+
+class AxisMoments(Protocol):
+    """Function that fills weighted covariances of values; see `axis_moments_of`."""
+
+    def __call__(
+        self,
+        samples: tuple[Floats, Floats, Integers],
+        factor: Floats,
+        found: Floats,
+        shift: Floats,
+        joint: Floats,
         spread: Floats,
         cross: Floats,
         /,
@@ -68,13 +90,30 @@ def offset_of(size: int) -> Offset:
 
 
 @lru_cache(maxsize=64)
-def moments_of(states: int, values: int) -> Moments:
+def axis_offset_of(size: int) -> AxisOffset:
+    """Make `offset(factor, axis, point)`: a lower triangle times a point (N,) on one axis.
+
+    The entries of the factor above its diagonal are zero.
+    """
+
+    def offset(factor: Floats, axis: int, point: Floats) -> Numbers:
+        length = point[axis]
+        return tuple(factor[row, axis] * length for row in range(size))
+
+    return offset
+
+
+@lru_cache(maxsize=64)
+def moments_of(states: int, places: tuple[int, ...]) -> Moments:
     """Make `moments(weights, offsets, found, shift, spread, cross)`, which fills weighted covariances.
 
-    These are the covariances of the values `found` (L, v) minus `shift` (v,) with each other and with
-    the offsets (L, >= t).
+    These are the covariances of some components of the values `found` (L, v) minus `shift` (v,) with each
+    other and with the offsets (L, >= t).
     """
-    parts = tuple(_moments_of_some(states, chosen) for chosen in _in_parts(states, values))
+    parts = tuple(
+        _moments_of_some(states, places[: chosen.stop], places[chosen.start : chosen.stop])
+        for chosen in _in_parts(states, len(places))
+    )
 
     def moments(
         weights: Floats, offsets: Floats, found: Floats, shift: Floats, spread: Floats, cross: Floats
@@ -95,44 +134,87 @@ def _in_parts(states: int, values: int) -> list[range]:
     return parts
 
 
-def _moments_of_some(states: int, chosen: range) -> Moments:
-    """Make `moments` for some values, with each other and with earlier values, in one loop."""
-    pairs = tuple((i, j) for i in chosen for j in range(i + 1))
-    mixed = tuple((row, i) for row in range(states) for i in chosen)
-    size, first = chosen.stop, chosen.start
+def _moments_of_some(states: int, places: tuple[int, ...], chosen: tuple[int, ...]) -> Moments:
+    """Make `moments` for the last values, with each other and with those before, in one loop."""
+    first = len(places) - len(chosen)
+    pairs = tuple((i, j) for i in range(first, len(places)) for j in range(i + 1))
+    own_places = tuple((places[i], places[j]) for i, j in pairs)
+    mixed = tuple((row, i) for row in range(states) for i in range(len(chosen)))
+    joint_places = tuple((row, chosen[i]) for row, i in mixed)
 
     def fill(
         weights: Floats, offsets: Floats, found: Floats, shift: Floats, spread: Floats, cross: Floats
     ) -> None:
-        centre = tuple(shift[i] for i in range(size))
+        centre = tuple(shift[i] for i in places)
         own, joint = (0.0,) * len(pairs), (0.0,) * len(mixed)
         for k in range(len(weights)):
-            y = tuple(found[k, i] - centre[i] for i in range(size))
-            weighed = tuple(weights[k] * y[i] for i in chosen)
+            y = tuple(found[k, i] - c for i, c in zip(places, centre, strict=True))
+            weighed = tuple(weights[k] * each for each in y[first:])
             x = tuple(offsets[k, row] for row in range(states))
             own = tuple(
                 sofar + weighed[i - first] * y[j] for sofar, (i, j) in zip(own, pairs, strict=True)
             )
             joint = tuple(
-                sofar + x[row] * weighed[i - first] for sofar, (row, i) in zip(joint, mixed, strict=True)
+                sofar + x[row] * weighed[i] for sofar, (row, i) in zip(joint, mixed, strict=True)
             )
-        for entry, (i, j) in zip(own, pairs, strict=True):
+        for entry, (i, j) in zip(own, own_places, strict=True):
             spread[i, j] = spread[j, i] = entry
-        for entry, (row, i) in zip(joint, mixed, strict=True):
+        for entry, (row, i) in zip(joint, joint_places, strict=True):
             cross[row, i] = entry
 
     return fill
 
 
 @lru_cache(maxsize=64)
-def weighted_mean_of(values: int) -> WeightedMean:
-    """Make `fill(weights, found, mean)`, which fills the weighted sums (v,) of values (L, v)."""
+def axis_moments_of(states: int, values: int, kept: tuple[int, ...]) -> AxisMoments:
+    """Make `moments`, which fills weighted covariances of values at samples that are on axes.
+
+    With the points (L, N), of which number k is on axis `axes[k]`, and the lower factor (N, N) of their
+    covariance, the covariance of states and values is the product of the factor with `joint` (N, v), the
+    covariance of points and values. Values that are `kept` are components of the state that the function
+    does not change, so that both covariances are the same.
+    """
+    spread_out = moments_of(0, tuple(each for each in range(values) if each not in kept))
+
+    def moments(
+        samples: tuple[Floats, Floats, Integers],
+        factor: Floats,
+        found: Floats,
+        shift: Floats,
+        joint: Floats,
+        spread: Floats,
+        cross: Floats,
+    ) -> None:
+        weights, points, axes = samples
+        spread_out(weights, points, found, shift, spread, cross)
+        joint[:, :] = 0.0
+        for k in range(len(weights)):
+            axis = axes[k]
+            share = weights[k] * points[k, axis]
+            for i in range(values):
+                joint[axis, i] += share * (found[k, i] - shift[i])
+        for row in range(states):
+            sums = (0.0,) * values
+            for k in range(row + 1):
+                sums = tuple(sofar + factor[row, k] * joint[k, i] for i, sofar in enumerate(sums))
+            for i, entry in enumerate(sums):
+                cross[row, i] = entry
+        for row in kept:
+            for i in range(values):
+                spread[row, i] = spread[i, row] = cross[row, i]
+
+    return moments
+
+
+@lru_cache(maxsize=64)
+def weighted_mean_of(places: tuple[int, ...]) -> WeightedMean:
+    """Make `fill(weights, found, mean)`: weighted sums (v,) of values (L, v), for some components."""
 
     def fill(weights: Floats, found: Floats, mean: Floats) -> None:
-        sums = (0.0,) * values
+        sums = (0.0,) * len(places)
         for k in range(len(weights)):
-            sums = tuple(sofar + weights[k] * found[k, i] for i, sofar in enumerate(sums))
-        for i, entry in enumerate(sums):
+            sums = tuple(sofar + weights[k] * found[k, i] for i, sofar in zip(places, sums, strict=True))
+        for i, entry in zip(places, sums, strict=True):
             mean[i] = entry
 
     return fill

@@ -27,7 +27,7 @@ from fuselog.replay.inference.linear_algebra.moments import (
     offset_of,
     weighted_mean_of,
 )
-from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from fuselog.replay.inference.linear_algebra.tuples import adding_noise, filling, range_of, tuple_of
 from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.sampling.resampling import choose_systematically
@@ -368,8 +368,8 @@ def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
 def summing_up(model: Model) -> EstimateRun:
     """Make the estimate: intrinsic mean and covariance, and particles if they are requested."""
     n, t = model.size, model.tangent
-    subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)
-    weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}
+    subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, range_of(t))
+    weighted_mean, straight = weighted_mean_of(range_of(n)), set(model.kinds) <= {"linear"}
 
     def estimate(run: int, cloud: Cloud, clouds: Clouds, row: int, _: ParticleMemory) -> None:
         states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]

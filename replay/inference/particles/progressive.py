@@ -20,6 +20,7 @@ from fuselog.replay.inference.kalman.regression import settling
 from fuselog.replay.inference.linear_algebra.gaussian import semidefinite_cholesky
 from fuselog.replay.inference.linear_algebra.manifold import boxminus, boxplus
 from fuselog.replay.inference.linear_algebra.moments import moments_of
+from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.particles.particles import (
     Cloud,
@@ -62,7 +63,7 @@ def renewing(model: Model) -> Renew:
     """
     t = model.tangent
     subtract, add, settle = boxminus(model.kinds), boxplus(model.kinds), settling(model.kinds)
-    moments = moments_of(0, t)
+    moments = moments_of(0, range_of(t))
 
     def renew(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
         states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]

@@ -292,14 +292,16 @@ def gaussian_likelihood(
         size: number of components that are used.
     """
     number = i if len(own.noise) > 1 else 0
-    difference, factor, squared = own.differences[i], own.noise[number], 0.0
+    difference, lower, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):
         entry = difference[own.kept[a]]
         for b in range(a):
-            entry -= factor[a, b] * difference[b]
-        difference[a] = entry / factor[a, a]
+            entry -= lower[a, b] * difference[b]
+        difference[a] = entry / lower[a, a]
         squared += difference[a] * difference[a]
-    factor = inflation(squared, size, parameters)
+    factor, wider = inflation(squared, size, parameters), 0.0
+    if factor != 1.0:
+        squared, wider = squared / factor, np.log(factor)
     known = own.determinant[number] + size * LOG_TWO_PI
-    logarithm: float = -0.5 * (squared / factor + known + size * np.log(factor))
+    logarithm: float = -0.5 * (squared + known + size * wider)
     return logarithm

@@ -15,11 +15,18 @@ def choose_systematically(weights: Floats, start: float, chosen: Integers) -> No
         start: offset in [0, 1), the same for all positions.
         chosen: (N,), filled with indices of particles.
     """
-    count = len(weights)
-    last, end = 0, weights[0]
-    for i in range(count):
-        position = (i + start) / count
-        while last < count - 1 and position >= end:  # the last particle covers 1 despite rounding
-            last += 1
-            end += weights[last]
+    count, begin, end = len(weights), 0, 0.0
+    chosen[:] = 0
+    for k in range(count):
+        if begin < count:
+            chosen[begin] = k  # replaced by the next particle if this one is not drawn
+        end += weights[k]
+        begin = min(int(end * count - start) + 1, count)  # first position beyond, except for rounding
+        while begin < count and (begin + start) / count < end:
+            begin += 1
+        while begin > 0 and (begin - 1 + start) / count >= end:
+            begin -= 1
+    last = 0
+    for i in range(count):  # the last particle covers 1 despite rounding
+        last = max(last, chosen[i])
         chosen[i] = last

@@ -53,6 +53,19 @@ def test_systematic_resampling_is_the_sheets() -> None:
     assert chosen.tolist() == [0, 2, 2, 3]  # round-off leaves the last position to the last particle
 
 
+def test_every_position_chooses_the_particle_that_covers_it() -> None:
+    """Including weights of zero, one that has them all, and positions that meet an end exactly."""
+    rng = np.random.default_rng(1)
+    drawn = [rng.uniform(size=count) ** 9 for count in (1, 2, 7, 64, 500)]
+    for parts in (*drawn, np.ones(10), np.ones(48), np.eye(9)[8], np.eye(9)[0], np.eye(9)[4]):
+        weights, chosen = parts / np.sum(parts), np.empty(len(parts), np.int64)
+        for start in (1e-16, 0.25, 0.5, 0.7, 1.0 - 2.0**-54):
+            choose_systematically(weights, start, chosen)
+            positions = (np.arange(len(parts)) + start) / len(parts)
+            covering = np.searchsorted(np.cumsum(weights), positions, side="right")
+            assert chosen.tolist() == np.minimum(covering, len(parts) - 1).tolist()
+
+
 def errors(particles: int, runs: int) -> tuple[Floats, Floats]:
     """In units of the Kalman filter's sigma / sqrt(N), (runs, 50); log-likelihoods less its.
 

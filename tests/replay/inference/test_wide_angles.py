@@ -6,15 +6,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
 from fuselog.replay.estimators.landmarks import ROBOT
 from fuselog.replay.estimators.navigation.attitude import ATTITUDE
 from fuselog.replay.estimators.navigation.navigation import INERTIAL
-from fuselog.replay.inference.kalman.regression import moved_with_noise, regression, sample_memory
-from fuselog.replay.inference.linear_algebra.manifold import manifold_blocks
+from fuselog.replay.inference.kalman.regression import (
+    kept_components,
+    moved_with_noise,
+    regression,
+    sample_memory,
+)
+from fuselog.replay.inference.linear_algebra.manifold import (
+    conjugate,
+    from_vector,
+    manifold_blocks,
+    product,
+    slightly_turned_back,
+    to_vector,
+)
+from fuselog.replay.inference.model.bound_model import bound_model_of
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.sampling import parse_sampling
 from fuselog.replay.inference.sampling.sets import SampleSets
@@ -97,6 +110,42 @@ def test_predictions_lose_nothing_of_an_angle(
         assert np.all(found <= 1.01 * np.hypot(sigma_rad, 0.05 * STEPS * STEP_S)), sigma_rad
         most = UNIFORM_RAD if len(rows) == 1 else UNIFORM_AXIS_RAD
         assert np.all(wanted < 1.02 * most)
+
+
+@pytest.mark.parametrize("sigma_rad", [0.05, 1.5])
+@pytest.mark.parametrize("model", [INERTIAL, ATTITUDE])
+def test_points_on_axes_have_the_moments_of_other_points(model: Model, sigma_rad: float) -> None:
+    """A point without weight that is on no axis changes no moments, only how they are computed."""
+    motion = bound_model_of(model, model.motion).motion
+    points, weights = parse_sampling("ukf").at(model.tangent).draw(np.random.default_rng(0), (1,))
+    others = np.full((1, 1, model.tangent), 0.1)
+    known = {"origin_latitude_deg": 50.0, "origin_altitude_m": 0.0} if model is INERTIAL else {}
+    given = TURNED, STEP_S, model.parameters(**known)
+    mean, covariance, _ = wide(model, sigma_rad)
+    mixed = np.eye(model.tangent) + 0.3 * np.random.default_rng(1).standard_normal(covariance.shape)
+    covariance = mixed @ covariance @ mixed.T
+    found = []
+    for kept, sets in (
+        (kept_components(motion, model.kinds), SampleSets(points, weights, 0, 0)),
+        ((), SampleSets(np.hstack([points, others]), np.hstack([weights, [[0.0]]]), 0, 0)),
+    ):
+        made = regression(
+            moved_with_noise(motion), model.kinds, 0, model.kinds, is_motion=True, kept=kept
+        )
+        memory = sample_memory(sets, model.kinds, 0, model.kinds)
+        spread, cross = np.empty_like(covariance), np.empty_like(covariance)
+        assert made(mean, covariance, given, (), spread, cross, 0, memory)
+        assert len(memory.axes) == (0 if found else points.shape[1])
+        found.append((memory.centre, spread, cross))
+    for on_axes, elsewhere in zip(*found, strict=True):
+        assert_allclose(on_axes, elsewhere, rtol=1e-11, atol=1e-14)
+
+
+def test_a_slight_turn_back_is_that_of_quaternions() -> None:
+    for v in np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2], [-0.6, 0.5, 0.6]]):
+        d = 9e-8 * np.array([0.6, -0.8, 1.0])
+        turned = product(conjugate(from_vector(*d)), from_vector(*v))
+        assert_allclose(slightly_turned_back(v, v @ v, d), to_vector(*turned), rtol=1e-14, atol=1e-15)
 
 
 def poses(log: fl.MemorySource, method: str) -> fl.Stream:
