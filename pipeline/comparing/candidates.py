@@ -26,7 +26,7 @@ from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
-from fuselog.recorders.parameters import build
+from fuselog.recorders.parameters import build, flat
 from fuselog.recorders.trajectories import read_trajectory
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
@@ -153,9 +153,8 @@ def key_of(source: Source) -> str:
 def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that affect one estimator's estimates, by dotted name."""
     run = source.run or RunMetadata("unknown")
-    return flat(
-        {"scenario": run.scenario, "parameters": run.parameters, "estimator": parameters(label, stated)}
-    )
+    own = {"scenario": run.scenario, "parameters": run.parameters}
+    return dict(flat(own | {"estimator": parameters(label, stated)}))
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
@@ -164,17 +163,6 @@ def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
         return dict(configure(label, stated)[1].model_dump(mode="json"))
     except BadInput:
         return dict(stated)
-
-
-def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten nested settings to dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            found |= flat(value, f"{before}{name}.")
-        else:
-            found[f"{before}{name}"] = value
-    return found
 
 
 def name_of(path: Path) -> str:
@@ -306,7 +294,7 @@ def _without_replay(folder: Path, why: str) -> str:
 
 def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
     deciding = {name: result.settings[name] for name in DECIDING if name in result.settings}
-    return flat(deciding | {"estimator": stated.get(label, {})})
+    return dict(flat(deciding | {"estimator": stated.get(label, {})}))
 
 
 def _stored(

@@ -7,6 +7,7 @@ import numpy as np
 
 from fuselog.pipeline.api.replays import Replay
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
+from fuselog.pipeline.output.over_time import nis_over_time
 from fuselog.pipeline.output.results import MetricValue, split_metric
 from fuselog.pipeline.output.words import listed
 from fuselog.recorders.checks.finding import Finding
@@ -20,8 +21,7 @@ from fuselog.replay.judging.metrics.measuring import metric_key
 # share of messages in which the truth equals the filter's input, so that both are the same data
 SAME = 0.9
 SEEN = 1.5  # NIS per component below which innovations show no error
-CHART_BINS = 60
-# ratio of mean to root mean square of innovations above which half of their power is a bias
+# ratio of mean to root mean square of innovations, above which half of their power is a bias
 BIASED = 0.7
 
 
@@ -192,12 +192,9 @@ def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> 
         degrees = np.isfinite(stream["innovation"]).sum(axis=1)
         used = (degrees > 0) & np.isfinite(nis)
         times_s = 1e-9 * (stream.publish_time_ns[used] - epoch_ns)
-        count, edges = np.histogram(times_s, CHART_BINS, weights=degrees[used])
-        total, _ = np.histogram(times_s, edges, weights=nis[used])
-        there = count > 0
-        middle_s = 0.5 * (edges[1:] + edges[:-1])[there]
+        middle_s, mean, *_ = nis_over_time(times_s, nis[used], degrees[used])
         panel = Panel(x=Axis(label="time (s)"), y=Axis(label="NIS per component", log=True))
-        panel.series.append(curve(label, middle_s, total[there] / count[there], "line+markers"))
+        panel.series.append(curve(label, middle_s, mean, "line+markers"))
         panel.series.append(level("if consistent", middle_s, 1.0))
         name = " ".join(filter(None, ("NIS", case)))
         charts[name.lower().replace(" ", "-")] = Chart(title=name, panels=[panel])

@@ -16,8 +16,8 @@ from fuselog.replay.judging.consistency.whiteness import Whiteness, whitened, wh
 from fuselog.replay.judging.errors.evaluation import (
     POSITION,
     Errors,
-    chi_square_band,
     chi_square_interval,
+    nis_by_bin,
     split_topic,
 )
 
@@ -158,16 +158,15 @@ def _of_innovations(
     time_s = _elapsed_s(stream, epoch_ns)
     degrees = np.isfinite(stream["innovation"]).sum(axis=1)
     spans = np.floor(time_s / BIN_S).astype(np.int64)
-    starts, place = np.unique(spans, return_inverse=True)
-    squared = np.bincount(place, stream["normalised_innovation_squared"])
-    count = np.bincount(place, degrees)
-    known = count > 0
-    starts, squared, count = starts[known], squared[known], count[known]
-    nis = Nis(np.asarray((starts + 0.5) * BIN_S), squared / count, *chi_square_band(count))
+    starts, *nis = nis_by_bin(spans, stream["normalised_innovation_squared"], degrees)
     series = whitened(stream).T
     white = {name: whiteness([each]) for name, each in zip(stream.components, series, strict=True)}
     stated = stream.columns.get("log_likelihood")
-    return nis, white, np.nan if stated is None else float(np.sum(stated))
+    return (
+        Nis(np.asarray((starts + 0.5) * BIN_S), *nis),
+        white,
+        np.nan if stated is None else float(np.sum(stated)),
+    )
 
 
 def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
@@ -195,24 +194,6 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
         for low, high in pairwise(edges.tolist())
     ]
     return np.unique(np.array(pairs))
-
-
-def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Floats:
-    """Compute the outline of the region of the plane that contains the truth with a given probability.
-
-    Args:
-        center: (2,), the estimate.
-        covariance: (2, 2), the covariance of the estimate.
-        probability: the probability with which the ellipse contains the truth.
-
-    Returns:
-        The closed outline (61, 2), in the unit of the center.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    turn = np.linspace(0.0, 2.0 * np.pi, 61)
-    radius = np.sqrt(-2.0 * np.log1p(-probability))
-    unit = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sqrt(np.maximum(values, 0.0)) * radius
-    return np.asarray(center + unit @ vectors.T)
 
 
 def typical_time_s(case: Case) -> float | None:

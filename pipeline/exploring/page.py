@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from html import escape
 from typing import Any
 
 from bokeh.document import Document
@@ -12,7 +11,7 @@ from bokeh.models import Div, Select, Span
 from bokeh.models import Slider as SliderWidget
 
 from fuselog.pipeline.exploring.curves import instant_of, true_path
-from fuselog.pipeline.exploring.markup import SIDE, head_html, heading_html, label_of, pre_html
+from fuselog.pipeline.exploring.markup import MACROS, SIDE, head_html
 from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.plots import (
     PINNED,
@@ -122,7 +121,7 @@ class Page:
     def _fill_side(self) -> None:
         """Fill the left column with filters, buttons and sliders."""
         session = self.session
-        heading = Div(text=heading_html(session.source.name), width=SIDE)
+        heading = Div(text=MACROS.heading(session.source.name), width=SIDE)
         names = list(dict.fromkeys([*self._known, *session.methods]))
         choices = filter_choices(session.filters, names)
         for choice in choices:
@@ -147,7 +146,7 @@ class Page:
         for slider in session.sliders:
             if slider.group != group:
                 group = slider.group
-                shown.append(Div(text=f"<b>{escape(group)}</b>", width=SIDE, styles={"color": QUIET}))
+                shown.append(Div(text=MACROS.group(group), width=SIDE, styles={"color": QUIET}))
             label = Div(width=SIDE, name=f"label-{slider.name}", margin=(0, 5, 0, 5))
             widget = widget_of(slider, self.values.get(slider.name, slider.default))
             widget.on_change("value", partial(self._dragged, slider))
@@ -161,7 +160,7 @@ class Page:
         """Write a slider's name, value and ends, with a mark at the value from the log."""
         value = self.values.get(slider.name, slider.default)
         _, widget, label = self._widgets[slider.name]
-        label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
+        label.text = MACROS.label(slider, value, slider.name in self.session.estimated)
         widget.tags = tags_of(slider, value)
 
     # Actions of the user.
@@ -265,7 +264,7 @@ class Page:
 
     def _save(self) -> None:
         try:
-            self._saved.text = pre_html(self.session.toml(self.values), SIDE - 20)
+            self._saved.text = MACROS.copied(self.session.toml(self.values), SIDE - 20)
         except BadInput as error:
             self._tell(str(error))
 
@@ -387,9 +386,9 @@ class Page:
         case = self._chosen_case()
         self._head.text = head_html(self.session.filters, self.played, case, estimated)
         try:
-            self._command.text = pre_html(self.session.command(self.played[0].values))
+            self._command.text = MACROS.copied(self.session.command(self.played[0].values))
         except BadInput as error:  # an estimator defined in Python has no command
-            self._command.text = f"<p>{escape(str(error))}</p>"
+            self._command.text = MACROS.paragraphs([str(error)])
 
     def _chosen_case(self) -> str:
         return str(self._case_choice.value or "")
@@ -398,7 +397,7 @@ class Page:
         return list(self.session.filters)[place]
 
     def _tell(self, *sentences: str) -> None:
-        self._sentences.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
+        self._sentences.text = MACROS.paragraphs(sentences)
 
     def _say_error(self, error: Exception) -> None:
         message = str(error) if isinstance(error, BadInput) else f"this action failed: {error!r}"

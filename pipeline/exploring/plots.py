@@ -20,7 +20,6 @@ from fuselog.pipeline.exploring.curves import (
     Case,
     Floats,
     Path,
-    ellipse,
     extremes,
     fewer,
     map_points,
@@ -31,6 +30,7 @@ from fuselog.pipeline.exploring.sliders import Slider, ticks_between
 from fuselog.pipeline.output.words import label_of, quantity
 from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.streams.sources import MemorySource
+from fuselog.replay.judging.consistency.consistency import ellipses
 
 # The report's black, grey and crimson; each filter has its own colour, and pinned results are grey.
 INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e7eb"
@@ -39,9 +39,10 @@ PINNED = "pinned"
 SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # wide enough to distinguish lags
 HEIGHT, HEIGHT_OVER_TIME = 220, 235
 LEAST_DROP = 10.0  # smallest range of log-likelihood in its plot
+CORNERS = 60  # number of corners of an ellipse
 ABOUT_PEAK = 3  # number of values that are shown on each side of the peak
 LEAST_CORRELATION = 0.25
-TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # number of positions of a slider
+TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # positions of the marks of a slider, from end to end
 
 
 @dataclass
@@ -311,11 +312,11 @@ def show_lens(
         if one is None or one.path is None:
             continue
         row = int(np.argmin(np.abs(one.path.time_s - at_s)))
-        outline = ellipse(one.path.points[row], one.covariance[row])
+        [outline] = ellipses(one.path.points[[row]], one.covariance[[row]], vertices=CORNERS)
         plot.fill(of, "ellipse", x=outline[:, 0], y=outline[:, 1])
         near = np.abs(one.path.time_s - at_s) < 5.0
         plot.fill(of, "line", x=one.path.points[near, 0], y=one.path.points[near, 1])
-        half = max(half, float(np.abs(outline - one.path.points[row]).max()))
+        half = max(half, float(np.nan_to_num(np.abs(outline - one.path.points[row])).max()))
     center = first.path.points[int(np.argmin(np.abs(first.path.time_s - at_s)))]
     scene.fill(0, "here", x=center[:1], y=center[1:])
     if truth is not None:

@@ -20,10 +20,10 @@ from fuselog.recorders.log.mirrors import MIRROR_OF
 from fuselog.recorders.log.planes import FRAME, body_of
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
 from fuselog.replay.engine.vectors.tangent import manifold_blocks
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 from fuselog.replay.timeline.drawing.canvas import PALETTE, TRUTH
-from fuselog.replay.timeline.drawing.plane import ellipses
 
 with extra("foxglove", "messages of Foxglove"):
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms

@@ -15,7 +15,7 @@ from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.compiling.cache import cache_folder, kept_files
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
-from fuselog.recorders.parameters import build, describe
+from fuselog.recorders.parameters import build, describe, flat
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
@@ -302,16 +302,4 @@ def _changed(run: RunMetadata) -> dict[str, Any]:
     except BadInput:
         return run.parameters
     defaults = {each.name: each.default for each in described}
-    values = dict(_flat(run.parameters))
-    return {name: value for name, value in values.items() if defaults.get(name) != value}
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
-    """Return nested values by their full names with dots."""
-    flat: dict[str, Any] = {}
-    for name, value in table.items():
-        if isinstance(value, Mapping) and value:
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
+    return {name: value for name, value in flat(run.parameters) if defaults.get(name) != value}

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import TYPE_CHECKING, NamedTuple
 
 from fuselog.pipeline.output.results import Bounds, MetricValue
@@ -35,8 +34,10 @@ class Shown(NamedTuple):
     @property
     def html(self) -> str:
         """Return the display as HTML for a notebook's cell."""
-        lines = [f"<b>{escape(self.title)}</b>", *map(escape, self._first())]
-        return "".join(f"<div>{line}</div>" for line in lines) + "".join(map(_html, self.tables))
+        from fuselog.pipeline.output.pages import templates  # slow to import
+
+        page = templates("fuselog.pipeline.output", {"value": format_value}).get_template("shown.html")
+        return page.render(lines=self._first(), **self._asdict())
 
     def _first(self) -> list[str]:
         more = len(self.sentences) - MOST_SENTENCES
@@ -66,11 +67,3 @@ def shown_metrics(
 ) -> Shown:
     """Format metrics for display; if there are several cases, show their medians."""
     return Shown(title, sentences, tables_of(metrics, bounds, runs, most_cases=1))
-
-
-def _html(table: PrintedTable) -> str:
-    cells = [[escape(format_value(value)) for value in row] for row in table.rows]
-    head = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in cells)
-    caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
-    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -6,8 +6,9 @@ from typing import Any
 import pandas as pd
 
 from fuselog.pipeline.output.alarming import alarms_of
-from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, Style, band, curve, thinned
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Style, curve, thinned
 from fuselog.pipeline.output.coverage import coverage_table
+from fuselog.pipeline.output.over_time import panel_over_time
 from fuselog.pipeline.output.results import MetricValue, Outcome, split_metric
 from fuselog.replay.engine.replaying.usage import Row
 from fuselog.replay.judging.errors.evaluation import Errors
@@ -102,21 +103,14 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
             continue
         steps = of_all.iloc[thinned(len(of_all))]
         label, time_s, quantity = errors.estimator, steps["elapsed_s"], errors.main.rmse
-        x, ends = Axis(label="time (s)"), (steps[f"{quantity}_low"], steps[f"{quantity}_high"])
-        panel = Panel(x=x, y=rmse_axis, title=_title(label, of_all, quantity, f"{quantity}_low"))
-        panel.bands.append(band(label, time_s, *ends))
-        panel.series.append(curve(label, time_s, steps[quantity]))
-        panel.series.extend(bounds)
-        panel.series.extend(_outside(steps, quantity, *ends, rmse_axis))
-        rmse.append(panel)
-        panel = Panel(x=x, y=nees_axis, title=_title(label, of_all, "nees", "nees_low"))
-        consistent = f"95 % if consistent ({len(errors.components)} components)"
-        panel.bands.append(
-            band(consistent, time_s, steps["nees_low"], steps["nees_high"], reference=True)
+        ends = steps[f"{quantity}_low"], steps[f"{quantity}_high"]
+        title = _title(label, of_all, quantity, f"{quantity}_low")
+        rmse.append(
+            panel_over_time(label, time_s, steps[quantity], ends, rmse_axis, title, others=bounds)
         )
-        panel.series.append(curve(label, time_s, steps["nees"]))
-        panel.series.extend(_outside(steps, "nees", steps["nees_low"], steps["nees_high"], nees_axis))
-        nees.append(panel)
+        ends, title = (steps["nees_low"], steps["nees_high"]), _title(label, of_all, "nees", "nees_low")
+        consistent = f"95 % if consistent ({len(errors.components)} components)"
+        nees.append(panel_over_time(label, time_s, steps["nees"], ends, nees_axis, title, consistent))
     runs = int(table["runs"].max())
     what = f"{case or 'errors'}, {'1 run' if runs == 1 else f'over all {runs} runs together'}"
     panels = [*rmse, *nees]
@@ -149,17 +143,6 @@ def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
         else f"at {100 * max(share, 0.01):.0f} % of steps"
     )
     return f"{label}: outside {where}"
-
-
-def _outside(
-    steps: pd.DataFrame, quantity: str, low: "pd.Series[float]", high: "pd.Series[float]", axis: Axis
-) -> list[Series]:
-    """Draw a strip along the bottom of a panel where a curve is outside its band."""
-    is_out = (steps[quantity] < low) | (steps[quantity] > high)
-    if not is_out.any() or axis.limits is None:
-        return []
-    times_s = steps["elapsed_s"][is_out]
-    return [curve("outside", times_s, [1.03 * axis.limits[0]] * len(times_s), "outside")]
 
 
 def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from fuselog.pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, typical_time_s
+from fuselog.pipeline.exploring.curves import BIN_S, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.curves import Path as Track
 from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.session import Session, open_session
@@ -30,6 +30,7 @@ from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.results import Result
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.estimators.landmarks import ROBOT
+from fuselog.replay.judging.consistency.consistency import ellipses
 
 SURE = {"sigma_range_m": 0.03}  # of .1
 GOOD = "No problem found."
@@ -203,7 +204,7 @@ def test_nothing_drawn_is_lost(session: Session) -> None:
     rows = extremes(values)
     assert len(rows) <= 400
     assert (values[rows].min(), values[rows].max()) == (-4.0, 5.0)
-    outline = ellipse(np.array([1.0, 2.0]), np.diag([4.0, 1.0])) - [1.0, 2.0]
+    [outline] = ellipses(np.array([[1.0, 2.0]]), np.diag([4.0, 1.0])[None]) - [1.0, 2.0]
     assert np.ptp(outline, axis=0) == pytest.approx(
         [4.0 * np.sqrt(5.9915), 2.0 * np.sqrt(5.9915)], rel=1e-3
     )

@@ -19,11 +19,12 @@ from scipy.stats import chi2, norm, t
 
 import fuselog as fl
 from fuselog.pipeline.diagnosing.consistency import nis_charts
-from fuselog.pipeline.exploring.curves import BIN_S, cases_of, ellipse
+from fuselog.pipeline.exploring.curves import BIN_S, cases_of
 from fuselog.pipeline.exploring.verdict import numbers_of
 from fuselog.pipeline.output.terminal import print_metrics, print_pose_errors
 from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.streams.blocks import gather
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.judge import Judge
 from tests.pipeline import known
 from tests.pipeline.conftest import run_here
@@ -482,7 +483,8 @@ def test_the_explorer_draws_and_says_the_numbers_of_the_run() -> None:
     assert said["error, RMS"] == (pytest.approx(size * known.rmse("one", 0, 1)), "m")
     assert said["NEES, aim 3"] == (pytest.approx(size**2 * known.nees("one")), "")
     assert case.log_likelihood == pytest.approx(known.LIKELIHOOD * (~known.GATED).sum())
-    outline = ellipse(np.array([1.0, 2.0]), np.array([[4.0, 1.0], [1.0, 2.0]]), 0.9) - [1.0, 2.0]
+    covariance = np.array([[[4.0, 1.0], [1.0, 2.0]]])
+    [outline] = ellipses(np.array([[1.0, 2.0]]), covariance, 0.9) - [1.0, 2.0]
     squared = np.einsum("ni,ij,nj->n", outline, np.linalg.inv([[4.0, 1.0], [1.0, 2.0]]), outline)
     np.testing.assert_allclose(squared, chi2.ppf(0.9, 2))
 

@@ -16,8 +16,8 @@ from fuselog.pipeline.families.acoustic.cases import (
 )
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, interval, path
 from fuselog.pipeline.studies.toolkit.repetitions import EFFICIENT
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
-from fuselog.replay.timeline.drawing.plane import ellipses
 
 
 def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Chart | Figure]:

@@ -17,16 +17,16 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from unicodedata import category
 from urllib.parse import unquote
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, Template, select_autoescape
+from jinja2 import Template
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
 from fuselog.pipeline.output.alarms import Cause
 from fuselog.pipeline.output.charts import Chart
+from fuselog.pipeline.output.pages import templates
 from fuselog.pipeline.output.report.evidence import Findings, Timings
 from fuselog.pipeline.output.report.first_run import first_run, picture_of_timeline
 from fuselog.pipeline.output.report.glossary import Term, glossary
@@ -39,7 +39,7 @@ from fuselog.pipeline.output.results import TIMINGS, Result, read_result, read_t
 from fuselog.pipeline.output.terminal import format_value, is_value
 from fuselog.pipeline.output.words import QUANTITIES, TRACKING, count, label_of, quantity
 from fuselog.recorders.atomic import whole_file
-from fuselog.recorders.errors import BadInput, printable
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters, build
 from fuselog.recorders.parsing import parse_json
 
@@ -127,14 +127,7 @@ def write_report(
 
 @cache
 def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("fuselog.pipeline.output.report", "."),
-        autoescape=select_autoescape(),
-        finalize=_visible,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
+    filters = {
         "value": format_value,
         "empty": empty_cells,
         "drawn": _as_json,
@@ -142,7 +135,7 @@ def _template() -> Template:
         "named": _named,
         "hues": _hues,
     }
-    return environment.get_template("page.html")
+    return templates("fuselog.pipeline.output.report", filters).get_template("page.html")
 
 
 def is_report(page: Path) -> bool:
@@ -154,14 +147,6 @@ def is_report(page: Path) -> bool:
 def _signed(page: bytes) -> bytes:
     """Append the SHA-256 of the page as its signature."""
     return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
-
-
-def _visible(value: object) -> object:
-    """Replace control characters of a text by their codes, everywhere on the page."""
-    if not isinstance(value, str) or value.isprintable():
-        return value
-    hidden = {each for each in {*value} - {*"\n\t"} if not each.isprintable() and category(each) != "Zs"}
-    return value.translate({ord(each): printable(each) for each in hidden}) if hidden else value
 
 
 def empty_cells(table: pd.DataFrame) -> list[str]:

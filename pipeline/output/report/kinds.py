@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, curve
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve
 from fuselog.pipeline.output.report.evidence import (
     MARGIN,
     Findings,
@@ -295,20 +296,15 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         return None
     panels = []
     for (first, second), own in shown.groupby(["first", "second"], sort=False):
-        places = list(range(len(own), 0, -1))
+        places = np.arange(len(own), 0, -1)
         factor = 100.0 * margin / own["margin"].to_numpy()
         low, middle, high = (own[name].to_numpy() * factor for name in ("low", "difference", "high"))
-        ends: list[float | None] = []
-        lines: list[float | None] = []
-        for place, left, right in zip(places, low, high, strict=True):
-            ends += [float(left), float(right), None]
-            lines += [float(place), float(place), None]
         several = len({*own["case"]}) > 1
         names = [
             quantity(key).name + (f", {case}" if several else "")
             for key, case in zip(own["quantity"], own["case"], strict=True)
         ]
-        ticks = {float(place): name for place, name in zip(places, names, strict=True)}
+        ticks = dict(zip(map(float, places), names, strict=True))
         y = Axis(ticks=ticks, limits=(0.4, len(own) + 0.6))
         least, most = min(*low, -100.0 * margin), max(*high, 100.0 * margin)
         room = 0.05 * float(most - least)
@@ -327,9 +323,11 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
             for side in (-100.0 * margin, 100.0 * margin)
         ]
         edges.append(curve("no difference", [0.0, 0.0], [0.4, len(own) + 0.6], reference=True))
-        spread = Series(label=str(second), x=ends, y=lines)
+        gaps = np.full(len(own), np.nan)
+        lines = np.array([[low, high, gaps], [places, places, gaps]]).transpose(0, 2, 1)
+        ends = curve(str(second), *lines.reshape(2, -1))
         panels.append(
-            Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
+            Panel(x=x, y=y, series=[*edges, ends, curve(str(second), middle, places, "markers")])
         )
     title = (
         "Differences in percent of the first estimator's value or of the aim, with 95 % intervals; "

@@ -1,12 +1,13 @@
 """Charts of the first run from above, of a magnified typical second, and of NIS over time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, path, thinned
+from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, path, thinned
+from fuselog.pipeline.output.over_time import nis_over_time, panel_over_time
 from fuselog.pipeline.output.report.first_run import (
     MOST_RUNS,
     PLANE,
@@ -20,7 +21,8 @@ from fuselog.recorders.log import open_log, read_streams, schemas, topics_of
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.detections import ORIGIN, detected_places
 from fuselog.replay.engine.streams.sources import LogSource
-from fuselog.replay.judging.errors.evaluation import chi_square_band, split_topic
+from fuselog.replay.judging.consistency.consistency import ellipses
+from fuselog.replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
 # Number of times at which particles are drawn, and number of equally weighted particles at each.
@@ -34,7 +36,6 @@ LENS_S, DOTS = 1.0, 6
 # Largest ratio of width to height of a lens, and of height to width.
 WIDEST, HIGHEST = 3.6, 0.8
 MOST_COLUMNS = 3
-BINS = 60
 MOST_FIXES = 600
 
 
@@ -80,8 +81,13 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
     if not shown or not length_s:
         return None
     rows = {label: _rows_within(each, begin_s, length_s) for label, each in shown.items()}
-    corners = np.concatenate([_shapes(shown[label], of) for label, of in rows.items()])
-    corners = np.concatenate([corners, *(shown[label].truth[of] for label, of in rows.items())])
+    corners = np.concatenate(
+        [
+            each
+            for label, of in rows.items()
+            for each in (*_outlines(shown[label], of), shown[label].truth[of])
+        ]
+    )
     low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
     middle, half = 0.5 * (low + high), 0.58 * (high - low)
     half = np.array([max(half[0], HIGHEST * half[1]), max(half[1], half[0] / WIDEST)])
@@ -152,24 +158,11 @@ def _half_axis(each: Followed) -> float:
 
 def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
     """Draw the 95 % regions that an estimator claims, at some of its estimates."""
-    points = _shapes(each, rows)
-    return Series(
-        label=label,
-        x=[None if np.isnan(x) else float(f"{x:.7g}") for x in points[:, 0]],
-        y=[None if np.isnan(y) else float(f"{y:.7g}") for y in points[:, 1]],
-        style="area",
-    )
+    return path(label, _parted(_outlines(each, rows)), "area")
 
 
-def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
-    """Compute the outlines of ellipses as one curve, with NaN between them."""
-    turn = np.linspace(0.0, 2.0 * np.pi, CORNERS)
-    circle = np.stack([np.cos(turn), np.sin(turn)])
-    values, axes = np.linalg.eigh(each.covariance[rows])
-    half = axes * np.sqrt(INSIDE * values.clip(0.0))[:, None, :]
-    borders = each.estimate[rows][:, None, :] + np.swapaxes(half @ circle, 1, 2)
-    gaps = np.full((len(rows), 1, 2), np.nan)
-    return np.concatenate([borders, gaps], axis=1).reshape(-1, 2)
+def _outlines(each: Followed, rows: NDArray[np.int64]) -> Floats:
+    return ellipses(each.estimate[rows], each.covariance[rows], vertices=CORNERS)
 
 
 def _landmarks(run: FirstRun) -> list[Series]:
@@ -323,7 +316,7 @@ def _tracks(output: LogSource, label: str) -> list[Floats]:
     return [places[tracks["track_id"] == number] for number in np.unique(tracks["track_id"])]
 
 
-def _parted(ways: Sequence[Floats]) -> Floats:
+def _parted(ways: Iterable[Floats]) -> Floats:
     """Join paths to one curve, with NaN between them."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for way in ways for part in (way, gap)])
@@ -343,7 +336,7 @@ def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
         degrees = np.concatenate([each.degrees for _, each in parts])
         known = np.isfinite(squared) & (degrees > 0)
         if known.any():
-            drawn.append((label, *_binned(time_s[known], squared[known], degrees[known])))
+            drawn.append((label, *nis_over_time(time_s[known], squared[known], degrees[known])))
     if not drawn:
         return None
     every = np.concatenate([np.concatenate([nis, low, high]) for _, _, nis, low, high in drawn])
@@ -351,32 +344,12 @@ def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
     y = Axis(label="NIS per component", log=True, limits=ends)
     panels = []
     for label, time_s, nis, low, high in drawn:
-        is_out = (nis < low) | (nis > high)
-        share = float(is_out.mean())
+        share = float(((nis < low) | (nis > high)).mean())
         where = "always" if share == 1.0 else f"{100 * share:.0f} % of the time" if share else "never"
-        panel = Panel(x=Axis(label="time (s)"), y=y, title=f"{label}: outside {where}")
-        panel.bands.append(band("95 % if consistent", time_s, low, high, reference=True))
-        panel.series.append(curve(label, time_s, nis))
-        if is_out.any():
-            foot = np.full(int(is_out.sum()), 1.02 * ends[0])
-            panel.series.append(curve("outside", time_s[is_out], foot, "outside"))
-        panels.append(panel)
+        title = f"{label}: outside {where}"
+        panels.append(panel_over_time(label, time_s, nis, (low, high), y, title, "95 % if consistent"))
     columns = max(1, min(len(panels), MOST_COLUMNS))
     of = f" of {cases[0]}" if cases[0] else ""
     runs = count(min(len([*folder.glob(RUNS)]), MOST_RUNS), "run")
     title = f"NIS over time{of}, {runs} together; grey: 95 % if consistent"
     return Chart(title=title, panels=panels, columns=columns, legend=False)
-
-
-def _binned(
-    time_s: Floats, squared: Floats, degrees: NDArray[np.int64]
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Average squares per component in bins of time, and compute the 95 % band of each bin."""
-    width = max(float(np.ptp(time_s)) / BINS, 1e-9)
-    place = np.minimum(((time_s - time_s.min()) / width).astype(int), BINS - 1)
-    counts = np.bincount(place, degrees, BINS)
-    filled = np.flatnonzero(counts)
-    sums = np.bincount(place, squared, BINS)[filled]
-    of = counts[filled]
-    middle = time_s.min() + (filled + 0.5) * width
-    return middle, sums / of, *chi_square_band(of)

@@ -31,6 +31,7 @@ from fuselog.recorders.importers.tables.guessed_places import (
     altitude_of,
     fixes_of,
     is_ais,
+    named_unit,
     places_of,
     speed_unit_of,
 )
@@ -147,8 +148,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u", usual="m")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
-        if (length := stated_unit(deviations[0], "m")) not in ("", "m"):
-            lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
+        lines += named_unit("covariance_m2", stated_unit(deviations[0], "m"))
     elif accuracy := take(table.columns, _ACCURACY, usual="m"):
         lines += [
             f"{ASSUMED}{accuracy[0].name}: standard deviation of each axis, twice upwards; factors",
@@ -271,8 +271,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     if place:
         lines.append(f"fields.position_m = {names_of(place)}")
         lines += [f"factors.position_m = {factors}"] * (-1 in factors)
-        if (length := _length(place)) != "m":
-            lines.append(f'units.position_m = "{length}"   # as its name says')
+        lines += named_unit("position_m", _length(place))
     if turn:
         lines.append(f"fields.quaternion = {names_of(turn)}")
         lines += _turned(turn)

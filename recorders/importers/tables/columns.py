@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,26 +66,26 @@ class GuessedTable(NamedTuple):
     prepared: dict[str, dict[str, Any]]
 
 
-def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
-    """Remove the columns that match the patterns, one each, from the list; return [] unless all match.
+def column_named(
+    columns: Iterable[GuessedColumn], pattern: str, usual: str = ""
+) -> GuessedColumn | None:
+    """Return the first column whose name matches, or None.
 
     A column whose unit measures another quantity than the usual unit, such as a speed in rpm, is
     skipped.
     """
-    found = []
-    for pattern in patterns:
-        match = next(
-            (
-                each
-                for each in columns
-                if re.fullmatch(pattern, each.plain)
-                and (not (usual and each.unit) or stated_unit(each, usual))
-            ),
-            None,
-        )
-        if match is None:
-            return []
-        found.append(match)
+    for each in columns:
+        is_usual = not (usual and each.unit) or stated_unit(each, usual)
+        if re.fullmatch(pattern, each.plain) and is_usual:
+            return each
+    return None
+
+
+def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
+    """Remove a `column_named` by each pattern from the list; return [] unless all are there."""
+    found = [each for pattern in patterns if (each := column_named(columns, pattern, usual))]
+    if len(found) < len(patterns):
+        return []
     columns[:] = [each for each in columns if each not in found]
     return found
 

@@ -16,6 +16,7 @@ from fuselog.recorders.importers.tables.columns import (
     ASSUMED,
     GuessedColumn,
     GuessedTable,
+    column_named,
     known_of,
     parted,
     stated_unit,
@@ -55,6 +56,7 @@ ALTITUDE = (
 _SCALES = ("deg", "1e-7 deg", "1e-6 deg", "semicircle", "1e-5 deg", "1e-3 deg")
 _MINUTES = "ddmm.mmmm"
 _SPEEDS = {name: unit(name).size for name in ("m/s", *MISTAKEN["m/s"], "cm/s", "mm/s")}
+_SPEED = r"(.*_)?(sog|speed(_over_ground)?|ground_?speed|g_?spd|velocity|gs)"
 _NEAR = 0.03  # tolerance for the ratio of the path to the speed
 _HIGHEST_M = 12_000.0  # usual limit for anything with a receiver
 # Names of columns with hemispheres, if they have a name.
@@ -74,11 +76,10 @@ class Places(NamedTuple):
 def without_codes(table: GuessedTable) -> GuessedTable:
     """Replace codes of missing values in a table by NaN; `prepared` lists them for the mapping."""
     plain = {column.plain for column in table.whole}
-    is_ais = any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
-    codes: dict[str, list[float]] = {}
+    has_ais, codes = is_ais(table), dict[str, list[float]]()
     for column in table.whole:
         known: tuple[float, ...] = ()
-        if is_ais:
+        if has_ais:
             known = next((those for name, those in _AIS.items() if re.fullmatch(name, column.plain)), ())
         if re.fullmatch(r"(.*_)?lat(itude)?", column.plain):
             known = tuple(code for code in _NOT_A_PLACE if _is_code(column.values, code, 90.0))
@@ -294,7 +295,7 @@ def _degrees(name: str, values: NDArray) -> NDArray:
 
 def _by_speed(table: GuessedTable, pair: tuple[NDArray, NDArray], fitting: Sequence[str]) -> list[str]:
     """Return the units in which positions agree with a column of speeds; all units without one."""
-    speed = _column(table.whole, r"(.*_)?(sog|speed(_over_ground)?|ground_?speed|g_?spd|velocity|gs)")
+    speed = column_named(table.whole, _SPEED)
     if speed is None or len(fitting) == 1:
         return list(fitting)
     stated = stated_unit(speed, "m/s")
@@ -315,8 +316,8 @@ def _speed_sizes(table: GuessedTable) -> list[float]:
 
 def is_ais(table: GuessedTable) -> bool:
     """Test by the names of columns whether a table contains AIS reports."""
-    plain = {column.plain for column in table.whole}
-    return any(re.fullmatch("(.*_)?mmsi", name) for name in plain) or {"sog", "cog"} <= plain
+    names = {each.plain for each in table.whole}
+    return {"sog", "cog"} <= names or column_named(table.whole, "(.*_)?mmsi") is not None
 
 
 def path_ratio(
@@ -398,10 +399,15 @@ def _by_name(
     return "", ""
 
 
+def named_unit(field: str, length: str) -> list[str]:
+    """Write the unit of a length that the name of its column states, unless it is m."""
+    return [f'units.{field} = "{length}"   # as its name says'] if length not in ("", "m") else []
+
+
 def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) -> list[str]:
     """Write the unit of an altitude; raise BadInput if its numbers are too large for m."""
     if length := stated_unit(height, "m"):
-        return [f'units.altitude_m = "{length}"   # as its name says'] if length != "m" else []
+        return named_unit("altitude_m", length)
     known = known_of(height)
     largest = float(np.abs(known).max())
     is_whole = bool(np.all(known == np.rint(known)))
@@ -422,7 +428,7 @@ def altitude_of(table: GuessedTable, height: GuessedColumn, position_unit: str) 
 def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str) -> list[str]:
     """Write the unit of a standard deviation of positions; raise BadInput if it is ambiguous."""
     if length := stated_unit(accuracy, "m"):
-        return [f'units.covariance_m2 = "{length}"   # as its name says'] if length != "m" else []
+        return named_unit("covariance_m2", length)
     known = known_of(accuracy)
     if position_unit != "1e-7 deg" or np.any(known != np.rint(known)) or known.max() < 20:
         return [f"{ASSUMED}{accuracy.name}: in m, as no unit is stated; units"]
@@ -454,10 +460,6 @@ def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tup
             if abs(np.log(_SPEEDS[nearest] / ratio)) < _NEAR:
                 return nearest, "which agrees with the positions"
     return "m/s", f"a guess: the largest is {np.nanmax(length):.4g}"
-
-
-def _column(columns: Sequence[GuessedColumn], pattern: str) -> GuessedColumn | None:
-    return next((each for each in columns if re.fullmatch(pattern, each.plain)), None)
 
 
 def prepared_lines(table: GuessedTable) -> Iterator[str]:

@@ -21,6 +21,7 @@ from fuselog.recorders.importers.tables.columns import (
     ASSUMED,
     TIME_OF_DAY,
     GuessedColumn,
+    column_named,
     known_of,
     parted,
 )
@@ -66,6 +67,14 @@ _COUNTERS = re.compile(
     r"(.*_)?(seq|sequence|index|idx|row|frame|sample|count|counter|number|num|no|nr|id|record|step|point|"
     r"distance|dist|odometer|unnamed|level)s?(_?(id|no|nr|number|count|index|m|km|0))?|"
 )
+_WEEKS = r"(gps_?|gnss_?)?(week|wn)(_?(no|nr|num|number))?|gwk"
+_SECONDS_OF_WEEK = r"(gps_?)?((i_?)?tow|time_of_week|seconds_of_week|sow)|gms"
+# Names of columns with fractions of seconds, and where they end.
+_FRACTIONS = {
+    "ns": (r"nsecs?|nano_?secs?|nanoseconds?|nanos?|ns", 1e9),
+    "us": (r"usecs?|micro_?secs?|microseconds?|micros?|us", 1e6),
+    "ms": (r"msecs?|milli_?secs?|milliseconds?|millis?|ms", 1e3),
+}
 # How many cells are searched at a time for one that is not empty.
 _CELLS = 1000
 # Names of columns that count days, as in Excel and MATLAB.
@@ -95,6 +104,11 @@ _RANGES = {
     "%S": (0, 60),
 }  # fmt: skip
 _DAYS_IN_PARTS = (["%Y", "%j"], ["%Y", "%m", "%d"])
+# Names of latitudes, longitudes, x, y and speeds.
+_OF_MOTION = (
+    r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?", r"(.*_)?(x|east(ing)?)",
+    r"(.*_)?(y|north(ing)?)", r"(.*_)?(speed|sog|velocity|v)",
+)  # fmt: skip
 # Frame numbers, whose rate is not in the table.
 _FRAMES = r"(.*_)?(frame|image|img)(_?(id|no|nr|num|number|idx|index|count|counter))?"
 # The clock of all messages of ArduPilot, and that of the computer that received them.
@@ -278,16 +292,16 @@ def _of_ardupilot(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 def _check_frames(table: _Table) -> None:
     """Raise BadInput for rows of several vehicles, or with frame numbers, that have no time."""
-    frames = next((each.name for each in table.columns if re.fullmatch(_FRAMES, each.plain)), "")
+    frames = column.name if (column := column_named(table.columns, _FRAMES)) else ""
     of_several = f"several vehicles, by column {table.vehicle}" if table.vehicle else ""
     if not (frames or of_several):
         return
     whose = f', and in the table vehicle = "{table.vehicle}"' if table.vehicle else ""
     of_frames = f"column {frames} counts frames, but the frame rate is not in the file" if frames else ""
-    column = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
+    time = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
     raise BadInput(
         f"{table.path}: {of_frames or 'no column could be the time of rows of ' + of_several}; write a "
-        f"mapping yourself with time = {{ {column} }}" + " for 25 a second" * bool(frames) + whose
+        f"mapping yourself with time = {{ {time} }}" + " for 25 a second" * bool(frames) + whose
     )
 
 
@@ -697,7 +711,7 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         is_of_day = (
             np.all(known < 240_000) and np.all(whole % 100 < 60) and np.all(whole // 100 % 100 < 60)
         )
-        day = next((each for each in table.columns if re.fullmatch("(.*_)?date", each.plain)), None)
+        day = column_named(table.columns, "(.*_)?date")
         next_minute = np.any(np.diff(whole) == 41)  # from 59 to 100
         is_sure = np.ptp(known) >= 60 or next_minute or cell.startswith("0") or day is not None
         is_sure = is_sure or "utc" in column.plain.split("_") or column.unit == TIME_OF_DAY
@@ -723,23 +737,7 @@ def _clocks_of_day(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
     """Yield GPS weeks with seconds of the week, and seconds with their fractions in another column."""
-    by_plain = {column.plain: column for column in table.columns}
-    week = next(
-        (
-            by_plain[name]
-            for name in by_plain
-            if re.fullmatch(r"(gps_?|gnss_?)?(week|wn)(_?(no|nr|num|number))?|gwk", name)
-        ),
-        None,
-    )
-    tow = next(
-        (
-            by_plain[name]
-            for name in by_plain
-            if re.fullmatch(r"(gps_?)?((i_?)?tow|time_of_week|seconds_of_week|sow)|gms", name)
-        ),
-        None,
-    )
+    week, tow = (column_named(table.columns, pattern) for pattern in (_WEEKS, _SECONDS_OF_WEEK))
     if week is not None and tow is not None:
         is_ms = re.fullmatch("i_?tow|gms", tow.plain) or np.nanmax(tow.values) > 604_800
         unit = tow.unit if tow.unit in _SIZES else "ms" if is_ms else "s"
@@ -752,35 +750,19 @@ def _pairs(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
         stem = re.fullmatch(r"(.*?)_?(secs?|seconds?|s)", _full(whole))
         if not stem or not _are_whole(whole.values):
             continue
-        for pattern, unit, most in (
-            (r"nsecs?|nano_?secs?|nanoseconds?|nanos?|ns", "ns", 1e9),
-            (r"usecs?|micro_?secs?|microseconds?|micros?|us", "us", 1e6),
-            (r"msecs?|milli_?secs?|milliseconds?|millis?|ms", "ms", 1e3),
-        ):
-            part = next(
-                (
-                    each
-                    for each in table.columns
-                    if re.fullmatch(rf"{re.escape(stem[1])}_?({pattern})", _full(each))
-                    and np.nanmin(each.values) >= 0
-                    and np.nanmax(each.values) < most
-                ),
-                None,
+        for unit, (pattern, most) in _FRACTIONS.items():
+            full = re.compile(rf"{re.escape(stem[1])}_?({pattern})")
+            parts = (each for each in table.columns if full.fullmatch(_full(each)))
+            fractions = (
+                each for each in parts if np.nanmin(each.values) >= 0 and np.nanmax(each.values) < most
             )
-            if part is None:
-                continue
-            is_date = _DATES_S[0] < np.nanmedian(whole.values) < _DATES_S[1]
-            zero = {} if is_date else {"zero": UNKNOWN_ZERO}
-            given = {"column": [whole.name, part.name], "unit": ["s", unit], **zero}
-            comments = (
-                []
-                if is_date
-                else [
-                    f"{ASSUMED}{whole.name} and {part.name}: from {UNKNOWN_ZERO}, as no date is stated; "
-                    "zero"
-                ]
-            )
-            yield TimeMapping.model_validate(given), comments
+            if part := next(fractions, None):
+                is_date = _DATES_S[0] < np.nanmedian(whole.values) < _DATES_S[1]
+                zero = {} if is_date else {"zero": UNKNOWN_ZERO}
+                given = {"column": [whole.name, part.name], "unit": ["s", unit], **zero}
+                both = f"{whole.name} and {part.name}"
+                why = f"{ASSUMED}{both}: from {UNKNOWN_ZERO}, as no date is stated; zero"
+                yield TimeMapping.model_validate(given), [] if is_date else [why]
 
 
 def _full(column: GuessedColumn) -> str:
@@ -853,7 +835,7 @@ def _counted(table: _Table, column: GuessedColumn) -> Iterator[tuple[TimeMapping
 
 
 def _is_fit(table: _Table) -> bool:
-    return any(re.fullmatch("(.*_)?position_lat", column.plain) for column in table.columns)
+    return column_named(table.columns, "(.*_)?position_lat") is not None
 
 
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:
@@ -877,30 +859,23 @@ def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[s
 
 def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
     """Estimate the seconds per count of a column from the distances and speeds of rows."""
-    named: dict[str, NDArray] = {}
-    for key, pattern in (
-        ("lat", r"(.*_)?lat(itude)?"), ("lon", r"(.*_)?(lon|lng|long)(gitude)?"),
-        ("x", r"(.*_)?(x|east(ing)?)"), ("y", r"(.*_)?(y|north(ing)?)"),
-        ("speed", r"(.*_)?(speed|sog|velocity|v)"),
-    ):  # fmt: skip
-        match = next((each for each in table.columns if re.fullmatch(pattern, each.plain)), None)
-        if match is not None:
-            named[key] = np.asarray(match.values)
-    if "speed" not in named:
+    latitude, longitude, first, second, speeds = (
+        column_named(table.columns, each) for each in _OF_MOTION
+    )
+    if speeds is None:
         return None
-    if {"lat", "lon"} <= named.keys():
-        latitude, longitude = named["lat"], named["lon"]
-        if np.nanmax(np.abs(latitude)) > 90 or np.nanmax(np.abs(latitude)) < 1.6:
+    if latitude and longitude:
+        if not 1.6 <= np.nanmax(np.abs(latitude.values)) <= 90:
             return None
-        east, north = local_metres(latitude, longitude).T
-    elif {"x", "y"} <= named.keys():
-        east, north = named["x"], named["y"]
+        east, north = local_metres(latitude.values, longitude.values).T
+    elif first and second:
+        east, north = np.stack([each.values for each in (first, second)])
     else:
         return None
     known = np.isfinite(east) & np.isfinite(north) & np.isfinite(column.values)
     counts = np.abs(np.diff(np.asarray(column.values)[known]))
     moved = np.hypot(np.diff(east[known]), np.diff(north[known]))
-    speed = float(np.nanmedian(np.abs(named["speed"])))
+    speed = float(np.nanmedian(np.abs(speeds.values)))
     if not (len(counts) and speed > 0 and moved.sum() > 0 and counts.sum() > 0):
         return None
     return float(moved.sum() / counts.sum() / speed)

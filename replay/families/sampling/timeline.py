@@ -5,8 +5,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.recorders.log import Stream, schemas
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.timeline.drawing.canvas import MUTED, WRONG, Canvas, Scene, Timeline
-from fuselog.replay.timeline.drawing.plane import ROOT, Stroke, ellipses, plane_view, turn_up
+from fuselog.replay.timeline.drawing.plane import ROOT, Stroke, plane_view, turn_up
 
 PIXELS = 14.0  # radius of a sample with weight 1
 

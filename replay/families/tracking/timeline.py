@@ -33,6 +33,7 @@ from fuselog.replay.families.tracking.judging.errors import (
     track_errors,
     tracks_at,
 )
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
 from fuselog.replay.timeline.drawing.events import Happened, above_events, draw_events
@@ -42,7 +43,6 @@ from fuselog.replay.timeline.drawing.plane import (
     draw_lines,
     draw_outlines,
     draw_path,
-    ellipses,
     plane_view,
     turn_up,
     with_legend,

@@ -107,7 +107,7 @@ def axis_offset_of(size: int) -> AxisOffset:
 def moments_of(states: int, places: tuple[int, ...]) -> Moments:
     """Make `moments(weights, offsets, found, shift, spread, cross)`, which fills weighted covariances.
 
-    These are the covariances of some components of the values `found` (L, v) minus `shift` (v,) with each
+    These are covariances of some components of the values `found` (L, v) minus `shift` (v,), with each
     other and with the offsets (L, >= t).
     """
     parts = tuple(

@@ -29,6 +29,26 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
     return np.pi * chi2.ppf(probability, 2) * np.sqrt(squared)
 
 
+def ellipses(means: Array, covariances: Array, probability: float = 0.95, vertices: int = 24) -> Array:
+    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if not positive definite.
+
+    Args:
+        means, covariances: (n, 2), (n, 2, 2).
+        probability: probability of the Gaussian inside the outline.
+        vertices: number of distinct points.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, vertices + 1)
+    circle = np.sqrt(chi2.ppf(probability, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    root = np.zeros_like(covariances)
+    with np.errstate(
+        invalid="ignore", divide="ignore"
+    ):  # a Cholesky factorisation that does not raise if one matrix fails
+        root[:, 0, 0] = np.sqrt(covariances[:, 0, 0])
+        root[:, 1, 0] = covariances[:, 1, 0] / root[:, 0, 0]
+        root[:, 1, 1] = np.sqrt(covariances[:, 1, 1] - root[:, 1, 0] ** 2)
+        return means[:, None, :] + (root @ circle).transpose(0, 2, 1)
+
+
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
     """Compute the GDOP from position error, range and noise of both angles; Belfadel et al. 2014, (32).
 

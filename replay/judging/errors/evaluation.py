@@ -183,6 +183,24 @@ def chi_square_band(degrees: NDArray[np.int64]) -> tuple[Floats, Floats]:
     return low / degrees, high / degrees
 
 
+def nis_by_bin(
+    place: NDArray[np.int64], squared: Floats, degrees: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+    """Average NIS per component in bins.
+
+    Args:
+        place: (n,), the bin of each innovation.
+        squared: (n,) NIS.
+        degrees: (n,), the numbers of components.
+
+    Returns the bins with a component (m,), and for each the mean and its 95 % interval.
+    """
+    bins, place = np.unique(place, return_inverse=True)
+    count, total = (np.bincount(place, each) for each in (degrees, squared))
+    known = count > 0
+    return bins[known], total[known] / count[known], *chi_square_band(count[known])
+
+
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:

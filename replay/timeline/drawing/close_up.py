@@ -5,6 +5,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.timeline.drawing.canvas import TRUTH, Canvas, Scene, entity_path
 from fuselog.replay.timeline.drawing.plane import (
@@ -12,7 +13,6 @@ from fuselog.replay.timeline.drawing.plane import (
     Stroke,
     draw_dots,
     draw_outlines,
-    ellipses,
     plane_view,
     stroke_of,
     turn_up,

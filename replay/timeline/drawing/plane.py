@@ -14,8 +14,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
-from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.measurements import PLANE
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import Floats
 from fuselog.replay.timeline.drawing.canvas import (
     TRUTH,
@@ -35,7 +35,6 @@ from fuselog.replay.timeline.drawing.canvas import (
 ROOT = "map"
 GRID: Colour = (45, 45, 45)
 TRAIL_S = 60.0
-ELLIPSE_VERTICES = 24
 # The lines of a scan stay visible for this multiple of the usual interval between scans.
 SHOWN_INTERVALS = 1.5
 # Largest number of particles drawn; all particles of a stamp are drawn, or none. Areas are proportional
@@ -293,25 +292,6 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
     columns = rr.LineStrips2D.columns(strips=outlines[good].astype(np.float32))
     canvas.send(entity, times, columns.partition(sizes))
     canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
-
-
-def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
-    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if one is not positive definite.
-
-    Args:
-        means, covariances: (n, 2), (n, 2, 2).
-        probability: probability of the Gaussian inside the outline.
-    """
-    angle = np.linspace(0.0, 2.0 * np.pi, ELLIPSE_VERTICES + 1)
-    circle = np.sqrt(chi2.ppf(probability, 2)) * np.stack([np.cos(angle), np.sin(angle)])
-    root = np.zeros_like(covariances)
-    with np.errstate(
-        invalid="ignore", divide="ignore"
-    ):  # a Cholesky factorisation that does not raise if one matrix fails
-        root[:, 0, 0] = np.sqrt(covariances[:, 0, 0])
-        root[:, 1, 0] = covariances[:, 1, 0] / root[:, 0, 0]
-        root[:, 1, 1] = np.sqrt(covariances[:, 1, 1] - root[:, 1, 0] ** 2)
-        return means[:, None, :] + (root @ circle).transpose(0, 2, 1)
 
 
 def draw_lines(

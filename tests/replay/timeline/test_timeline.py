@@ -36,10 +36,10 @@ from fuselog.replay.engine.replaying.replaying import replay as replayed
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from fuselog.replay.judging.consistency.consistency import ellipses
 from fuselog.replay.judging.errors.evaluation import Errors, chi_square_interval
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
-from fuselog.replay.timeline.drawing.plane import ellipses
 from fuselog.replay.timeline.landmarks import GATED
 from fuselog.replay.timeline.moments import read_moments, worst_at
 from fuselog.replay.timeline.show import Drawing, show
