@@ -738,6 +738,6 @@ def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: in
     if not np.isfinite(before):
         return Sought()
     causes, tried, in_doubt = find_causes(
-        likelihood, base, hypotheses(base.bound, base, seen, likelihood.readings), most
+        likelihood, base, hypotheses(base.bind(), base, seen, likelihood.readings), most
     )
     return Sought(_over_halves(likelihood, base, causes), tried, in_doubt, before)

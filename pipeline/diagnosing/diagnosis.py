@@ -60,6 +60,7 @@ from fuselog.pipeline.runs.estimates import (
 )
 from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.pipeline.tuning.objective import for_likelihood
+from fuselog.pipeline.tuning.tuning import OPEN, gate_of
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import Stream, schemas
@@ -70,7 +71,6 @@ from fuselog.replay.foreign.naming import allowed, name_of, of_file, refuse_prog
 from fuselog.replay.judging.intervals import Interval
 
 NOTHING = "nothing found"
-OPEN = {"gate_probability": 1.0}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -260,7 +260,7 @@ def diagnose(
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
         raise silent(source.name, label, bound, settings)
-    gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
+    gate = gate_of(bound)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes, sought, end_ns = [*why], Sought(), None
     opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})

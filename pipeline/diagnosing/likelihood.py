@@ -30,8 +30,9 @@ from fuselog.pipeline.tuning.broad_starts import (
     part_count,
 )
 from fuselog.pipeline.tuning.control_noise import disturbed
+from fuselog.pipeline.tuning.objective import is_innovation
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.ensembles import Ensemble
@@ -174,7 +175,7 @@ class Likelihood:
     def _bound_to(self, trial: Trial, key: Hashable = None) -> list[Bound]:
         key = key or (_key(trial), _stated_by(trial))
         if key not in self._bound:
-            self._bound[key] = trial.bound
+            self._bound[key] = trial.bind()
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
@@ -225,11 +226,7 @@ class Likelihood:
         if not outputs and any(each is not bounds[0] for each in bounds):
             alone = zip(bounds, scored, strict=True)
             return [parts for each, own in alone for parts in self._innovations([each], [own])]
-        innovations = {
-            topic: rows
-            for topic, rows in outputs.items()
-            if rows.stream.schema.full_name == schemas.INNOVATION.full_name
-        }
+        innovations = {topic: rows for topic, rows in outputs.items() if is_innovation(rows)}
         runs = [
             {topic: rows.of_run(run) for topic, rows in innovations.items()}
             for run in range(len(sources))

@@ -15,7 +15,7 @@ from pydantic import NonNegativeInt
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.diagnosing.battery import battery
-from fuselog.pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
+from fuselog.pipeline.diagnosing.diagnosis import Diagnosis, diagnose
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.sentences import cause_of, names_of
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
@@ -23,6 +23,7 @@ from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting, Study
 from fuselog.pipeline.runs.trials import Trial
+from fuselog.pipeline.tuning.tuning import OPEN
 from fuselog.recorders.checks.finding import Kind
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameters, merge

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.pipeline.tuning.objective import innovations_in
 from fuselog.recorders.log import Stream, schemas, topics_of
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
@@ -94,11 +95,7 @@ def cases_of(
         estimated: parameters that are part of the state.
     """
     of_case = {each.case: each for each in errors}
-    innovations = {
-        split_topic(topic)[1]: rows.stream
-        for topic, rows in outputs.items()
-        if rows.stream.schema.full_name == schemas.INNOVATION.full_name and len(rows)
-    }
+    innovations = {split_topic(topic)[1]: stream for topic, stream in innovations_in(outputs)}
     found: dict[str, Case] = {}
     for topic, rows in outputs.items():
         stream = rows.stream

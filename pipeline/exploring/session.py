@@ -144,7 +144,7 @@ class Session:
         """
         begin = time.perf_counter()
         trial = self._trial(label, values)
-        bound, outputs = trial.bound, trial.outputs()
+        bound, outputs = trial.bind(), trial.outputs()
         judge = Judge(self._log, gap_limit_s=self.gap_limit_s)
         judged = judge.add(outputs)
         estimated = self.settings(label, values).get("estimate", ())

@@ -35,8 +35,7 @@ class Trial:
         """Return the first run, which is the only one unless runs are replayed together."""
         return self.runs[0]
 
-    @property
-    def bound(self) -> list[Bound]:
+    def bind(self) -> list[Bound]:
         """Bind the estimator to the runs; raises BadInput as `bind`."""
         return bind(self.label, self.runs, self.settings)
 
@@ -54,7 +53,7 @@ class Trial:
 
     def outputs(self) -> dict[str, Ragged]:
         """Replay the runs: outputs by topic; raises BadInput as `replay`."""
-        return collect(replay(self.runs, self.bound))
+        return collect(replay(self.runs, self.bind()))
 
 
 def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

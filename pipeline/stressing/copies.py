@@ -2,13 +2,15 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fuselog.pipeline.runs.ensemble import parameters_of, replay_blocks, stated_of
+from fuselog.pipeline.runs.ensemble import parameters_of, stated_of
+from fuselog.pipeline.runs.recorded import replay_in_memory
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.stressing.changes import (
     DROPPED,
     SHIFT_NS,
@@ -19,13 +21,9 @@ from fuselog.pipeline.stressing.verdicts import MARGIN, Tried
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, Stream, schemas
 from fuselog.recorders.parameters import merge
-from fuselog.replay.engine.replaying.estimator import Bound, bind
 from fuselog.replay.engine.replaying.late import Late
-from fuselog.replay.engine.replaying.replaying import Report, collect
 from fuselog.replay.engine.streams.blocks import Ragged
-from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.failures import sentences_of
-from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.judge import Judge
 
 
@@ -49,14 +47,12 @@ class How(NamedTuple):
 class Replayed:
     """Runs and copies that one estimator has replayed.
 
-    sources: the runs and copies.
-    bound: the estimator.
+    trial: the estimator, the runs and the copies.
     outputs: its outputs, by topic.
     how: how they were replayed.
     """
 
-    sources: Ensemble[MemorySource]
-    bound: Sequence[Bound]
+    trial: Trial
     outputs: Mapping[str, Ragged]
     how: How
 
@@ -79,13 +75,13 @@ class Replayed:
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 own = rows.of_run(run)
                 if len(own):
-                    at_s = (int(own.publish_time_ns[0]) - self.sources[run].epoch_ns) * 1e-9
+                    at_s = (int(own.publish_time_ns[0]) - self.trial.runs[run].epoch_ns) * 1e-9
                     return f"at {at_s:.3f} s: {sentences_of(own)[0]}"
         return ""
 
     @cached_property
     def _metrics(self) -> Mapping[int, Mapping[tuple[str, str], float]]:
-        judge = Judge(self.sources, {}, gap_limit_s=self.how.gap_limit_s)
+        judge = Judge(self.trial.runs, {}, gap_limit_s=self.how.gap_limit_s)
         judge.add(self.outputs)
         found: dict[int, dict[tuple[str, str], float]] = defaultdict(dict)
         for row in judge.runs_table.to_dict("records"):
@@ -101,20 +97,10 @@ class Replayed:
         return self._metrics.get(run, {})
 
 
-def replayed(
-    sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
-) -> Replayed:
-    """Replay runs with one estimator.
-
-    Raises BadInput if the estimator can replay no run.
-    """
-    ensemble = Ensemble(sources)
-    bound, report = bind(label, ensemble, settings), Report()
-    blocks = replay_blocks(ensemble, bound, report, order=how.order, late=how.late)
-    outputs = collect(list(block.values()) for block in blocks)
-    for refusal in report.refused.values():
-        raise refusal
-    return Replayed(ensemble, bound, outputs, how)
+def replayed(trial: Trial, how: How) -> Replayed:
+    """Replay runs with one estimator; raise BadInput if it can replay no run."""
+    settings = {trial.label: trial.settings}
+    return Replayed(trial, replay_in_memory(trial.runs, settings, order=how.order, late=how.late), how)
 
 
 def compared(
@@ -174,10 +160,10 @@ def _main(quantities: Sequence[str]) -> str:
     return next(iter([*main, *errors]), "")
 
 
-def _parameters(done: Replayed, label: str) -> dict[str, Any]:
+def _parameters(trial: Trial) -> dict[str, Any]:
     """Return all parameters of an estimator: its own, and those that a single channel contains."""
-    stated = {}
-    for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
+    bound, stated = trial.bind(), {}
+    for name, words in stated_of(bound, trial.source).get(trial.label, {}).items():
         number, _, topics = words.partition(" (")
         if "(" in topics:  # channels with different values
             continue
@@ -185,26 +171,24 @@ def _parameters(done: Replayed, label: str) -> dict[str, Any]:
             stated[name] = float(number)
         except ValueError:
             continue
-    return stated | parameters_of(done.bound).get(label, {})
+    return stated | parameters_of(bound).get(trial.label, {})
 
 
-def with_parameters(
-    done: Replayed,
-    sources: Sequence[MemorySource],
-    label: str,
-    settings: Mapping[str, Any],
-    size: float,
-) -> Replayed | str:
+def with_parameters(trial: Trial, how: How, size: float) -> Replayed | str:
     """Replay runs with changed parameters; return the reason if this is not possible."""
-    known = _parameters(done, label)
-    changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
+    known = _parameters(trial)
+    changed = parameters_changed(known, size, np.random.default_rng(how.seed))
     changed = {name: value for name, value in changed.items() if value != known[name]}
     if not changed:
         return "all numeric parameters are zero"
     refused = ""
+
+    def having(values: Mapping[str, Any]) -> Trial:
+        return replace(trial, settings=merge(trial.settings, values))
+
     for name in [*changed]:
         try:
-            bind(label, sources, merge(settings, {name: changed[name]}))
+            having({name: changed[name]}).bind()
         # for example, a setting that the method fixes and does not use
         except BadInput as error:
             refused = str(error)
@@ -212,6 +196,6 @@ def with_parameters(
     if not changed:
         return refused
     try:
-        return replayed(sources, label, merge(settings, changed), done.how)
+        return replayed(having(changed), how)
     except BadInput as error:
         return str(error)

@@ -5,6 +5,7 @@ Runs with the same topics are replayed together with all their copies in one pas
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,18 @@ from fuselog.pipeline.altering.sources import split_settings
 from fuselog.pipeline.api.planning import Log, Named, settings_of, sources_of
 from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Settings
 from fuselog.pipeline.runs.settings import with_settings
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.stressing.changes import (
     CHANGES,
     PARAMETERS,
     Inputs,
     inputs_of,
 )
-from fuselog.pipeline.stressing.copies import How, compared, replayed, with_parameters
+from fuselog.pipeline.stressing.copies import How, Replayed, compared, replayed, with_parameters
 from fuselog.pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive
+from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource, in_memory
 from fuselog.replay.foreign.naming import allowed
 
@@ -108,8 +111,9 @@ def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -
 def _stressed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> list[Stressed]:
-    """Stress runs with the same topics, with all copies, changed parameters, and halved changes."""
-    bound = bind(label, sources, settings)
+    """Stress runs with the same topics: replay all copies, changed parameters, and halved changes."""
+    trial = Trial(label, Ensemble(sources), settings)
+    bound = trial.bind()
     controls = [
         topic
         for each in bound
@@ -127,6 +131,9 @@ def _stressed(
             made.append(change(sources[run], inputs[run], size, how.seed))
         return made
 
+    def again(sources: Sequence[MemorySource]) -> Replayed:
+        return replayed(replace(trial, runs=Ensemble(sources)), how)
+
     whole = [
         (run, name)
         for run, own in enumerate(inputs)
@@ -135,20 +142,20 @@ def _stressed(
     ]
     refused: dict[str, str] = {}
     try:
-        done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+        done = again([*sources, *copies(whole, 1.0)])
     except BadInput:
-        replayed(sources, label, settings, how)  # raises if the copy is not the cause of the fault
+        again(sources)  # raises if the fault is not that of a copy
         for name in CHANGES:
             own = [what for what in whole if what[1] == name]
             try:
-                replayed([*sources, *copies(own, 1.0)], label, settings, how)
+                again([*sources, *copies(own, 1.0)])
             except BadInput as error:
                 refused[name] = str(error)
         whole = [what for what in whole if what[1] not in refused]
-        done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+        done = again([*sources, *copies(whole, 1.0)])
     rows = {what: len(sources) + place for place, what in enumerate(whole)}
     base = [done.estimates(run) for run in range(len(sources))]
-    other = with_parameters(done, sources, label, settings, 1.0)
+    other = with_parameters(trial, how, 1.0)
 
     def tried(run: int, name: str) -> Tried:
         if name == PARAMETERS:
@@ -166,12 +173,13 @@ def _stressed(
         """Try smaller versions of these changes of these runs."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
-            again = replayed(copies(own, size), label, settings, how)
+            lesser = again(copies(own, size))
             for row, (run, name) in enumerate(own):
-                less[run, name] = compared(name, done, run, again, row, base[run])
+                less[run, name] = compared(name, done, run, lesser, row, base[run])
         runs = [run for run, name in of if name == PARAMETERS]
         if runs:
-            changed = with_parameters(done, [sources[run] for run in runs], label, settings, size)
+            of_runs = replace(trial, runs=Ensemble(sources[run] for run in runs))
+            changed = with_parameters(of_runs, how, size)
             for row, run in enumerate([] if isinstance(changed, str) else runs):
                 assert not isinstance(changed, str)
                 less[run, PARAMETERS] = compared(PARAMETERS, done, run, changed, row, base[run])

@@ -417,7 +417,7 @@ class Objective:
         return run._replace(begun=begun, starts=starts, parts=parts)
 
     def _bound(self, values: Floats, run: Run) -> list[Bound]:
-        return run.trial.with_settings(dict(zip(self.names, values.tolist(), strict=True))).bound
+        return run.trial.with_settings(dict(zip(self.names, values.tolist(), strict=True))).bind()
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """Replay a log with values (k,): outputs by topic. Raise BadInput as `replay` does."""

@@ -13,6 +13,7 @@ import fuselog as fl
 from fuselog.pipeline.output.alarms import NOT_TESTED, Stressing
 from fuselog.pipeline.output.report.kinds import opening
 from fuselog.pipeline.output.results import RUNS, Result, read_result, read_table
+from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.stressing import copies, stressing
 from fuselog.pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
 from fuselog.pipeline.stressing.experiments import stress_result
@@ -460,9 +461,9 @@ def test_runs_and_their_copies_are_replayed_together(monkeypatch: Any) -> None:
     sizes: list[int] = []
     replayed = stressing.replayed
 
-    def counted(sources: Sequence[Any], *rest: Any) -> Any:
-        sizes.append(len(sources))
-        return replayed(sources, *rest)
+    def counted(trial: Trial, *rest: Any) -> Any:
+        sizes.append(len(trial.runs))
+        return replayed(trial, *rest)
 
     monkeypatch.setattr(stressing, "replayed", counted)
     monkeypatch.setattr(copies, "replayed", counted)
@@ -492,8 +493,8 @@ def test_a_copy_that_is_refused_is_not_tried(monkeypatch: Any) -> None:
 def test_parameters_that_channels_state_differently_stay(monkeypatch: Any) -> None:
     stated = {"ekf": {"one": "0.1 (/a)", "two": "0.1 (/a), 0.2 (/b)", "word": "yes (/a)"}}
     monkeypatch.setattr(copies, "stated_of", lambda *_: stated)
-    done = SimpleNamespace(bound=(), sources=[None])
-    assert copies._parameters(done, "ekf") == {"one": 0.1}
+    trial: Any = SimpleNamespace(bind=list, source=None, label="ekf")
+    assert copies._parameters(trial) == {"one": 0.1}
 
 
 def test_pages_withhold_what_stress_moves_further() -> None:
@@ -614,10 +615,8 @@ def test_errors_over_longer_gaps_of_the_truth_do_not_count() -> None:
     log = fl.record("landmarks", seed=2, duration_s=3.0)
     truth = log.streams["/robot1/truth"]
     sparse = replace(log, streams={**log.streams, truth.topic: truth.take(slice(None, None, 3))})
-    errors = [
-        copies.replayed([sparse], "ekf", {"kind": "ekf"}, copies.How(gap_limit_s=gap_s)).metrics(0)
-        for gap_s in (0.2, 0.001)
-    ]
+    trial = Trial("ekf", [sparse], {})
+    errors = [copies.replayed(trial, copies.How(gap_limit_s=gap_s)).metrics(0) for gap_s in (0.2, 0.001)]
     near, none = (each.get(("robot1", "position_rmse_m")) for each in errors)
     assert near is not None
     assert none != near
