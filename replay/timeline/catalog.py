@@ -14,7 +14,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint.table as rrt
 import rerun.chunk as rc
-from rerun.catalog import DatasetEntry, OnDuplicateSegmentLayer
+from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
 from rerun.server import Server
 
 from fuselog.recorders.errors import BadInput
@@ -37,13 +37,14 @@ class Dataset:
     """A dataset in a running server.
 
     Args:
-        entry: the dataset in the catalog.
-        url: address of the server.
+        client: a client of the server.
+        name: the dataset's name.
     """
 
-    def __init__(self, entry: DatasetEntry, url: str) -> None:
-        self._entry = entry
-        self.url = f"{url}/dataset/{entry.id}"
+    def __init__(self, client: CatalogClient, name: str) -> None:
+        self._client = client  # tables that are read need it
+        self._entry = client.create_dataset(name)
+        self.url = f"{client.url}/dataset/{self._entry.id}"
 
     def add(self, layers: Sequence[tuple[Path, str]]) -> None:
         """Register files as layers, each with its name; a file states its segment itself.
@@ -93,7 +94,7 @@ def serve_dataset(name: str, port: int | None = None) -> Iterator[Dataset]:
             client = server.client()
         except ImportError:
             raise BadInput(EXTRA) from None
-        yield Dataset(client.create_dataset(name), server.url())
+        yield Dataset(client, name)
 
 
 def column_of(group: str, name: str) -> str:

@@ -47,13 +47,14 @@ def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
     from rerun.server import Server
 
     server = Server(host="127.0.0.1", datasets={"all": folder})
-    entry = server.client().get_dataset("all")
+    client = server.client()
+    entry = client.get_dataset("all")
     table = entry.segment_table().to_pandas().set_index("rerun_segment_id").sort_index()
-    return (server, entry), table
+    return (server, client, entry), table
 
 
 def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
-    (server, entry), table = read_back(dataset)
+    (server, _client, entry), table = read_back(dataset)
     rows = read_table(result / segments.RUNS)
     assert list(table.index) == [f"run-{run:04d}" for run in range(RUNS)]
     assert [each[0] for each in table["property:run:run"]] == [*range(RUNS)]
@@ -134,7 +135,7 @@ def test_two_versions_of_an_estimator_are_in_one_scene(
     assert fuselog("replay", log, "-e", "ekf", "--set", "sigma_range_m=0.3", "-o", new).code == 0
     said = fuselog("view", log.parent, "--save", tmp_path / "set")
     assert said.code == 0, said.err
-    (server, _), table = read_back(tmp_path / "set")
+    (server, *_), table = read_back(tmp_path / "set")
     server.shutdown()
     old, other = (table[f"property:{name}:position_rmse_m"]["run"][0] for name in ("ekf", "ekf_new"))
     assert old != other
@@ -203,3 +204,18 @@ def test_without_the_extra_the_first_run_is_shown(
     assert said.code == 0
     assert shown == [result / "timeline.rrd"]
     assert "needs the extra catalog" in said.err
+
+
+def test_a_report_has_the_command_that_opens_the_worst_run(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """Its run is that of the table, and `view` opens it."""
+    page = tmp_path / "page.html"
+    assert fuselog("report", result, "-o", page).code == 0
+    rows = read_table(result / segments.RUNS).query("estimator == 'ekf'").set_index("run")
+    worst = rows["position_rmse_m"].idxmax()
+    command = f"fuselog view {result} --runs {worst} --at worst:ekf"
+    assert f'<code>{command}</code> <button type="button" class="copy">' in page.read_text()
+    runs = runs_in(result, 0.2)
+    assert runs is not None
+    assert [each.name for each in runs.chosen(str(worst))] == [f"run-{worst:04d}"]
