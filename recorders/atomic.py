@@ -51,7 +51,7 @@ def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
     Raises BadInput if the file cannot be written.
     """
     named, place = place, settled(place) if parents else place
-    _clear_leftovers(place)
+    clear_leftovers(place)
     with parents_of(named, make=parents), _working_folder(place) as work, _telling(place, work):
         new = work / (_NEW + place.suffix)
         yield new
@@ -70,7 +70,7 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
     Raises BadInput if the folder cannot be written, or another process is writing it.
     """
     named, place = place, settled(place)
-    if _clear_leftovers(place):
+    if clear_leftovers(place):
         raise BadInput(
             f"{place}: another fuselog command is writing it; wait until it ends, or give another --out"
         )
@@ -93,7 +93,7 @@ def scratch_folder(name: str) -> Iterator[Path]:
     Raises BadInput if the folder cannot be created.
     """
     place = Path(tempfile.gettempdir()) / name
-    _clear_leftovers(place)
+    clear_leftovers(place)
     with _working_folder(place) as work:
         new = work / _NEW
         new.mkdir(mode=0o700)
@@ -110,27 +110,7 @@ def _working_folder(place: Path) -> Iterator[Path]:
         _remove(work, place, lock)
 
 
-def is_being_written(file: Path) -> bool:
-    """Test whether a file is in a working folder, as a partial output or the lock."""
-    return any(
-        each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
-        for each in file.parents
-    )
-
-
-def _make(place: Path) -> tuple[Path, FileLock]:
-    """Create a working folder and lock it."""
-    while True:
-        work = Path(tempfile.mkdtemp(".part", f".{place.name}.", place.parent))
-        lock = FileLock(work / _LOCK, timeout=0)
-        try:
-            lock.acquire()
-        except (Timeout, FileNotFoundError, FileExistsError):
-            continue  # removed as a leftover before it was locked; filelock may recreate the folder
-        return work, lock
-
-
-def _clear_leftovers(place: Path) -> bool:
+def clear_leftovers(place: Path) -> bool:
     """Remove leftovers of killed writers of a destination; return whether a writer is active."""
     at_work = False
     for work in place.parent.glob(f".{escape(place.name)}.*.part"):
@@ -152,6 +132,26 @@ def _clear_leftovers(place: Path) -> bool:
         with suppress(FileNotFoundError):  # its creator, which has just released the lock, was faster
             _remove(work, place, lock)
     return at_work
+
+
+def is_being_written(file: Path) -> bool:
+    """Test whether a file is in a working folder, as a partial output or the lock."""
+    return any(
+        each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
+        for each in file.parents
+    )
+
+
+def _make(place: Path) -> tuple[Path, FileLock]:
+    """Create a working folder and lock it."""
+    while True:
+        work = Path(tempfile.mkdtemp(".part", f".{place.name}.", place.parent))
+        lock = FileLock(work / _LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except (Timeout, FileNotFoundError, FileExistsError):
+            continue  # removed as a leftover before it was locked; filelock may recreate the folder
+        return work, lock
 
 
 def _is_ours(work: Path) -> bool:

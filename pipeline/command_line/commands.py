@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.api.planning import plan_replay
@@ -25,6 +25,7 @@ from fuselog.pipeline.output.outputs import (
     run_written,
 )
 from fuselog.pipeline.output.results import (
+    RESULT_FILE,
     in_order,
     plain,
     split_metric,
@@ -52,9 +53,12 @@ from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, Mirrors, open_log
 from fuselog.replay.engine.streams.linting import lint_source, worst
-from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.judging.judge import Judge
+
+if TYPE_CHECKING:
+    from fuselog.pipeline.presenting.segments import Runs, Segment
 
 MOST_LOGS = 5  # number of logs whose findings are printed
 
@@ -343,8 +347,10 @@ def _worst(moment: Moment, run: str = "") -> str:
 
 
 def view_path(
-    path: Path,
+    paths: Sequence[Path],
     *,
+    runs: str | None,
+    port: int | None,
     screenshot: Path | None,
     at: float | str | None,
     start_s: float | None,
@@ -356,7 +362,89 @@ def view_path(
     gap_limit_s: float,
     recover: bool,
 ) -> None:
-    """Open a path in the viewer, take a screenshot of it, or write or stream its timeline."""
+    """Open a path in the viewer, take a screenshot of it, or write or stream its timeline.
+
+    Several runs are shown as a dataset, unless the options are about one run.
+    """
+    of_one = [at, start_s, end_s, focus, connect]
+    is_timeline = any(each is not None for each in of_one) or (save and save.suffix == ".rrd")
+    path, segment = paths[0], None
+    is_asked = runs is not None or len(paths) > 1 or port is not None
+    is_shown_first = is_timeline or screenshot is not None
+    if is_asked or (path.is_dir() and not (is_shown_first and (path / RESULT_FILE).is_file())):
+        found = _runs_of(paths, gap_limit_s, is_asked=is_asked)
+        chosen = [] if found is None else found.chosen(runs or "worst")
+        if found is not None and not (is_timeline or (screenshot and len(chosen) == 1)):
+            from fuselog.pipeline.presenting.command import save_dataset, show_dataset
+
+            if save is not None:
+                save_dataset(found, chosen, save)
+            else:
+                show_dataset(found, chosen, port=port, web=web, picture=screenshot)
+            return
+        if found is not None and len(chosen) != 1:
+            raise BadInput(
+                f"{path}: --at, --start, --end, --focus, --connect and --save FILE.rrd are about one "
+                "run; choose it with --runs NUMBER"
+            )
+        segment, gap_limit_s = (chosen[0], found.gap_limit_s) if found else (None, gap_limit_s)
+    _view_one(
+        path,
+        segment,
+        screenshot=screenshot,
+        at=at,
+        span=(start_s, end_s),
+        focus=focus,
+        save=save,
+        connect=connect,
+        web=web,
+        gap_limit_s=gap_limit_s,
+        recover=recover,
+    )
+
+
+def _runs_of(paths: Sequence[Path], gap_limit_s: float, *, is_asked: bool) -> "Runs | None":
+    """Return the runs of results or folders; None if there is only a timeline to show.
+
+    Raises BadInput if several runs are requested and there are none.
+    """
+    from fuselog.pipeline.presenting.segments import runs_in, together
+    from fuselog.replay.timeline.catalog import EXTRA, has_catalog
+
+    given = [runs_in(path, gap_limit_s) for path in paths]
+    found = [each for each in given if each is not None]
+    if len(found) < len(paths):
+        if is_asked:
+            without = paths[given.index(None)]
+            raise BadInput(
+                f"{without}: has no row for each run; give a result of fuselog run or sweep, or a "
+                "folder of logs, or leave out --runs and --port"
+            )
+        return None
+    if not is_asked and (paths[0] / RESULT_FILE).is_file():
+        if len(found[0].segments) < 2:
+            return None
+        if not has_catalog():
+            warn(f"{EXTRA}; showing the first run")
+            return None
+    return together(found)
+
+
+def _view_one(
+    path: Path,
+    segment: "Segment | None",
+    *,
+    screenshot: Path | None,
+    at: float | str | None,
+    span: tuple[float | None, float | None],
+    focus: str | None,
+    save: Path | None,
+    connect: str | None,
+    web: bool,
+    gap_limit_s: float,
+    recover: bool,
+) -> None:
+    """Show, write or stream the timeline of a log, a result or one of its runs (`segment`)."""
     from fuselog.replay.timeline import viewer
     from fuselog.replay.timeline.moments import read_moments, worst_at
 
@@ -371,15 +459,22 @@ def view_path(
     outputs = [(save, TIMELINE), (screenshot, PICTURE)]
     check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
     with scratch_folder("fuselog-view") as folder:
-        if rrd.suffix != ".rrd":
+        if segment is not None or rrd.suffix != ".rrd":
             rrd = save or folder / "timeline.rrd"
-            span = (start_s, end_s)
             with status() as told:
                 told("drawing the timeline")
-                _draw_log(path, rrd, connect, focus, at, span, gap_limit_s, recover=recover)
-        elif any(given is not None for given in (start_s, end_s, focus, connect)):
+                if segment is not None:
+                    source, estimates, _ = segment.load()
+                    name = f"{path} {segment.name}"
+                    judged: Sequence[LogSource | MemorySource] = [estimates] if estimates.topics else []
+                else:
+                    name = str(path)
+                    source, judged = _read_log(path, recover=recover)
+                _draw(source, judged, name, rrd, connect, focus, at, span, gap_limit_s)
+        elif any(given is not None for given in (*span, focus, connect)):
             raise BadInput(
-                f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log"
+                f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log, "
+                "or one run with --runs NUMBER"
             )
         elif save is not None:
             _copy_timeline(rrd, save)
@@ -408,20 +503,8 @@ def _copy_timeline(rrd: Path, save: Path) -> None:
         shutil.copyfile(rrd, new)
 
 
-def _draw_log(
-    path: Path,
-    rrd: Path,
-    connect: str | None,
-    focus: str | None,
-    at: float | str | None,
-    span: tuple[float | None, float | None],
-    gap_limit_s: float,
-    *,
-    recover: bool,
-) -> None:
-    """Draw a span of a log in seconds, or of an estimates log together with its source log."""
-    from fuselog.replay.timeline.show import Drawing
-
+def _read_log(path: Path, *, recover: bool) -> tuple[LogSource, list[LogSource]]:
+    """Open a log, or an estimates log together with its source log; return the run and its estimates."""
     log = open_log(path, recover=recover)
     estimates = source = LogSource(log)
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
@@ -429,16 +512,32 @@ def _draw_log(
         source = source_of_estimates(log, recover=recover)
     elif not is_estimates:
         source = alter(source, {})  # draws a log with several local tangent planes in one of them
+    _state_losses([log, source.log])
+    return source, [estimates] if is_estimates else []
+
+
+def _draw(
+    source: LogSource | MemorySource,
+    estimates: Sequence[LogSource | MemorySource],
+    name: str,
+    rrd: Path,
+    connect: str | None,
+    focus: str | None,
+    at: float | str | None,
+    span: tuple[float | None, float | None],
+    gap_limit_s: float,
+) -> None:
+    """Draw a span of a run in seconds, with its estimates if there are any."""
+    from fuselog.replay.timeline.show import Drawing
+
     shown = span_of(source, *span, "publish_time")
-    identity = f"{path} {span}"
     worst = at if isinstance(at, str) else None
-    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect, at=worst) as drawing:
-        judged = [replace(estimates, start_ns=shown.start_ns, end_ns=shown.end_ns)]
-        judge = judge_logs(
-            judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
-        )
+    with Drawing(
+        shown, identity=f"{name} {span}", focus=focus, save=rrd, connect=connect, at=worst
+    ) as drawing:
+        judged = [replace(each, start_ns=shown.start_ns, end_ns=shown.end_ns) for each in estimates]
+        judge = judge_logs(judged, [source], {}, gap_limit_s=gap_limit_s, drawing=drawing)
     for sentence in judge.components_without_truth:
         warn(sentence)
     for topic in source.rejections:
         say(f"{topic}: {source.rejections.sentence(topic)}")
-    _state_losses([log, source.log])

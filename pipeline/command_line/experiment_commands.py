@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from fuselog.pipeline.api.api import run, sweep
@@ -114,6 +115,8 @@ def run_named(
     if not result.stress and result.settings.get("estimators"):
         say(NOT_TESTED)
     say(f"{done.folder}: {', '.join(result.contents)}")
+    if table is not None and result.settings.get("runs", 1) > 1:
+        say(f"to see the worst runs: fuselog view {quote(str(done.folder))}")
     say_next("report", str(done.folder))
 
 
@@ -197,4 +200,5 @@ def sweep_named(
     ]
     print_table([*points[0], *shown], rows)
     say(f"{done.folder}: a table of all metrics, figures, result.json")
+    say(f"to see the worst runs: fuselog view {quote(str(done.folder))}")
     say_next("report", str(done.folder))

@@ -44,6 +44,7 @@ EXAMPLES = {
     "--origin": "48.137,11.575,520",
     "--out": "out/mine",
     "--over": "ekf.sigma_range_m=0.05:0.8:log9",
+    "--port": "51234",
     "--run": "3",
     "--runs": "20",
     "--samples": "64",
@@ -87,6 +88,7 @@ EXAMPLES = {
     "calibrate --set": "lever_x_m=1.1",
     "calibrate --bound": "lever_x_m=-2:2",
     "noise --topic": "/imu",
+    "view --runs": "worst:50",
     "relabel --topic": "/robot1/=/left/",
 }
 

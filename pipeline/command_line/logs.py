@@ -12,7 +12,7 @@ from fuselog.pipeline.command_line.options import (
     LOG_OR_FOLDER,
     PICTURE,
     RESULT,
-    TIMELINE,
+    TIMELINE_OR_FOLDER,
     Instant,
     Seconds,
     gap_option,
@@ -148,9 +148,20 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     "fuselog view est.mcap",
     "fuselog view run.mcap --start 10 --end 20",
     "fuselog view est.mcap --at worst:ekf",
-    "fuselog view out/landmarks --screenshot picture.png --at 30",
+    "fuselog view out/landmarks --runs worst:50",
+    "fuselog view out/landmarks --runs 731 --screenshot picture.png --at 30",
 )
-@click.argument("path", type=ANY_PATH)
+@click.argument("paths", nargs=-1, required=True, type=ANY_PATH)
+@click.option(
+    "--runs",
+    metavar="worst:N|all|RUN,...",
+    help="The runs to draw; the table lists all of them [default: worst:20].",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(1, 65535),
+    help="Port of the server of the dataset [default: any free].",
+)
 @click.option(
     "--screenshot", type=PICTURE, help="Save a screenshot of the viewer as PNG, without a window."
 )
@@ -163,7 +174,12 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 )
 @click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run.")
 @click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
-@click.option("--save", type=TIMELINE, help="Write the timeline to this .rrd instead of opening it.")
+@click.option(
+    "--save",
+    type=TIMELINE_OR_FOLDER,
+    help="Write the timeline to this .rrd, or the dataset of several runs to this folder, instead of "
+    "opening it.",
+)
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option(
     "--web", is_flag=True, help="Serve the timeline to a browser on this machine until Ctrl-C."
@@ -171,22 +187,28 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
 @click.option("--focus", help="Entity to show first, for example robot3.")
 @recover_option
 @gap_option
-def view(path: Path, **options: Any) -> None:
-    """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
+def view(paths: tuple[Path, ...], **options: Any) -> None:
+    """Open PATHS in the Rerun viewer: a log, an estimates log, a result, an .rrd, or a folder of logs.
+
+    Results with several runs and folders of logs open as a sortable table of runs, the worst first.
+    Several results of the same runs are shown together, each with its own colours.
+    """
     from fuselog.pipeline.command_line.commands import view_path
 
-    view_path(path, **options)
-    _say_next_of_view(path, recover=options["recover"])
+    view_path(paths, **options)
+    _say_next_of_view(paths[0], recover=options["recover"])
 
 
 def _say_next_of_view(path: Path, *, recover: bool) -> None:
     """Suggest the next command after a result, a log or an estimates log was viewed."""
+    from fuselog.pipeline.output import RESULT_FILE
     from fuselog.pipeline.output.terminal import say_next
     from fuselog.pipeline.runs.inputs import shipped
     from fuselog.recorders.log import open_log
 
     if path.is_dir():
-        say_next("report", str(path))
+        if (path / RESULT_FILE).is_file():
+            say_next("report", str(path))
     elif path.suffix != ".rrd":
         log = open_log(path, recover=recover)
         if not any(topic.startswith("/estimates/") for topic in log.topics):

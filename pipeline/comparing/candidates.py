@@ -17,22 +17,20 @@ import pandas as pd
 from fuselog.pipeline.api.replays import Replay, replay
 from fuselog.pipeline.comparing.renamed import Renamed
 from fuselog.pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
-from fuselog.pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
+from fuselog.pipeline.output.results import Result, read_result, read_table, split_metric
 from fuselog.pipeline.runs.ensemble import Progress, judge_logs, parts_of
 from fuselog.pipeline.runs.estimates import labels_of, source_of_estimates, stated_estimators
-from fuselog.pipeline.runs.experiment import Experiment, Setting
 from fuselog.pipeline.runs.initial_states import check_same_run
 from fuselog.pipeline.runs.inputs import load_scenario
-from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.runs.runner import NO_REPLAY, runner_again
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
-from fuselog.recorders.parameters import build, flat
+from fuselog.recorders.parameters import flat
 from fuselog.recorders.trajectories import read_trajectory
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
 from fuselog.replay.engine.replaying.usage import Row
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
-from fuselog.replay.foreign.naming import of_file
 from fuselog.replay.judging.errors.evaluation import POSITION
 from fuselog.replay.judging.errors.trajectory_streams import estimates_of
 from fuselog.replay.judging.errors.truths import Doubt
@@ -321,20 +319,10 @@ def _stored(
 def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate) -> Candidate:
     """Replay the runs of a result in batches, and compare them with the truth again."""
     label = kept.label
-    if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
-        raise BadInput("its settings are not sufficient for a replay; estimates logs can be compared")
-    fields = {each.alias or name for name, each in Experiment.model_fields.items()}
-    entries = {key: value for key, value in result.settings.items() if key in fields}
-    entries["estimators"] = of_file(entries["estimators"])
-    if "record" not in entries:  # the recorded data determine the number of runs
-        entries = {key: value for key, value in entries.items() if key not in ("runs", "seed")}
-    experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")
-    experiment = experiment.model_copy(update={"runs": len(experiment.files) or experiment.runs})
-    data = result.settings.get("data")
-    setting = Setting(folder, folder, data=Path(data) if data else None)
-    if experiment.import_ and setting.data is None:
-        raise BadInput("its settings do not contain the folder of its data")
-    runner = Runner(experiment, setting)
+    runner = runner_again(folder, result)
+    experiment = runner.experiment
+    if label not in experiment.estimators:
+        raise BadInput(NO_REPLAY)
     parts: list[Candidate] = []
     chosen = {label: experiment.estimators[label]}
     for now in progress(list(parts_of(experiment.runs)), f"replaying {label} of {folder}", None):

@@ -25,7 +25,7 @@ def show_result(folder: Path, *, as_json: bool) -> None:
     rows = [[name, count] for name, count in counts.items() if name != RESULT_FILE]
     print_table(["content", "files"], rows)
     shown = [f"fuselog report {quote(str(folder))}"]
-    if (folder / "timeline.rrd").is_file():
+    if (folder / "timeline.rrd").is_file() or "sweep" in result.settings:
         shown.append(f"fuselog view {quote(str(folder))}")
     say(f"To view it: {', '.join(shown)}; to process it further: fuselog compare, check")
 

@@ -41,6 +41,8 @@ def summarise(
         outcome.tables["steps"] = pd.concat(steps)
         outcome.tables["runs"] = judge.runs_table
         outcome.tables["times"] = judge.times
+    if judge.failed_runs:
+        outcome.tables["failures"] = pd.DataFrame(judge.failed_runs, columns=["run", "failure"])
     over_time = {"modes": judge.modes, "effective": judge.effective, "late-times": judge.late}
     outcome.tables |= {name: table for name, table in over_time.items() if len(table)}
     if len(judge.late):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fuselog.pipeline.altering.sources import alter_all
+from fuselog.pipeline.output.results import RESULT_FILE, Result
 from fuselog.pipeline.runs.ensemble import Pass, RunGroup, Settings, estimates_metadata, replay_parts
 from fuselog.pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
 from fuselog.pipeline.runs.experiment import Experiment, Setting
@@ -19,11 +20,14 @@ from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import LogWriter, open_log
-from fuselog.recorders.parameters import merge
+from fuselog.recorders.parameters import build, merge
 from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory, memory_source
+from fuselog.replay.foreign.naming import of_file
 from fuselog.replay.judging.judge import Judge
+
+NO_REPLAY = "its settings are not sufficient for a replay; estimates logs can be compared"
 
 
 @dataclass(frozen=True)
@@ -191,6 +195,27 @@ class Runner:
         """Return the paths of a run's log and estimates."""
         name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
         return place / "logs" / name, place / "estimates" / name
+
+
+def runner_again(folder: Path, result: Result) -> Runner:
+    """Make the runner of a result from its settings, to replay its runs again.
+
+    Raises BadInput if they do not state the runs and the estimators.
+    """
+    if not result.settings.get("estimators") or "study" not in result.settings:
+        raise BadInput(NO_REPLAY)
+    fields = {each.alias or name for name, each in Experiment.model_fields.items()}
+    entries = {key: value for key, value in result.settings.items() if key in fields}
+    entries["estimators"] = of_file(entries["estimators"])
+    if "record" not in entries:  # the recorded data determine the number of runs
+        entries = {key: value for key, value in entries.items() if key not in ("runs", "seed")}
+    experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")
+    experiment = experiment.model_copy(update={"runs": len(experiment.files) or experiment.runs})
+    data = result.settings.get("data")
+    setting = Setting(folder, folder, data=Path(data) if data else None)
+    if experiment.import_ and setting.data is None:
+        raise BadInput("its settings do not contain the folder of its data")
+    return Runner(experiment, setting)
 
 
 def _write_log(source: MemorySource, path: Path) -> None:

@@ -1,7 +1,7 @@
 """Diagnostics of a replay: failures, skipped messages, assumed values, and spans without estimates."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -92,23 +92,23 @@ class Diagnostics:
         for topic, found in other._topics.items():
             self._topics.setdefault(topic, StreamDiagnostics()).merge(found)
 
-    def failures(self, names: Mapping[int, str]) -> list[str]:
-        """Return a sentence for every run that an estimator did not process, or not to the end.
+    def failures(self, runs: Iterable[int]) -> list[tuple[int, str]]:
+        """Return the number and a sentence for each run that an estimator did not process completely.
 
         Args:
-            names: names of all runs, by number.
+            runs: the numbers of all runs.
         """
         sentences: dict[tuple[str, int], str] = {}
         for topic, found in self._topics.items():
             without: Iterable[int] = (
-                [] if found.with_estimates is None else sorted(names.keys() - found.with_estimates)
+                [] if found.with_estimates is None else sorted({*runs} - found.with_estimates)
             )
             sentences |= {
                 (name_of(topic), run): f"{name_of(topic)} gave no estimates" for run in without
             }
         for topic, found in self._topics.items():
             sentences |= {(name_of(topic), run): sentence for run, sentence in found.failed.items()}
-        return [f"{names[run]}: {sentence}" for (_, run), sentence in sentences.items()]
+        return [(run, sentence) for (_, run), sentence in sentences.items()]
 
     def notes(self) -> list[str]:
         """Return sentences about assumptions, time spans without estimates, and unused messages."""

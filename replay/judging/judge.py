@@ -335,6 +335,11 @@ class Judge:
     @property
     def failures(self) -> list[str]:
         """Return a sentence for every run that an estimator did not process, or not to the end."""
+        return [f"{self._names[run]}: {sentence}" for run, sentence in self.failed_runs]
+
+    @property
+    def failed_runs(self) -> list[tuple[int, str]]:
+        """Return the numbers of these runs with the sentences."""
         return self._diagnostics.failures(self._names)
 
     @property

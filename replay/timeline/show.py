@@ -28,6 +28,8 @@ from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
+# The entity of the text about a segment of a dataset.
+ABOUT = "about"
 # Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
 
@@ -48,6 +50,7 @@ class Drawing:
         at: `worst` or `worst:ESTIMATOR`; without a focus, the case of this moment is shown first.
         sides: estimators whose scenes are shown side by side, with the differences of their errors.
         fans: distances of copies from their estimates.
+        layout: file for the layout of a dataset's segments, which has a text about the segment as well.
 
     Raises BadInput if neither `save` nor `connect` is given, if a sink fails (see `open_recording`), or
     if the focus does not exist.
@@ -64,13 +67,14 @@ class Drawing:
         at: str | None = None,
         sides: Sequence[str] = (),
         fans: Sequence[Fan] = (),
+        layout: Path | None = None,
     ) -> None:
         if save is None and connect is None:
             raise BadInput(
                 "a timeline needs a destination: give --save FILE.rrd, --connect URL, or both"
             )
         self._source, self._focus, self._save = source, focus, save
-        self._at, self._sides, self._fans = at, sides, fans
+        self._at, self._sides, self._fans, self._layout = at, sides, fans, layout
         scenario = source.run.scenario if source.run else ""
         known = available("timelines")
         self._timeline: Timeline = load("timelines", scenario) if scenario in known else GENERIC
@@ -162,13 +166,12 @@ class Drawing:
             layout = draw_side_by_side(canvas, scene, layout, self._sides)
         if self._fans:
             layout = draw_fans(canvas, layout, self._fans)
-        recording.send_blueprint(
-            rrb.Blueprint(
-                layout,
-                rrb.TimePanel(timeline="sim_time", state="collapsed"),
-                collapse_panels=True,
-            )
-        )
+        panel = rrb.TimePanel(timeline="sim_time", state="collapsed")
+        recording.send_blueprint(rrb.Blueprint(layout, panel, collapse_panels=True))
+        if self._layout is not None:
+            about = rrb.TextDocumentView(origin=ABOUT, name="Run")
+            layout = rrb.Vertical(about, layout, row_shares=[1.0, 8.0])
+            rrb.Blueprint(layout, panel, collapse_panels=True).save(self._names[0], str(self._layout))
 
 
 def show(

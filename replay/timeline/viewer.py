@@ -47,7 +47,7 @@ class Listener(NamedTuple):
 
 
 def screenshot(
-    rrd: Path,
+    shown: Path | str,
     png: Path,
     *,
     at_s: float | None = None,
@@ -57,7 +57,7 @@ def screenshot(
     """Save a picture of a timeline in the viewer; this needs a Vulkan driver, but no screen.
 
     Args:
-        rrd: the timeline.
+        shown: the timeline, or the address of a dataset.
         png: the picture to write.
         at_s: time of the cursor in s since the epoch of the run; None for the middle.
         size: width and height in pixels.
@@ -68,7 +68,8 @@ def screenshot(
     Raises BadInput if a file cannot be found or written, if `at_s` is outside the run, or if no Vulkan
     driver is installed.
     """
-    _require_timeline(rrd)
+    if isinstance(shown, Path):
+        _require_timeline(shown)
     if not png.parent.is_dir():
         raise BadInput(f"{png}: the folder does not exist; make it first")
     with scratch_folder("fuselog-viewer") as folder, whole_file(png, parents=False) as new:
@@ -80,8 +81,9 @@ def screenshot(
             for _ in range(_EMPTY_PICTURES):
                 client.save_screenshot(rerun_path(picture))
             progress("picture: loading the timeline")
-            _load(client, rrd)
-            _set_cursor(client, rrd, at_s)
+            client.open(shown if isinstance(shown, str) else rerun_path(shown.resolve()))
+            _await_loaded(client)
+            _set_cursor(client, shown, at_s)
             for number in range(_PICTURES):
                 progress(f"picture: drawing, {number + 1} of {_PICTURES}")
                 client.save_screenshot(rerun_path(picture))
@@ -103,22 +105,36 @@ def view(rrd: Path, *, at_s: float | None = None) -> None:
     Raises BadInput if the file or a screen is missing, or if the viewer cannot run.
     """
     _require_timeline(rrd)
+    with showing(str(rrd)) as listener:
+        if at_s is not None:
+            client = ViewerClient.connect(listener.url)
+            _await_loaded(client)
+            _set_cursor(client, rrd, at_s)
+        listener.process.wait()
+
+
+@contextmanager
+def showing(address: str) -> Iterator[Listener]:
+    """Open a timeline or a dataset in the desktop viewer, which is closed at the end.
+
+    Raises BadInput if there is no screen, or if the viewer cannot run.
+    """
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise BadInput(
             "there is no screen to show a timeline on; give --web to see it in a browser, --screenshot "
             "FILE.png for a picture, --save FILE.rrd for a file, or --connect URL for a running viewer"
         )
     port = _free_port()
-    options = [str(rrd), "--port", str(port), "--bind", "127.0.0.1"]
+    options = [address, "--port", str(port), "--bind", "127.0.0.1"]
     with scratch_folder("fuselog-viewer") as folder:
         with _running(folder, options, _private_environment(folder)) as process:
-            if at_s is not None:
+            try:
                 _await_port(process, port)
-                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-                _await_loaded(client)
-                _set_cursor(client, rrd, at_s)
-            process.wait()
-        if process.returncode != 0:
+            except ConnectionError:
+                raise _why_ended(folder) from None
+            yield Listener(f"rerun+http://127.0.0.1:{port}/proxy", process)
+            code = process.poll()
+        if code:
             raise _why_ended(folder)
 
 
@@ -132,14 +148,24 @@ def serve(rrd: Path, announce: Callable[[str], None]) -> None:
     Raises BadInput if the file is missing, or if the viewer ends.
     """
     _require_timeline(rrd)
+    with serving(announce, timeline=rrd) as listener:
+        listener.process.wait()
+
+
+@contextmanager
+def serving(
+    announce: Callable[[str], None], *, timeline: Path | None = None, address: str | None = None
+) -> Iterator[Listener]:
+    """Serve a timeline, or the dataset at an address, with Rerun's web viewer; see `serve`."""
     port = _free_port()
     options = ["--serve-web", "--web-viewer-port", str(port)]
-    with scratch_folder("fuselog-viewer") as folder:
-        with listen(folder, str(rrd.resolve()), *options) as listener:
-            _await_port(listener.process, port)
-            announce(f"http://127.0.0.1:{port}/?url={quote(listener.url, safe='')}")
-            listener.process.wait()
-        raise _why_ended(folder)
+    files = [] if timeline is None else [str(timeline.resolve())]
+    with scratch_folder("fuselog-viewer") as folder, listen(folder, *files, *options) as listener:
+        _await_port(listener.process, port)
+        announce(f"http://127.0.0.1:{port}/?url={quote(address or listener.url, safe='')}")
+        yield listener
+        if listener.process.poll() is not None:
+            raise _why_ended(folder)
 
 
 def view_inline(rrd: Path) -> None:
@@ -276,23 +302,18 @@ def _require_timeline(rrd: Path) -> None:
         raise BadInput(f"{rrd}: is not a timeline; give an .rrd file")
 
 
-def _load(client: ViewerClient, rrd: Path) -> None:
-    client.open(rerun_path(rrd.resolve()))
-    _await_loaded(client)
-
-
 def _await_loaded(client: ViewerClient) -> None:
     end = time.monotonic() + _LOAD_S
     while client.get_state().loading and time.monotonic() < end:
         time.sleep(0.1)
 
 
-def _set_cursor(client: ViewerClient, rrd: Path, at_s: float | None) -> None:
+def _set_cursor(client: ViewerClient, shown: Path | str, at_s: float | None) -> None:
     timelines = [each for run in client.get_state().recordings for each in run.timelines]
     times = next((each for each in timelines if each.name == "sim_time"), None)
     if times is None or times.start is None or times.end is None:
         if at_s is not None:
-            raise BadInput(f"{rrd}: has no timeline sim_time; leave out --at")
+            raise BadInput(f"{shown}: has no timeline sim_time; leave out --at")
         return
     start_s, end_s = times.start * 1e-9, times.end * 1e-9
     cursor_s = 0.5 * (start_s + end_s) if at_s is None else at_s

@@ -59,6 +59,7 @@ ABOUT_OTHERS = (
     "json",
     "known_answers",
     "outputs",
+    "presenting",
     "report",
     "shipped_experiments",
 )

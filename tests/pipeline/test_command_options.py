@@ -215,7 +215,7 @@ COMMANDS_ELSEWHERE = {
     "stress": ("test_stressing",),
     "sweep": ("test_sweeps", "test_campaigns", "test_outputs"),
     "tune": ("test_tuning",),
-    "view": ("test_outputs", "test_spans", "../replay/timeline/test_timeline"),
+    "view": ("test_outputs", "test_spans", "test_presenting", "../replay/timeline/test_timeline"),
 }
 
 

@@ -27,6 +27,7 @@ from markupsafe import Markup, escape
 from fuselog.pipeline.output.alarms import Cause
 from fuselog.pipeline.output.charts import Chart
 from fuselog.pipeline.output.pages import templates
+from fuselog.pipeline.output.report.commands import NamedRun, worst_runs
 from fuselog.pipeline.output.report.evidence import Findings, Timings
 from fuselog.pipeline.output.report.first_run import first_run, picture_of_timeline
 from fuselog.pipeline.output.report.glossary import Term, glossary
@@ -85,6 +86,7 @@ class Section:
     legend: str
     sheet: Sheet | None
     sheets: list[Sheet]
+    worst: list[NamedRun]
     tables: dict[str, pd.DataFrame]
     figures: list[Shown]
     glossary: list[Term] = field(default_factory=list)
@@ -242,6 +244,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         _legend(begun),
         sheet,
         each_case,
+        worst_runs(folder, result, begun.found),
         short,
         figures,
         glossary(keys, draws=bool(begun.story.draws)),

@@ -23,6 +23,20 @@ function compare(a, b) {
   return isNaN(x) ? 1 : -1;
 }
 
+// A button copies the command before it; where that is not permitted, the command is selected.
+for (const button of document.querySelectorAll("button.copy")) {
+  button.addEventListener("click", async () => {
+    const command = button.previousElementSibling;
+    getSelection().selectAllChildren(command);
+    try {
+      await navigator.clipboard.writeText(command.textContent);
+      button.textContent = "Copied";
+    } catch {
+      button.textContent = "Selected";
+    }
+  });
+}
+
 // A chart is drawn when it comes close to the window, and redrawn when the window's size or colours change.
 const NARROWEST_PANEL = 260;
 const LETTER_PX = 7;

@@ -1,0 +1,1 @@
+"""Runs of results and folders of logs, reviewed as a dataset in Rerun; begin with `command`."""

@@ -1,0 +1,162 @@
+"""Datasets of recordings, served by Rerun's catalog server on the loopback interface only.
+
+A dataset has segments, one for each run. A segment has layers, each a file: its properties, which are
+columns of the dataset's table, what was recorded, and one for each estimator.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint.table as rrt
+import rerun.chunk as rc
+from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
+from rerun.server import Server
+
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.timeline.show import ABOUT
+
+LOOPBACK = "127.0.0.1"
+PROPERTIES, BASE = "properties", "base"
+EXTRA = "a list of runs needs the extra catalog (DataFusion, 115 MB): pip install 'fuselog[catalog]'"
+# Columns of Rerun's own that say nothing about a run.
+_HIDDEN = (
+    "rerun_storage_urls",
+    "rerun_last_updated_at",
+    "rerun_num_chunks",
+    "rerun_size_bytes",
+    "property:RecordingInfo:name",
+)
+
+
+class Dataset:
+    """A dataset in a running server.
+
+    Args:
+        client: a client of the server.
+        name: the dataset's name.
+    """
+
+    def __init__(self, client: CatalogClient, name: str) -> None:
+        self._client = client  # tables that are read need it
+        self._entry = client.create_dataset(name)
+        self.url = f"{client.url}/dataset/{self._entry.id}"
+
+    def add(self, layers: Sequence[tuple[Path, str]]) -> None:
+        """Register files as layers, each with its name; a file states its segment itself.
+
+        Raises BadInput if a file cannot be read.
+        """
+        if not layers:
+            return
+        files = [path.resolve().as_uri() for path, _ in layers]
+        names = [name for _, name in layers]
+        replacing = OnDuplicateSegmentLayer.REPLACE
+        try:
+            self._entry.register(files, layer_name=names, on_duplicate=replacing).wait()
+        except Exception as error:  # rerun does not document its exceptions
+            raise BadInput(f"{layers[0][0].parent}: cannot be served ({error}); remove it") from error
+
+    def lay_out(self, blueprint: Path, *, table: bool = False) -> None:
+        """Set the layout of all segments, or that of the table of segments, from an .rbl file."""
+        self._entry.register_blueprint(blueprint.resolve().as_uri(), segment_table=table)
+
+    def url_of(self, segment: str, at_s: float | None = None) -> str:
+        """Return the address of a segment, at a time in seconds since the run's epoch."""
+        if at_s is None:
+            return self._entry.segment_url(segment)
+        return self._entry.segment_url(segment, "sim_time", timedelta(seconds=at_s))
+
+
+@contextmanager
+def serve_dataset(name: str, port: int | None = None) -> Iterator[Dataset]:
+    """Serve an empty dataset to this machine.
+
+    Args:
+        name: its name.
+        port: by default any free one.
+
+    Raises BadInput if the extra is missing or the port is in use.
+    """
+    try:
+        server = Server(host=LOOPBACK, port=port)
+    except Exception as error:  # rerun does not document its exceptions
+        raise BadInput(
+            f"--port {port}: the server of the dataset cannot use it ({error}); give another port, or "
+            "leave out --port"
+        ) from error
+    with server:
+        try:
+            client = server.client()
+        except ImportError:
+            raise BadInput(EXTRA) from None
+        yield Dataset(client, name)
+
+
+def column_of(group: str, name: str) -> str:
+    """Return the name of a property's column in the table of segments."""
+    return f"property:{_plain(group)}:{_plain(name)}"
+
+
+def _plain(name: str) -> str:
+    """Return a name as columns have it: Rerun replaces some other characters, and escapes the rest."""
+    return re.sub(r"\W", "_", name)
+
+
+def has_catalog() -> bool:
+    """Test whether datasets can be served."""
+    try:
+        import datafusion  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def write_properties(
+    path: Path, application: str, name: str, properties: Mapping[str, Mapping[str, Any]], text: str
+) -> None:
+    """Write the layer of a segment's properties, with a text in Markdown."""
+    plain: dict[str, str] = {}
+    for group in properties:
+        other = plain.setdefault(_plain(group), group)
+        if other != group:
+            raise BadInput(f"{other} and {group}: columns cannot tell these names apart; rename one")
+    chunks = [
+        rc.Chunk.from_property(group, _values(properties[of]))
+        for group, of in plain.items()
+        if properties[of]
+    ]
+    about = rr.TextDocument.columns(text=[text], media_type=[rr.MediaType.MARKDOWN])
+    write_chunks(path, application, name, [*chunks, rc.Chunk.from_columns(f"/{ABOUT}", [], about)])
+
+
+def _values(values: Mapping[str, Any]) -> rr.AnyValues:
+    columns: dict[str, Any] = {_plain(name): [value] for name, value in values.items()}
+    return rr.AnyValues(**columns)
+
+
+def write_chunks(path: Path, application: str, name: str, chunks: Sequence[rc.Chunk]) -> None:
+    """Write chunks of a segment to an .rrd file; raises BadInput if that fails."""
+    try:
+        stream = rc.LazyChunkStream.from_iter(chunks)
+        stream.write_rrd(path, application_id=application, recording_id=name)
+    except Exception as error:  # rerun does not document its exceptions
+        raise BadInput(f"{path.parent}: cannot be written ({error})") from error
+
+
+def read_chunks(path: Path) -> list[rc.Chunk]:
+    """Read the chunks of an .rrd file without Rerun's own properties."""
+    return [each for each in rc.RrdReader(str(path)).stream() if each.entity_path != "/__properties"]
+
+
+def write_table_layout(path: Path, application: str, properties: Sequence[tuple[str, str]]) -> None:
+    """Write the layout of a table of segments that shows `properties` first, sorted by the first."""
+    columns = [column_of(*each) for each in properties]
+    shown = [rrt.Column("rerun_segment_id", name="run"), *map(rrt.Column, columns)]
+    hidden = [rrt.Column(name, visible=False) for name in _HIDDEN]
+    layout = rrt.TableLayout(columns=[*shown, *hidden])
+    rrt.TableBlueprint(table_layout=layout, sort_by=columns[0]).save(application, path)

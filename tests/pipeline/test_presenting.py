@@ -1,0 +1,221 @@
+"""Runs as a dataset: what Rerun's catalog reads back, what is kept, and what is refused."""
+
+import shutil
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import psutil
+import pytest
+
+from fuselog.pipeline.output.results import read_table
+from fuselog.pipeline.presenting import segments
+from fuselog.pipeline.presenting.making import Kept
+from fuselog.pipeline.presenting.segments import runs_in
+from fuselog.recorders.log import open_log, read_streams
+from fuselog.replay.timeline import catalog, viewer
+
+pytest.importorskip("datafusion")
+
+Fuselog = Callable[..., Any]
+RUNS = 5
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory, fuselog: Fuselog) -> Path:
+    """A result of five runs, of which one log was kept; others add to what is next to it."""
+    folder = tmp_path_factory.mktemp("presenting") / "result"
+    options = ["--runs", RUNS, "--logs", 1, "--set", "duration_s=2", "--out", folder]
+    assert fuselog("run", "landmarks", *map(str, options)).code == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dataset(result: Path, fuselog: Fuselog) -> Path:
+    """Its dataset, with a run whose log was kept and one that was recorded again."""
+    folder = result.with_name("dataset")
+    said = fuselog("view", result, "--runs", "0,3", "--save", folder)
+    assert said.code == 0, said.err
+    return folder
+
+
+def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
+    """Read the table of segments as Rerun's server lists the files of a folder."""
+    from rerun.server import Server
+
+    server = Server(host="127.0.0.1", datasets={"all": folder})
+    client = server.client()
+    entry = client.get_dataset("all")
+    table = entry.segment_table().to_pandas().set_index("rerun_segment_id").sort_index()
+    return (server, client, entry), table
+
+
+def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
+    (server, _client, entry), table = read_back(dataset)
+    rows = read_table(result / segments.RUNS)
+    assert list(table.index) == [f"run-{run:04d}" for run in range(RUNS)]
+    assert [each[0] for each in table["property:run:run"]] == [*range(RUNS)]
+    for label, own in rows.groupby("estimator"):
+        for key in own.columns.drop(["estimator", "case", "run"]):
+            column = catalog.column_of(str(label), key)
+            stated = own.sort_values("run")[key].to_numpy(float)
+            if np.isnan(stated).all():
+                assert column not in table
+            else:
+                np.testing.assert_array_equal([each[0] for each in table[column]], stated)
+    by_rank = table["property:run:rank"].map(lambda each: each[0]).sort_values().index
+    error = table["property:ukf:position_rmse_m"].map(lambda each: each[0])
+    first = rows.groupby("estimator")["position_rmse_m"].apply(lambda of: np.sqrt((of**2).mean()))
+    assert first.idxmin() == "ukf"
+    assert error[by_rank].is_monotonic_decreasing
+    estimates = open_log(result / "estimates" / "run-0000.mcap")
+    stream = read_streams(estimates, ["/estimates/ekf/robot1/pose"])["/estimates/ekf/robot1/pose"]
+    drawn = entry.filter_segments("run-0000").filter_contents("/map/robot1/ekf/pose")
+    shown = drawn.reader(index="utc").to_pandas().dropna(subset=["utc"])
+    assert len(shown) == len(stream)
+    assert (shown["utc"].astype("int64") == stream.publish_time_ns).all()
+    server.shutdown()
+
+
+def test_layers_are_what_was_recorded_and_each_estimator(result: Path, dataset: Path) -> None:
+    """Kept files are drawn once, and are registered onto the segments that have only properties."""
+    assert dataset.is_dir()
+    runs = runs_in(result, 0.2)
+    assert runs is not None
+    kept = Kept(runs)
+    before = {path: path.stat().st_mtime_ns for path in kept.folder.rglob("*.rrd")}
+    with catalog.serve_dataset("runs") as served:
+        properties = sorted(kept.properties().glob("*.rrd"))
+        served.add([(path, catalog.PROPERTIES) for path in properties])
+        served.add([layer for each in kept.made() for layer in each.layers])
+        for each in kept.made():
+            served.lay_out(each.folder / "layout.rbl")
+        layers = served._entry.segment_table().to_pandas().set_index("rerun_segment_id")
+        found = {name: {*of} for name, of in layers["rerun_layer_names"].items()}
+        assert served._entry.default_blueprint() in served._entry.blueprints()
+        process = psutil.Process()
+        listening = [each for each in process.net_connections() if each.status == psutil.CONN_LISTEN]
+        assert listening
+        assert {each.laddr.ip for each in listening} == {"127.0.0.1"}
+    drawn = {"properties", "base", "dead-reckoning", "ekf", "ukf"}
+    assert found["run-0000"] == found["run-0003"] == drawn
+    assert found["run-0001"] == {"properties"}
+    assert before == {path: path.stat().st_mtime_ns for path in kept.folder.rglob("*.rrd")}
+
+
+def test_one_run_is_drawn_as_a_log_would_be(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    """A run that was recorded again looks as one whose log was kept."""
+    from rerun.chunk import RrdReader
+
+    def rows(name: str) -> dict[str, int]:
+        return {
+            each.entity_path: each.num_rows
+            for each in RrdReader(str(tmp_path / name)).stream()
+            if "/plots/robot1/error" in each.entity_path and not each.is_static
+        }
+
+    for run in ("0", "3"):
+        saved = tmp_path / f"{run}.rrd"
+        assert fuselog("view", result, "--runs", run, "--save", saved, "--start", "1").code == 0
+    assert rows("0.rrd") == rows("3.rrd")
+
+
+def test_two_versions_of_an_estimator_are_in_one_scene(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """Estimates of one log that were replayed with other settings are another layer."""
+    log = tmp_path / "logs" / "run.mcap"
+    log.parent.mkdir()
+    shutil.copy(result / "logs" / "run-0000.mcap", log)
+    assert fuselog("replay", log, "-e", "ekf").code == 0
+    new = log.with_name("new.estimates.mcap")
+    assert fuselog("replay", log, "-e", "ekf", "--set", "sigma_range_m=0.3", "-o", new).code == 0
+    said = fuselog("view", log.parent, "--save", tmp_path / "set")
+    assert said.code == 0, said.err
+    (server, *_), table = read_back(tmp_path / "set")
+    server.shutdown()
+    old, other = (table[f"property:{name}:position_rmse_m"]["run"][0] for name in ("ekf", "ekf_new"))
+    assert old != other
+    runs = runs_in(log.parent, 0.2)
+    assert runs is not None
+    (made,) = Kept(runs).made()
+    assert {name for _, name in made.layers} == {"base", "ekf", "ekf new"}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--runs", "9"], "has no run 9; its 5 runs are run-0000 to run-0004"),
+        (["--runs", "worst:0"], "has no run worst:0"),
+        (["--runs", "all", "--at", "1"], "are about one run; choose it with --runs NUMBER"),
+        (
+            ["--runs", "1", "--save", "{notes}"],
+            "is not a dataset that fuselog wrote; give another folder",
+        ),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(
+    result: Path, fuselog: Fuselog, tmp_path: Path, options: list[str], words: str
+) -> None:
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    (notes / "note.txt").write_text("mine")
+    said = fuselog("view", result, *(each.format(notes=notes) for each in options))
+    assert said.code == 2
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["notes", "note.txt"]
+
+
+def test_a_port_in_use_is_refused(result: Path, fuselog: Fuselog) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        said = fuselog("view", result, "--port", str(other.getsockname()[1]), "--web")
+    assert said.code == 2
+    assert "cannot use it" in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_a_run_without_log_and_seed_is_refused(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    shutil.copy(result / "logs" / "run-0000.mcap", log)
+    second = tmp_path / "second.mcap"
+    shutil.copy(log, second)
+    out = tmp_path / "out"
+    assert fuselog("run", log, second, "-e", "ekf", "--logs", "0", "--out", out).code == 0
+    second.unlink()
+    said = fuselog("view", out, "--runs", "1", "--save", tmp_path / "set")
+    assert said.code == 2
+    assert str(second) in said.err
+    assert not (tmp_path / "set").exists()
+
+
+def test_without_the_extra_the_first_run_is_shown(
+    result: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Path] = []
+    monkeypatch.setattr(catalog, "has_catalog", lambda: False)
+    monkeypatch.setattr(viewer, "view", lambda rrd, at_s: shown.append(rrd))  # noqa: ARG005
+    said = fuselog("view", result)
+    assert said.code == 0
+    assert shown == [result / "timeline.rrd"]
+    assert "needs the extra catalog" in said.err
+
+
+def test_a_report_has_the_command_that_opens_the_worst_run(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """Its run is that of the table, and `view` opens it."""
+    page = tmp_path / "page.html"
+    assert fuselog("report", result, "-o", page).code == 0
+    rows = read_table(result / segments.RUNS).query("estimator == 'ekf'").set_index("run")
+    worst = rows["position_rmse_m"].idxmax()
+    command = f"fuselog view {result} --runs {worst} --at worst:ekf"
+    assert f'<code>{command}</code> <button type="button" class="copy">' in page.read_text()
+    runs = runs_in(result, 0.2)
+    assert runs is not None
+    assert [each.name for each in runs.chosen(str(worst))] == [f"run-{worst:04d}"]
