@@ -175,7 +175,7 @@ def evaluate(
             vertical axis, and translation), "se2" (the same, with the height unchanged), "se3", "sim3".
         delta: the distance over which relative errors are computed.
         delta_unit: unit of `delta`: "m" along the estimate's path, "frames" or "s".
-        association: "nearest" matches poses by time, "interpolated" with the interpolated truth.
+        association: "nearest" pairs poses that are close in time, "interpolated" interpolates the truth.
         max_difference_s: the largest time difference of matched poses, for "nearest".
         gap_limit_s: the longest gap over which the truth is interpolated.
         time_offset_s: seconds to add to the estimate's stamps; "estimate" determines them.

@@ -302,7 +302,7 @@ class _Search:
         return beside, _likeliest(self.likelihood, now, beside.ranked, self.count)[0] or alike, []
 
     def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
-        """Remove a noise if the other causes, replaced by faults of their kinds, explain as much.
+        """Remove a noise if the other causes, or others of their kinds, explain as much without it.
 
         For example, positions that are scaled and look imprecise may be explained by speeds that are too
         small.

@@ -139,7 +139,10 @@ def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Caus
             "no truth: errors and NEES are missing, and faults that innovations do not show stay hidden"
         )
     elif len(done.logs) == 1:
-        notes.append("one run: NEES has the interval of a single step; give more runs to fuselog run")
+        notes.append(
+            "there is only one run, so NEES has the interval of a single step; use fuselog run with "
+            "more runs"
+        )
     if len(sentences) > MOST_SENTENCES:
         notes.append(f"{len(sentences) - MOST_SENTENCES} more findings; fix these first")
     return notes

@@ -261,9 +261,8 @@ def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Ma
     if len(own) != 1:
         listed = f"has several: {', '.join(own)}" if own else f"has {', '.join(estimates.topics)}"
         raise BadInput(
-            f"{estimates.name}: need one estimate of {', '.join(components)} to start {label} from "
-            f"instead "
-            f"of {prior.topic}; the log {listed}"
+            f"{estimates.name}: starting {label} needs exactly one estimate of {', '.join(components)} "
+            f"instead of {prior.topic}; the log {listed}"
         )
     return own[0]
 

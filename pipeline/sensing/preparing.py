@@ -68,8 +68,8 @@ def grid_of(stream: Stream) -> Grid:
     span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
     if len(stamps) < FEWEST or span_s < SHORTEST_S:
         raise BadInput(
-            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; noise needs at least "
-            f"{FEWEST} in {SHORTEST_S:.0f} s, and a random walk an hour at rest"
+            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; an estimate of noise needs "
+            f"at least {FEWEST} in {SHORTEST_S:.0f} s, and that of a random walk an hour at rest"
         )
     written = np.diff(stamps[np.argsort(stream.position, kind="stable")])
     if (written < 0).any():
@@ -118,7 +118,7 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
     """
     there = values[np.isfinite(values)]
     if len(there) < FEWEST:
-        raise BadInput(f"{name}: has {len(there)} numbers; noise needs at least {FEWEST}")
+        raise BadInput(f"{name}: has {len(there)} numbers; an estimate of noise needs at least {FEWEST}")
     if np.ptp(there) == 0:
         raise BadInput(f"{name}: is constant, {there[0]:.6g}; an active sensor has noise")
     means = block_means(values, max(1, round(1 / step_s)))

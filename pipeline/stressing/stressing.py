@@ -238,7 +238,7 @@ def _topics(bound: Sequence[Bound]) -> list[str]:
 
 def _lacking(name: str, inputs: Inputs) -> str:
     if name == "start" and not inputs.priors:
-        return "the log states no start"
+        return "the log contains no initial state"
     if name == "zero duration" and not inputs.controls:
         return "the estimator has no control"
     return "" if inputs.sensed or name == "start" else "the log has no measurements"

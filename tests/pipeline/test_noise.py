@@ -328,7 +328,7 @@ def test_bad_input_is_a_sentence() -> None:
     moved = rest(size)["turn_rate_radps"].copy()
     moved[800:900] += 0.5 * np.sin(np.arange(100)[:, None])
     assert "the unit moves" in refused(rest(size, turn_rate_radps=moved))
-    assert "noise needs at least 500 in 20 s" in refused(rest(250))
+    assert "an estimate of noise needs at least 500 in 20 s" in refused(rest(250))
     assert "is constant" in refused(rest(size, turn_rate_radps=np.zeros((size, 3))))
     rows = np.r_[0:500, 1500:2000]
     assert "% of the messages are lost" in refused(rest(size).take(rows))

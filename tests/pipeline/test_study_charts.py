@@ -68,7 +68,7 @@ def of_moving_sights() -> tuple[Chart, Wanted]:
     }
     for name, own in wanted.items():
         if "NEES" in name:
-            own["expected"] = [[1, 2], [1, 1]]
+            own["ideal"] = [[1, 2], [1, 1]]
         else:
             own |= {key: [x, 1e3 * np.sqrt(y)] for key, (x, y) in own.items()}
     return moving._chart(table), wanted

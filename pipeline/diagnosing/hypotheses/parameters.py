@@ -235,7 +235,7 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
 
     def words(reopens_s: float, *_: float) -> str:
         which = "some measurements" if reopens_s == REOPENS_S else "whole stretches of measurements"
-        return f"{which} are outliers, which are false or measure something else"
+        return f"{which} are outliers: they are false, or belong to another object"
 
     found = supposed("outliers", "gate_probability", "", without, "", Advice("gate_probability", GATE))
     yield replace(found, words=words, specials=(REOPENS_S, NEVER_S) if reopens else (REOPENS_S,))

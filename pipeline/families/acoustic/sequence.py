@@ -145,7 +145,7 @@ def _chart(shots: pd.DataFrame) -> Chart:
 
 
 ACOUSTIC_SEQUENCE = Study(
-    "shots of one moving shooter estimated jointly and singly, with wrong detections",
+    "shots of a moving shooter, estimated jointly and one by one, with wrong detections",
     study,
     Options,
 )

@@ -234,7 +234,7 @@ def _chart(every: pd.DataFrame) -> Chart:
                 if estimator != "unaware":
                     panel.series.append(curve(str(estimator), mean.index, values))
             if quantity == "nees_per_component":
-                panel.series.append(level("expected", of_case["second"], 1.0))
+                panel.series.append(level("ideal", of_case["second"], 1.0))
             panels.append(panel)
     return Chart(panels=panels, columns=every["case"].nunique())
 

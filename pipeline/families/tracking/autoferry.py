@@ -156,5 +156,5 @@ def _chart(table: pd.DataFrame) -> Chart:
 
 
 AUTOFERRY = Study(
-    "benefit of each sensor for tracks of vessels from a moving one", study, AutoferryOptions
+    "benefit of each sensor for tracking vessels from a moving vessel", study, AutoferryOptions
 )

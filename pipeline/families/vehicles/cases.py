@@ -183,7 +183,7 @@ def bytes_per_step(
     """Compute the mean number of bytes sent per scan of the network, by estimator.
 
     Fixes contain an identity only if the association must be known. The infrastructure sensor sends
-    nothing, its one number, or its detections.
+    nothing, a single number, or its detections, depending on the estimator.
     """
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]

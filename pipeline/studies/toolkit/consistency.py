@@ -1,7 +1,7 @@
 """A study of consistency: whether errors agree with the covariances after an estimator is aligned.
 
-In addition to the metrics of `localization`, it computes the mean NEES of the runs at stamps from
-`aligned_s` on: the share of these stamps at which it is within its 95 % interval, and its mean.
+The study adds two metrics to those of `localization`, for stamps from `aligned_s` on: the mean NEES over
+runs and stamps, and the share of stamps at which the mean over runs is in its 95 % interval.
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section
 5.4.2.
 """
