@@ -129,7 +129,7 @@ CASES = (
         {},
         "state",
         reactor_in_c,
-        {LOOP: 2.0, PLUMBING: 4.0},
+        {LOOP: 1.8, PLUMBING: 4.0},
         (({"steps": 2000}, 1), ({}, 1000)),
     ),
     Case(
@@ -139,7 +139,7 @@ CASES = (
         {"gate_probability": 1.0},
         "robot1/pose",
         robot_in_c,
-        {LOOP: 2.0},
+        {LOOP: 1.8},
         (({"duration_s": 300.0}, 1), ({"duration_s": 20.0}, 200)),
     ),
 )

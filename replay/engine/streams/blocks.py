@@ -223,7 +223,7 @@ def join(parts: Sequence[Ragged]) -> Ragged:
         return parts[0]
     order, offsets = by_runs([part.offsets for part in parts])
     stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
-    return Ragged(stream.take(order), offsets)
+    return Ragged(stream if len(offsets) == 2 else stream.take(order), offsets)
 
 
 def side_by_side(parts: Sequence[Ragged]) -> Ragged:

@@ -311,6 +311,10 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
     find_slope = sloping(model.kinds, model.correct)
     correct = correcting(model.kinds, model.correct)
 
+    def reduce(covariance: Floats, innovation: Innovation, size: int, work: Workspace) -> None:
+        kalman_step(innovation, size, work.step)
+        downdate(covariance, innovation.cross_covariance, size)
+
     def update(
         mean: Floats,
         covariance: Floats,
@@ -326,7 +330,10 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
             return NOT_POSITIVE_DEFINITE
         write_innovation(innovation, record)
         size = drop_missing(innovation)
-        squared, determinant = whiten(innovation, size)
+        if size == m:  # a number that the kernel knows, so that it needs no loops
+            squared, determinant = whiten(innovation, m)
+        else:
+            squared, determinant = whiten(innovation, size)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
@@ -334,8 +341,10 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
         if accepted:
             if factor != 1.0:
                 inflate(innovation, size, factor)
-            kalman_step(innovation, size, work.step)
-            downdate(covariance, innovation.cross_covariance, size)
+            if size == m:
+                reduce(covariance, innovation, m, work)
+            else:
+                reduce(covariance, innovation, size, work)
             find_slope(mean, covariance, work.slope)
             correct(mean, covariance, work)
         write_numbers(record, squared, determinant, size, accepted, factor)

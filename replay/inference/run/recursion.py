@@ -410,8 +410,10 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
     for row in range(len(mean)):
         total += mean[row]
     for row in range(len(covariance)):
+        of_row = 0.0  # so that the sums of rows do not wait for each other
         for column in range(row + 1):
-            total += covariance[row, column]
+            of_row += covariance[row, column]
+        total += of_row
     if not np.isfinite(total):
         return NOT_FINITE
     for row in range(len(covariance)):
