@@ -869,7 +869,7 @@ def _seconds_a_count(table: _Table, column: GuessedColumn) -> float | None:
             return None
         east, north = local_metres(latitude.values, longitude.values).T
     elif first and second:
-        east, north = np.stack([each.values for each in (first, second)])
+        east, north = np.asarray(first.values), np.asarray(second.values)
     else:
         return None
     known = np.isfinite(east) & np.isfinite(north) & np.isfinite(column.values)
