@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.finding import Finding, since_first
 from fuselog.recorders.checks.losses import FEWEST, REGULARS, is_measured
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
@@ -54,14 +54,14 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             continue
         others = [other for of, at, other in entries if (of, at) != (field, name)]
         if any(_changes(other[begin : begin + length]) > MOVING / max(usual, 1.0) for other in others):
-            first_s = 1e-9 * float(stream.publish_time_ns[begin] - stream.publish_time_ns[0])
             yield Finding(
                 "values",
                 stream.topic,
                 field,
                 float(length),
                 f"{stream.topic}: {name} is frozen at {column[begin]:.6g} for {length} messages, from "
-                f"{first_s:.4g} s after its first stamp, while {usual:.3g} are usual and others change",
+                f"{since_first(stream, stream.publish_time_ns[begin])}, while {usual:.3g} are usual and "
+                "others change",
                 otherwise="cut out these messages: fuselog cut LOG --start ... --end ...",
             )
 
@@ -152,7 +152,6 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 continue
             is_sure = stream.schema.full_name in REGULARS and _changes(known[known != end]) > MEASURED
             first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
-            first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
             what = "the end of a range" if is_end else f"its {'greatest' if at else 'least'} value"
             yield Finding(
                 "values",
@@ -160,7 +159,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 field,
                 float(count),
                 f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
-                f"{end:.6g}, {what}, the first {first_s:.4g} s after its first stamp",
+                f"{end:.6g}, {what}, the first {since_first(stream, first_ns)}",
                 otherwise="set the sensor to a larger range, or cut out these messages",
                 severity="likely" if is_end or is_sure else "hint",
                 time_ns=first_ns,
