@@ -33,10 +33,10 @@ def choices(name: str, known: Collection[str]) -> str:
     return f"did you mean '{near[0]}'?" if near else f"available: {some_of(known) or 'none'}"
 
 
-def some_of(names: Collection[object]) -> str:
+def some_of(names: Collection[object], most: int = _NAMED) -> str:
     """Join names for a message: the first ones, and how many more there are."""
-    more = len(names) - _NAMED
-    return ", ".join(map(str, islice(names, _NAMED))) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - most
+    return ", ".join(map(str, islice(names, most))) + (f" and {more} more" if more > 0 else "")
 
 
 def check_format(path: object, stated: object, read: int) -> None:

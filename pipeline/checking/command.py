@@ -10,8 +10,10 @@ from fuselog.pipeline.checking.stored import Golden, read
 from fuselog.pipeline.output.outputs import check_files
 from fuselog.pipeline.output.terminal import print_json, say
 from fuselog.pipeline.runs.ensemble import Settings
-from fuselog.pipeline.runs.settings import settings_of_estimators
+from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators
 from fuselog.recorders.errors import BadInput
+
+_TOLERANCE = "PATTERN=RELATIVE, as '/estimates/ekf/* mean=1e-9'"
 
 
 def check_path(
@@ -45,7 +47,7 @@ def check_path(
             {"late": late, "arrival_order": arrival_order},
             estimators=chosen,
             columns=columns,
-            tolerances=dict(map(_tolerance, tolerances)),
+            tolerances=pairs_of("--tolerance", tolerances, _tolerance, _TOLERANCE),
         )
         streams = sum(len(run["streams"]) for run in made["runs"].values())
         size_kb = golden.stat().st_size / 1e3
@@ -97,13 +99,7 @@ def check_path(
     return not done.found
 
 
-def _tolerance(text: str) -> tuple[str, Tolerance]:
-    """Parse PATTERN=RELATIVE, a pattern of columns and their largest allowed relative difference."""
-    pattern, _, value = text.rpartition("=")
-    try:
-        relative = float(value)
-    except ValueError:
-        relative = -1.0
-    if not (pattern and relative >= 0):
-        raise BadInput(f"--tolerance {text}: expected PATTERN=RELATIVE, as '/estimates/ekf/* mean=1e-9'")
-    return pattern, Tolerance(relative)
+def _tolerance(text: str) -> Tolerance:
+    if not (relative := float(text)) >= 0.0:
+        raise ValueError
+    return Tolerance(relative)

@@ -22,7 +22,7 @@ from fuselog.pipeline.command_line.options import (
     set_option,
 )
 from fuselog.pipeline.command_line.recording import say_written
-from fuselog.recorders.errors import BadInput, printable
+from fuselog.recorders.errors import printable
 
 if TYPE_CHECKING:
     from fuselog.pipeline.logs.rewriting import Changed
@@ -305,15 +305,9 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
     """Merge LOGS, which must have no topic in common, into one log; fuselog relabel renames topics."""
     from fuselog.pipeline.logs.edit import merge as merge_logs
+    from fuselog.pipeline.runs.settings import pairs_of
 
-    offsets_s = {}
-    for log, text in _pairs("--offset", offsets).items():
-        try:
-            offsets_s[log] = float(text)
-        except ValueError:
-            raise BadInput(
-                f"--offset {log}={text}: expected LOG=SECONDS, for example {log}=-0.5"
-            ) from None
+    offsets_s = pairs_of("--offset", offsets, float, "LOG=SECONDS, for example left.mcap=-0.5")
     _say_changed(merge_logs(list(logs), offsets_s=offsets_s, **options))
 
 
@@ -374,14 +368,16 @@ def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **
 
 
 def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """Convert an option's NAME=VALUE texts to a dictionary; reject names that occur more than once."""
-    pairs: dict[str, str] = {}
-    for text in texts:
-        name, equals, value = text.rpartition("=")
-        if not (name and equals and value) or name in pairs:
-            raise BadInput(f"{option} {text}: expected NAME=VALUE, and each name only once")
-        pairs[name] = value
-    return pairs
+    """Convert an option's NAME=VALUE texts to a dictionary."""
+    from fuselog.pipeline.runs.settings import pairs_of
+
+    return pairs_of(option, texts, _text, "NAME=VALUE")
+
+
+def _text(value: str) -> str:
+    if not value:
+        raise ValueError
+    return value
 
 
 def _say_changed(done: "Changed") -> None:

@@ -13,7 +13,7 @@ from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.compiling.cache import cache_folder, kept_files
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput, some_of
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from fuselog.recorders.parameters import build, describe, flat
 from fuselog.recorders.recording import Recorder
@@ -184,21 +184,15 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
         why = nearest(registered_models(), log.topics)
         say(f"No registered model fits this log: {why}; {OWN_MODEL}")
     for name, each in fit.items():
-        say(f"  {name}: -e {' '.join(each.methods)}; from {_some_topics(each.topics)}")
+        say(f"  {name}: -e {' '.join(each.methods)}; from {some_of(each.topics, MOST_TOPICS)}")
     for seen, names in by_topics.items():
-        say(f"  without a model: -e {' '.join(names)}; from {_some_topics(seen)}")
+        say(f"  without a model: -e {' '.join(names)}; from {some_of(seen, MOST_TOPICS)}")
     if fit and others and not is_all:
         say(f"  {', '.join(others)}: do not fit; --all lists what they need")
     for name, each in others.items() if is_all else ():
         say(f"  {name}: needs {'; '.join(each.lacks)}")
     if known := [*(each.methods for each in fit.values()), *by_topics.values()]:
         say_next("replay", str(path), "-e", known[0][0])
-
-
-def _some_topics(topics: Sequence[str]) -> str:
-    """List the first topics, and the number of further ones."""
-    more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
-    return ", ".join(topics[:MOST_TOPICS]) + more
 
 
 def _say_what_to_do(path: Path, log: Log) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fuselog.pipeline.output.results import read_table
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput, some_of
 from fuselog.recorders.log import Clock
 from fuselog.recorders.log.impossible import Rejections
 from fuselog.recorders.parsing import parse_json
@@ -297,7 +297,5 @@ def _of_untaken(rows: Sequence[Row]) -> str:
     """Name the topics that one estimator does not use, or the first few of many."""
     if len(rows) == 1:
         return rows[0].sentence
-    topics = [row.topic for row in rows]
-    more = f" and {len(topics) - MOST_TOPICS} more" if len(topics) > MOST_TOPICS else ""
-    named = ", ".join(topics[:MOST_TOPICS])
-    return f"{rows[0].estimator}: {len(topics)} topics not used: it does not take {named}{more}"
+    named = some_of([row.topic for row in rows], MOST_TOPICS)
+    return f"{rows[0].estimator}: {len(rows)} topics not used: it does not take {named}"

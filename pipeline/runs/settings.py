@@ -1,9 +1,9 @@
 """Parameters of estimators as commands receive them, from --set, a settings file and other options."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fuselog.pipeline.altering.changes import by_topic, is_of_topic, is_parameter
 from fuselog.recorders.errors import BadInput, choices
@@ -13,6 +13,7 @@ from fuselog.recorders.registry import available
 from fuselog.replay.engine.replaying.estimator import Bound, specified
 from fuselog.replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
+Value = TypeVar("Value")
 Settings = Mapping[str, Mapping[str, Any]]
 # Parameters of estimators that have a separate option.
 OPTIONS = {"model": "--model", "every_s": "--every"}
@@ -122,18 +123,37 @@ def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str
     return names
 
 
+def pairs_of(
+    option: str, texts: Iterable[str], read: Callable[[str], Value], expected: str
+) -> dict[str, Value]:
+    """Parse an option's NAME=VALUE texts as a dictionary.
+
+    Raises BadInput with the `expected` form if a text has no name or `read` raises ValueError, and if a
+    name occurs twice.
+    """
+    found: dict[str, Value] = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        if name in found:
+            raise BadInput(f"{option} {text}: {name} has a value already; give each name only once")
+        try:
+            found[name] = read(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise BadInput(f"{option} {text}: expected {expected}")
+    return found
+
+
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
     """Parse standard deviations by component from an option's COMPONENT=SIGMA texts."""
-    sigmas: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            sigmas[name] = float(value)
-        except ValueError:
-            sigmas[name] = math.nan
-        if not 0 < sigmas[name] < math.inf:
-            raise BadInput(f"{option} {text}: expected COMPONENT=SIGMA with a positive number")
-    return sigmas
+    return pairs_of(option, texts, _positive, "COMPONENT=SIGMA with a positive number")
+
+
+def _positive(text: str) -> float:
+    if not 0.0 < (value := float(text)) < math.inf:
+        raise ValueError
+    return value
 
 
 def meanings_of(bound: Sequence[Bound]) -> dict[str, dict[str, str]]:

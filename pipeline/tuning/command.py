@@ -10,7 +10,7 @@ from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
-from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators, split_texts
 from fuselog.pipeline.tuning.objective import Best, By
 from fuselog.pipeline.tuning.outcome import SETTINGS, Tuning
 from fuselog.pipeline.tuning.tuning import tune
@@ -60,7 +60,7 @@ def tune_logs(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             chosen,
             set=alterations,
-            bounds=dict(map(_bound, bounds)),
+            bounds=pairs_of("--bound", bounds, _ends, "NAME=LOW:HIGH, for example sigma_range_m=0.01:1"),
             validate=[LogSource(open_log(path, recover=recover)) for path in held_out],
             folds=folds,
             gap_limit_s=gap_limit_s,
@@ -136,14 +136,8 @@ def _in_words(logs: Sequence[Path]) -> str:
     return f"1 log, {logs[0]}" if logs else "none"
 
 
-def _bound(text: str) -> tuple[str, tuple[float, float]]:
-    """Parse a parameter's bounds from NAME=LOW:HIGH."""
-    name, _, ends = text.rpartition("=")
-    low, _, high = ends.partition(":")
-    try:
-        found = float(low), float(high)
-    except ValueError:
-        found = (0.0, 0.0)
-    if not (name and found[0] < found[1]):
-        raise BadInput(f"--bound {text}: expected NAME=LOW:HIGH, for example sigma_range_m=0.01:1")
-    return name, found
+def _ends(text: str) -> tuple[float, float]:
+    low, _, high = text.partition(":")
+    if not (ends := (float(low), float(high)))[0] < ends[1]:
+        raise ValueError
+    return ends

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding, Severity
+from fuselog.recorders.checks.finding import Finding, Severity, since_first
 from fuselog.recorders.checks.losses import FEWEST, REGULARS, is_measured
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.orientation import heading
@@ -56,14 +56,14 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             continue
         others = [other for of, at, other in entries if (of, at) != (field, name)]
         if any(_changes(other[begin : begin + length]) > MOVING / max(usual, 1.0) for other in others):
-            first_s = 1e-9 * float(stream.publish_time_ns[begin] - stream.publish_time_ns[0])
             yield Finding(
                 "values",
                 stream.topic,
                 field,
                 float(length),
                 f"{stream.topic}: {name} is frozen at {column[begin]:.6g} for {length} messages, from "
-                f"{first_s:.4g} s after its first stamp, while {usual:.3g} are usual and others change",
+                f"{since_first(stream, stream.publish_time_ns[begin])}, while {usual:.3g} are usual and "
+                "others change",
                 otherwise="cut out these messages: fuselog cut LOG --start ... --end ...",
             )
 
@@ -115,21 +115,23 @@ def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     least_m = float(ranges_m[is_there].min())
     is_code = int(is_there.sum()) >= OFTEN and bool((ranges_m[is_there] == least_m).all())
     first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
-    first_s = 1e-9 * float(first_ns - int(stream.publish_time_ns[0]))
+    words, fix = (
+        "below zero, down to",
+        "the offset of the sensor, or of range_m under `offsets` in the mapping",
+    )
+    if is_code:
+        words, fix = (
+            "a code for a missing value,",
+            "missing = { COLUMN = [...] } in the table of the mapping",
+        )
     yield Finding(
         "values",
         stream.topic,
         "range_m",
         float(is_there.sum()),
-        f"{stream.topic}: range_m is {least_m:.6g} in {int(is_there.sum())} of {len(stream)} messages, "
-        f"the first {first_s:.4g} s after its first stamp: a code for a missing value, which is used as "
-        "a distance"
-        if is_code
-        else f"{stream.topic}: range_m is negative in {int(is_there.sum())} of {len(stream)} messages, "
-        f"down to {least_m:.3g} m, the first {first_s:.4g} s after its first stamp",
-        otherwise="missing = { COLUMN = [...] } in the table of the mapping"
-        if is_code
-        else "correct the offset of the sensor, for example by range_m under `offsets` in the mapping",
+        f"{stream.topic}: range_m is {words} {least_m:.4g} m in {int(is_there.sum())} of {len(stream)} "
+        f"messages, the first {since_first(stream, first_ns)}",
+        otherwise=fix,
         severity="likely" if is_code else "hint",
         time_ns=first_ns,
     )
@@ -198,7 +200,6 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             continue
         is_there = np.isin(column, ends)
         first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
-        first_s = 1e-9 * float(first_ns - stream.publish_time_ns[0])
         which = "greatest" if ends == [levels[-1]] else "least"
         what = "the end of a range" if is_range else f"its {which} value"
         if len(ends) == 2:
@@ -209,8 +210,8 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             field,
             float(is_there.sum()),
             f"{stream.topic}: {name} is saturated: {int(is_there.sum())} of {len(column)} messages are "
-            f"at {' or '.join(f'{end:.6g}' for end in ends)}, {what}, the first {first_s:.4g} s after "
-            "its first stamp",
+            f"at {' or '.join(f'{end:.6g}' for end in ends)}, {what}, the first "
+            f"{since_first(stream, first_ns)}",
             otherwise="set the sensor to a larger range"
             if is_range
             else "if the sensor ends there, set it to a larger range; if the vehicle is limited there, "

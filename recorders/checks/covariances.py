@@ -6,7 +6,7 @@ from math import isqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.finding import Finding, since_first
 from fuselog.recorders.log import Stream, schemas
 
 TOLERANCE = 1e-6  # relative to the largest entry
@@ -32,9 +32,6 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         for words, bad in faults:
             if bad.any():
                 share = np.repeat(bad, np.diff(np.append(rows, len(column)))).sum()
-                first_s = 1e-9 * float(
-                    stream.publish_time_ns[rows[np.argmax(bad)]] - stream.publish_time_ns[0]
-                )
                 is_unknown = words.startswith("-1")
                 yield Finding(
                     "covariance",
@@ -43,7 +40,7 @@ def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                     float(share),
                     f"{stream.topic}: {entry.name} is {words} in {int(share)} of "
                     f"{len(column)} messages, "
-                    f"the first {first_s:.4g} s after its first stamp",
+                    f"the first {since_first(stream, stream.publish_time_ns[rows[np.argmax(bad)]])}",
                     otherwise="missing = [-1] in the mapping"
                     if is_unknown
                     else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, with a number for "

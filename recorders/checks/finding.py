@@ -4,6 +4,9 @@ import warnings
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+if TYPE_CHECKING:
+    from fuselog.recorders.log import Stream
+
 Kind = Literal[
     # Findings about a log, without a filter.
     "stamps",
@@ -123,6 +126,12 @@ class Finding:
     def as_json(self) -> dict[str, Any]:
         """Return the finding as `--json` prints it, with the fix in words."""
         return {**asdict(self), "fix": self.fix}
+
+
+def since_first(stream: "Stream", stamp_ns: int) -> str:
+    """Write a stamp of a topic relative to its first one."""
+    since_ns = int(stamp_ns) - int(stream.publish_time_ns.min())
+    return f"{since_ns * 1e-9:.4g} s after its first stamp"
 
 
 def digits(value: float) -> float:

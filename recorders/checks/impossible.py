@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding, Kind, Severity
+from fuselog.recorders.checks.finding import Finding, Kind, Severity, since_first
 from fuselog.recorders.checks.losses import FEWEST
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.log.impossible import TIMELESS, YEAR_NS, impossible
@@ -136,8 +136,7 @@ def _finding(
     severity: Severity = "fact",
 ) -> Finding:
     row = int(np.argmax(rows))
-    since_s = 1e-9 * float(stream.publish_time_ns[row] - stream.publish_time_ns[0])
-    where = f"the first, message {row}, {since_s:.4g} s after its first stamp"
+    where = f"the first, message {row}, {since_first(stream, stream.publish_time_ns[row])}"
     return Finding(
         kind,
         stream.topic,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.stamps import of_stamps
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.geodesy import local_metres
 from fuselog.recorders.models.orientation import heading
@@ -167,8 +168,9 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find stamps before 2000 that do not count from 1970, swapped days and months, and time zones."""
     first_ns, last_ns = int(stream.publish_time_ns.min()), int(stream.publish_time_ns.max())
     if EARLIEST_NS < first_ns < LATEST_NS:
-        yield _stamps(
+        yield of_stamps(
             stream,
+            0.0,
             f"its stamps begin on {_day(first_ns)}, before such logs existed",
             "`unit` and `zero` of `time` in the mapping",
         )
@@ -180,8 +182,9 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         and len(set(of_month.tolist())) == 1
         and len(stream) >= 5 * len(days)
     ):
-        yield _stamps(
+        yield of_stamps(
             stream,
+            0.0,
             f"its stamps are of {len(days)} days, each the {of_month[0]}. of a month, the first on "
             f"{days[0]}: day and month are swapped",
             "`format` of `time` in the mapping",
@@ -191,8 +194,9 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         hours = round(apart_ns / 3600e9)
         is_near = abs(apart_ns - hours * 3600 * 10**9) < NEAR_S * 1e9
         if 0 < hours <= FAR_H and is_near and int(other.publish_time_ns.min()) > last_ns:
-            yield _stamps(
+            yield of_stamps(
                 other,
+                0.0,
                 f"it begins {hours} h after {stream.topic}, which has ended by then: a time zone is "
                 "stated for only one of them, or twice",
                 "`zone` or `utc_offset_h` of `time` in the mapping",
@@ -214,7 +218,3 @@ def _places(stream: Stream) -> Floats:
 
 def _found(stream: Stream, field: str, value: float, words: str, mapping: str) -> Finding:
     return Finding("place", stream.topic, field, value, f"{stream.topic}: {words}", otherwise=mapping)
-
-
-def _stamps(stream: Stream, words: str, mapping: str) -> Finding:
-    return Finding("stamps", stream.topic, "", 0.0, f"{stream.topic}: {words}", otherwise=mapping)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.finding import Finding, digits, since_first
 from fuselog.recorders.log import Stream, schemas
 
 FEWEST = 50
@@ -69,7 +69,7 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         "",
         lost,
         f"{stream.topic}: loses {share} of its messages: steps are multiples of {usual_s:.3g} s, and "
-        f"{int(is_gap.sum())} are longer than one, the first {_since(stream, first_ns)}; "
+        f"{int(is_gap.sum())} are longer than one, the first {since_first(stream, first_ns)}; "
         "the losses may also explain a delay or a noise that is found",
         otherwise="find the cause where the log is recorded",
         severity="likely" if is_sure else "hint",
@@ -92,7 +92,7 @@ def silences(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]
             "",
             float(steps_s[longest]),
             f"{stream.topic}: is silent for {steps_s[longest]:.3g} s from "
-            f"{_since(stream, int(begin_ns[longest]))} on, where the usual step is {usual_s:.3g} s",
+            f"{since_first(stream, int(begin_ns[longest]))} on, where the usual step is {usual_s:.3g} s",
             otherwise="find the cause where the log is recorded",
             severity="likely" if is_long and stream.schema.full_name in REGULARS else "hint",
             time_ns=int(begin_ns[longest]),
@@ -116,7 +116,7 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         "",
         float(same.sum()),
         f"{stream.topic}: {int(same.sum())} of its {len(same) + 1} messages are duplicates, with equal "
-        f"stamp and content, the first {_since(stream, first_ns)}: they count twice",
+        f"stamp and content, the first {since_first(stream, first_ns)}: they count twice",
         otherwise="remove them where the log is written",
         time_ns=first_ns,
     )
@@ -146,10 +146,6 @@ def _steps(
 def _pause_s(steps_s: NDArray[np.float64]) -> float:
     """Return the usual step, or the pause between bursts, such as ranges to many anchors."""
     return float(np.quantile(steps_s, PAUSES))
-
-
-def _since(stream: Stream, time_ns: int) -> str:
-    return f"{(time_ns - int(stream.publish_time_ns.min())) * 1e-9:.4g} s after its first stamp"
 
 
 def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.checks.body import bodies
-from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.checks.finding import Finding, since_first
 from fuselog.recorders.checks.motion import BodyMotion, Slope
 from fuselog.recorders.log import Stream, schemas
 
@@ -66,12 +66,11 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         )
     zero = (latitude == 0.0) & (longitude == 0.0)
     if zero.any():
-        first_s = 1e-9 * float(stream.publish_time_ns[int(np.argmax(zero))] - stream.publish_time_ns[0])
         yield _place(
             stream,
             float(zero.sum()),
             f"{int(zero.sum())} of {len(stream)} fixes are at 0, 0, which means no fix, the first "
-            f"{first_s:.4g} s after its first stamp",
+            f"{since_first(stream, stream.publish_time_ns[np.argmax(zero)])}",
             "missing = [0] in the mapping",
         )
 
@@ -117,9 +116,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     is_abrupt = (beside_m < ABRUPT * sizes_m) & (sizes_m > CLIMB_MPS2 * steps_s**2)
     leaps = np.flatnonzero((sizes_m > LEAP_M) & ((sizes_m > CLIMB_MPS * steps_s) | is_abrupt))
     if len(leaps):
-        first_s = 1e-9 * float(
-            stream.publish_time_ns[rows[leaps[0] + 1]] - stream.publish_time_ns[rows[0]]
-        )
+        first_ns = int(stream.publish_time_ns[rows[leaps[0] + 1]])
         worst_m = float(steps_m[leaps[np.argmax(np.abs(steps_m[leaps]))]])
         yield Finding(
             "place",
@@ -127,7 +124,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             "altitude_m",
             worst_m,
             f"{stream.topic}: its altitude leaps {len(leaps)} times, by up to {abs(worst_m):.4g} m from "
-            f"one fix to the next, the first {first_s:.4g} s after its first stamp",
+            f"one fix to the next, the first {since_first(stream, first_ns)}",
             otherwise="use one altitude throughout, above the ellipsoid or above the sea",
         )
 

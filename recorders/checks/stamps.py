@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.recorders.checks.finding import Finding, digits
+from fuselog.recorders.checks.finding import Finding, digits, since_first
 from fuselog.recorders.checks.losses import FEWEST, REGULARS, losses
 from fuselog.recorders.log import Stream, schemas
 
@@ -47,7 +47,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     last_ns = int(stream.publish_time_ns.max())
     if last_ns > YEAR_2100_NS:
         year = 1970 + last_ns / 1e9 / 31_556_952
-        yield _stamps(
+        yield of_stamps(
             stream,
             year,
             f"its stamps reach the year {year:.0f}",
@@ -67,7 +67,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     while (rate_hz * 10.0**power < SLOWEST_HZ) if is_slow else (rate_hz * 10.0**power > fastest_hz):
         power += 3 if is_slow else -3
     how = "large" if is_slow else "small"
-    yield _stamps(
+    yield of_stamps(
         stream,
         10.0**power,
         f"its stamps are {10 ** abs(power):.0e} times too {how}, because of their unit: the rate would "
@@ -84,7 +84,8 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     stamps_ns = stream.publish_time_ns[rows]
     back = np.diff(stamps_ns) < 0
     if back.any():
-        count, first_s = int(back.sum()), _since_s(stream, int(stamps_ns[int(np.argmax(back))]))
+        count, first_ns = int(back.sum()), int(stamps_ns[int(np.argmax(back))])
+        first_s = (first_ns - int(stream.publish_time_ns.min())) * 1e-9
         steps_ns = np.diff(stamps_ns)
         usual_ns = float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else np.inf
         began_again = not is_late and -steps_ns.min() > AGAIN * usual_ns and count <= FEW_FALLS
@@ -113,7 +114,6 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     use = _USES.get(stream.schema.full_name, "both are used, in file order")
     same = (np.diff(stamps_ns) == 0) & (np.diff(things) == 0)
     if same.any() and stream.schema.full_name in REGULARS:
-        first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))
         yield Finding(
             "stamps",
             stream.topic,
@@ -121,7 +121,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             float(same.sum()),
             f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the same stamp as "
             "the "
-            f"previous one, the first {first_s:.4g} s after its first stamp: {use}",
+            f"previous one, the first {since_first(stream, stamps_ns[np.argmax(same)])}: {use}",
             otherwise="remove one of them where the log is written",
             severity="fact",
         )
@@ -135,7 +135,7 @@ def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     usual_s = float(np.median(steps_s))
     scatter = 1.4826 * float(np.median(np.abs(steps_s - usual_s)))
     if scatter > JITTER * usual_s > 0.0 and not any(losses(stream, streams)):
-        yield _stamps(
+        yield of_stamps(
             stream,
             scatter / usual_s,
             f"its steps scatter by {100 * scatter / usual_s:.2g} % of the usual {usual_s:.3g} s: its "
@@ -204,17 +204,14 @@ def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]
     return np.zeros(len(stream), np.uint32)
 
 
-def _stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:
+def of_stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:
+    """Make a finding about the stamps of a topic, with a correction of the mapping."""
     return Finding("stamps", stream.topic, "", value, f"{stream.topic}: {words}", otherwise=mapping)
 
 
 def _steps_ns(stream: Stream) -> NDArray[np.int64]:
     steps_ns: NDArray[np.int64] = np.diff(np.sort(stream.publish_time_ns)).astype(np.int64)
     return steps_ns
-
-
-def _since_s(stream: Stream, stamp_ns: int) -> float:
-    return (stamp_ns - int(stream.publish_time_ns.min())) * 1e-9
 
 
 def _ahead_s(stream: Stream) -> float:

@@ -128,7 +128,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     ),
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap": (
         "--offset log.mcap",
-        "NAME=VALUE",
+        "LOG=SECONDS",
     ),
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=soon": ("LOG=SECONDS", "-0.5"),
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=nan": (

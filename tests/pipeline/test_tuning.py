@@ -402,6 +402,7 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     )
     for options, sentence in (
         (("--bound", "sigma_range_m=1"), "--bound sigma_range_m=1: expected NAME=LOW:HIGH"),
+        (("--bound", "a=1:2", "--bound", "a=1:3"), "--bound a=1:3: a has a value already"),
         (("--by", "luck"), "Invalid value for '--by'"),
         (("--settings", world / "garbled.toml"), "cannot be read as TOML"),
     ):

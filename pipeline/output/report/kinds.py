@@ -35,6 +35,7 @@ from fuselog.pipeline.output.words import (
     quantity,
     scale,
 )
+from fuselog.recorders.errors import some_of
 from fuselog.recorders.units import unit_of, written
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.verdicts import DIFFER, MATERIAL, Claimed, Comparison
@@ -113,9 +114,7 @@ def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
     """Describe the estimators, the runs, their duration, and their source."""
     settings = result.settings
     estimators = list(settings.get("estimators") or [*found.labels, *found.bounds])
-    named = listed(estimators)
-    if len(estimators) > MOST_NAMED:
-        named = f"{', '.join(estimators[:MOST_NAMED])} and {len(estimators) - MOST_NAMED} more"
+    named = listed(estimators) if len(estimators) <= MOST_NAMED else some_of(estimators, MOST_NAMED)
     scenario = settings.get("record", {}).get("scenario")
     source = settings.get("import", {}).get("source")
     what = count(found.runs, "simulated run" if scenario else "log" if settings.get("logs") else "run")

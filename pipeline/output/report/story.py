@@ -30,6 +30,7 @@ from fuselog.pipeline.output.words import (
     scale,
 )
 from fuselog.recorders.checks.finding import Finding
+from fuselog.recorders.errors import some_of
 from fuselog.replay.judging.diagnostics import LEAST_SHARE
 from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
@@ -533,9 +534,7 @@ def named(labels: Sequence[str], among: int = 0) -> str:
     """Name estimators, or count them if they are many; `among` is the total number of estimators."""
     if len(labels) == among > 1:
         return "both" if among == 2 else f"all {among}"
-    if len(labels) > MOST_NAMED:
-        return f"{', '.join(labels[:MOST_NAMED])} and {len(labels) - MOST_NAMED} more"
-    return listed(list(labels))
+    return some_of(labels, MOST_NAMED) if len(labels) > MOST_NAMED else listed(list(labels))
 
 
 def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:

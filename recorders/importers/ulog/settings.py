@@ -1,7 +1,9 @@
 """Counterparts of PX4's EKF2 parameters in the model `inertial`, and reasons why others have none."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
+
+from fuselog.recorders.errors import some_of
 
 # EKF2's noise is a density divided by the root of its step: its variance in a step is (step x noise)^2.
 _DENSITIES = {
@@ -68,10 +70,5 @@ def carried(parameters: Mapping[str, float]) -> dict[str, str]:
         pattern = next((each for each in _REASONS if fnmatchcase(name, each)), None)
         if pattern is not None:
             rest.setdefault(pattern, []).append(name)
-    notes |= {_listed(names): _REASONS[pattern] for pattern, names in rest.items()}
+    notes |= {some_of(names, _NAMED): _REASONS[pattern] for pattern, names in rest.items()}
     return notes
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
