@@ -179,7 +179,7 @@ def _log_likelihoods(innovations: Innovations) -> Sums:
     accepted_likelihood = np.array([np.nan]) if stated is None else stated[innovations.accepted]
     return {
         "log_likelihood": float(accepted_likelihood.sum()),
-        "runs": set(np.unique(innovations.run).tolist()),
+        "runs": set(innovations.run[np.flatnonzero(np.diff(innovations.run, prepend=-1))].tolist()),
     }
 
 
