@@ -117,7 +117,10 @@ def factorise(covariance: Array, factor: Array) -> None:
             entry = covariance[row, column]
             if np.isinf(covariance[row, row]) or np.isinf(covariance[column, column]):
                 entry = 1.0 if row == column else 0.0
-            rest = entry - dot(factor[row], factor[column], column)
+            explained = 0.0
+            for place in range(column):
+                explained += factor[row, place] * factor[column, place]
+            rest = entry - explained
             if column < row:
                 factor[row, column] = rest / factor[column, column]
             elif rest > ROUNDING * entry:

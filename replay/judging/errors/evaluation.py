@@ -266,7 +266,7 @@ def errors_of(
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, judged, where)
     mean = stream["mean"].reshape(len(stream), len(components))[:, columns]
-    error = difference(mean, truth, kinds)
+    error = np.ascontiguousarray(difference(mean, truth, kinds))  # its layout decides how sums round
     tangent = tangent_components(names, kinds)
     size = len(tangent_components(list(components), list(components.values())))
     is_known = over_columns(np.logical_and, np.isfinite(error))

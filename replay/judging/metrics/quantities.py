@@ -116,9 +116,9 @@ class InnovationSums:
         stated, accepted = innovations.log_likelihood, innovations.accepted
         accepted_likelihood = np.where(accepted, np.nan if stated is None else stated, 0.0)
         degrees = innovations.degrees
-        columns = np.column_stack(
-            [accepted, degrees, degrees * accepted, innovations.squared, accepted_likelihood]
-        ).astype(float)
+        columns = np.empty((len(accepted), len(OfRuns._fields) - 1))
+        columns[:, 0], columns[:, 1], columns[:, 2] = accepted, degrees, degrees * accepted
+        columns[:, 3], columns[:, 4] = innovations.squared, accepted_likelihood
         self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
 
     def merge(self, other: "InnovationSums") -> None:
