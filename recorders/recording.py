@@ -34,7 +34,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     with np.errstate(over="ignore"):
         elapsed_ns = np.rint(np.asarray(elapsed_s, float) * 1e9)
     stamps_ns = SIMULATION_EPOCH_NS + elapsed_ns
-    if not ((stamps_ns >= 0) & (stamps_ns < 2**63)).all():
+    if stamps_ns.size and not (stamps_ns.min() >= 0 and stamps_ns.max() < 2**63):
         longest_s = float(np.max(np.abs(elapsed_s)))
         raise BadInput(
             f"the run lasts {longest_s:.3g} s, but stamps end in the year 2262; make it shorter"

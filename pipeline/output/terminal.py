@@ -20,15 +20,6 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from fuselog.pipeline.output.claims import Claim
-from fuselog.pipeline.output.results import (
-    Bounds,
-    Measured,
-    MetricTable,
-    MetricValue,
-    metric_tables,
-    split_metric,
-)
 from fuselog.pipeline.output.words import MISSING
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import printable
@@ -37,6 +28,9 @@ from fuselog.replay.judging.verdicts import Claimed
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from fuselog.pipeline.output.claims import Claim
+    from fuselog.pipeline.output.results import Bounds, Measured, MetricTable, MetricValue
 
 # With more cases than this, metrics are summarised, and only files list each case.
 MOST_CASES = 6
@@ -208,18 +202,20 @@ def is_value(value: object) -> bool:
     return value is not None and type(value).__name__ not in ("NAType", "NaTType")
 
 
-def has_many_cases(metrics: Mapping[str, MetricValue]) -> bool:
+def has_many_cases(metrics: "Mapping[str, MetricValue]") -> bool:
     """Test whether metrics have so many cases that they are summarised."""
     return _number_of_cases(metrics) > MOST_CASES
 
 
-def _number_of_cases(metrics: Mapping[str, MetricValue]) -> int:
+def _number_of_cases(metrics: "Mapping[str, MetricValue]") -> int:
+    from fuselog.pipeline.output.results import split_metric  # slow to import
+
     return len({split_metric(key)[2] for key in metrics} - {""})
 
 
 def print_metrics(
-    metrics: Mapping[str, MetricValue],
-    bounds: Mapping[str, Bounds],
+    metrics: "Mapping[str, MetricValue]",
+    bounds: "Mapping[str, Bounds]",
     runs: "pd.DataFrame | None" = None,
     details: str = "--json",
 ) -> None:
@@ -239,12 +235,14 @@ def print_metrics(
 
 
 def tables_of(
-    metrics: Mapping[str, MetricValue],
-    bounds: Mapping[str, Bounds],
+    metrics: "Mapping[str, MetricValue]",
+    bounds: "Mapping[str, Bounds]",
     runs: "pd.DataFrame | None" = None,
     most_cases: int = MOST_CASES,
 ) -> list[PrintedTable]:
     """Make the tables of metrics, or of their medians if there are more cases than `most_cases`."""
+    from fuselog.pipeline.output.results import Measured, metric_tables  # slow to import
+
     tables = metric_tables(metrics, bounds, runs)
     is_summarised = _number_of_cases(metrics) > most_cases
     found = []
@@ -259,7 +257,7 @@ def tables_of(
     return [*found, _over_cases([table for table in tables if table.case])] if is_summarised else found
 
 
-def _over_cases(tables: Sequence[MetricTable]) -> PrintedTable:
+def _over_cases(tables: "Sequence[MetricTable]") -> PrintedTable:
     """Make a table of the median, minimum and maximum over cases, with a row per quantity."""
     found: dict[str, dict[str, list[float]]] = {}
     for table in tables:
@@ -285,7 +283,7 @@ def _spread(values: Sequence[float]) -> str | None:
     return middle if least == greatest else f"{middle} ({least} to {greatest})"
 
 
-def _with_bounds(measured: Measured) -> object:
+def _with_bounds(measured: "Measured") -> object:
     if not measured.bounds or not measured.place:
         return measured.value
     low, high = map(format_value, measured.bounds)
@@ -336,7 +334,7 @@ def print_others(alarms: Sequence[Finding]) -> None:
         say(f"and {len(alarms) - MOST_ALARMS} more; --json lists them all")
 
 
-def print_claims(claims: Sequence[Claim]) -> None:
+def print_claims(claims: "Sequence[Claim]") -> None:
     """Print the claims with the paper's and our numbers, after a line on claims without a verdict."""
     elsewhere = sum(claim.verdict == Claimed.NO_VERDICT for claim in claims)
     if elsewhere:

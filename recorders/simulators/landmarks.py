@@ -178,13 +178,16 @@ def _robot_streams(
             streams.append(
                 outage_stream(f"{prefix}/{name}/outages", simulation_stamps_ns(seen.outages_s))
             )
-    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rng_of("fix"))
+    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rng_of)
 
 
-def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:
+def _fix_streams(
+    topic: str, receiver: Fixes, robot: Drive, rng_of: Callable[[str], np.random.Generator]
+) -> list[Stream]:
     """Simulate fixes in the plane or on the earth with their covariance, and their outages."""
     if receiver.rate_hz == 0:
         return []
+    rng = rng_of("fix")
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
     outages_s, is_dead = _dead(receiver, times_s, robot.times_s[-1], rng)
     places = robot.pose_at(times_s)[:, :2] + receiver.sigma_m * rng.normal(size=(len(times_s), 2))

@@ -25,7 +25,7 @@ from fuselog.replay.engine.replaying.estimator import (
 from fuselog.replay.engine.replaying.late import Late, taking_late
 from fuselog.replay.engine.replaying.monitor import RunMonitor
 from fuselog.replay.engine.replaying.usage import Usage
-from fuselog.replay.engine.streams.blocks import Block, Ragged, gather, join
+from fuselog.replay.engine.streams.blocks import Block, Findings, Ragged, gather, join
 from fuselog.replay.engine.streams.ensembles import Ensemble, ensemble_of
 from fuselog.replay.engine.streams.priors import start_of_runs
 from fuselog.replay.engine.streams.sources import Source
@@ -129,13 +129,14 @@ def replay(
         if isinstance(bound, Batch):
             for block in _required(ensemble, bound.streams, order, sys.maxsize):
                 yield monitor.receive(monitor.take(partial(_solve, bound, given), block))
+    block_of = partial(ensemble.block, order=order, latest=Findings(1))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
     for block in _required(ensemble, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
         for index, (bound, monitor) in enumerate(zip(estimators, monitors, strict=True)):
             if isinstance(bound, Recursive):
                 streams = {topic: block[topic] for topic in bound.streams}
-                work = partial(_advance, bound, states[index], partial(ensemble.block, order=order))
+                work = partial(_advance, bound, states[index], block_of)
                 states[index], produced = monitor.take(work, streams)
                 outputs += monitor.receive(produced)
         yield outputs

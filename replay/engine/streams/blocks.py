@@ -30,10 +30,9 @@ class Findings(dict[Hashable, Columns]):
             known: Found = self[key]
             return known
         except KeyError:
-            found = find()
-        while len(self) >= self._most:
-            self.pop(list(self)[0], None)  # noqa: RUF015 other threads may add entries
-        kept: Found = self.setdefault(key, found)
+            while len(self) >= self._most:  # before the new value takes memory
+                self.pop(list(self)[0], None)  # noqa: RUF015 other threads may add entries
+        kept: Found = self.setdefault(key, find())
         return kept
 
     def __reduce__(self) -> tuple[type["Findings"], tuple[int]]:

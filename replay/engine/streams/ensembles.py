@@ -20,6 +20,8 @@ from fuselog.replay.engine.streams.sources import MemorySource, Source
 SourceType = TypeVar("SourceType", bound=Source)
 # Only small blocks cache the findings of a few filters; larger blocks would need too much memory.
 FEW_MESSAGES, FEW_FILTERS = 1 << 13, 4
+# Larger blocks are merged for each estimator, since their memory is needed for the next one.
+MANY_MESSAGES = 1 << 20
 
 
 class Ensemble(list[SourceType]):
@@ -92,16 +94,25 @@ class Ensemble(list[SourceType]):
                 for topic, nothing in empty.items()
             }
 
-    def block(self, streams: dict[str, Ragged], order: Clock) -> Block:
-        """Merge messages in time order; the order of whole recordings is cached."""
+    def block(self, streams: dict[str, Ragged], order: Clock, latest: Findings) -> Block:
+        """Merge messages in time order; the order of short whole recordings is cached.
+
+        Args:
+            streams: by topic.
+            order: the clock.
+            latest: has the last merged block of a replay, for several estimators of the same topics.
+        """
 
         def merged(findings: Findings | None = None) -> Block:
             return Block(streams, merge_events(streams, order), findings=findings)
 
-        if any(self._kept.get((topic, order)) is not ragged for topic, ragged in streams.items()):
+        messages = sum(map(len, streams.values()))
+        kept = (self._kept.get((topic, order)) is ragged for topic, ragged in streams.items())
+        if messages > MANY_MESSAGES:
             return merged()
-        if sum(map(len, streams.values())) > FEW_MESSAGES:
-            return merged()
+        if messages > FEW_MESSAGES or not all(kept):
+            same = tuple((topic, id(ragged)) for topic, ragged in streams.items())
+            return latest.once(same, lambda: merged(Findings(1)))
         return self.findings.once(("block", order, *streams), lambda: merged(Findings(FEW_FILTERS)))
 
     @cached_property

@@ -6,6 +6,8 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Na
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
+
 Array = NDArray[np.float64]
 
 # Smaller fractions of a variance are rounding errors.
@@ -27,14 +29,34 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     [2.0, 0.25]
     """
     size = error.shape[-1]
-    error = np.where(np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1)), 0.0, error)
-    # |L^-1 e|^2 with the Cholesky factors L of all P
-    factor, whitened = _factors(covariance), np.empty_like(error)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        for row in range(size):
-            reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
-            whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
-        return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
+    leading = np.broadcast_shapes(error.shape[:-1], covariance.shape[:-2])
+    found = np.full(leading, np.nan)
+    if size and found.size:
+        errors = np.broadcast_to(error, (*leading, size)).reshape(-1, size)
+        covariances = np.broadcast_to(covariance, (*leading, size, size)).reshape(-1, size, size)
+        errors, covariances = (np.ascontiguousarray(each, float) for each in (errors, covariances))
+        _fill_squares(errors, covariances, np.empty((size, size)), np.empty(size), found.reshape(-1))
+    return found[()]
+
+
+def fill_squares(
+    errors: Array, covariances: Array, factor: Array, whitened: Array, found: Array
+) -> None:
+    """Compute |L^-1 e|^2 of errors (n, d) with the Cholesky factors L of covariances (n, d, d).
+
+    Args:
+        errors: (n, d).
+        covariances: (n, d, d).
+        factor: (d, d), work space.
+        whitened: (d,), work space.
+        found: (n,), filled.
+    """
+    for each in range(len(errors)):
+        factorise(covariances[each], factor)
+        for row in range(len(factor)):
+            error = 0.0 if np.isinf(covariances[each, row, row]) else errors[each, row]
+            whitened[row] = (error - dot(factor[row], whitened, row)) / factor[row, row]
+        found[each] = dot(whitened, whitened, len(whitened))
 
 
 def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
@@ -74,22 +96,51 @@ def _factors(covariance: Array) -> Array:
 
     A component of infinite variance is treated as independent of all others.
     """
-    size = covariance.shape[-1]
-    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
-    if not finite.all():
-        both = finite[..., :, None] & finite[..., None, :]
-        covariance = np.where(both, covariance, np.eye(size))
-    factor = np.empty_like(covariance)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        for row in range(size):
-            for column in range(row + 1):
-                entry = covariance[..., row, column]
-                if column:
-                    reached = factor[..., row, :column] * factor[..., column, :column]
-                    entry = entry - np.sum(reached, axis=-1)
-                if column < row:
-                    factor[..., row, column] = entry / factor[..., column, column]
-                else:
-                    is_sound = entry > ROUNDING * covariance[..., row, row]
-                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
-    return factor
+    factors = np.empty_like(covariance, float, "C")
+    if factors.size:
+        shape = -1, *covariance.shape[-2:]
+        covariances = np.ascontiguousarray(covariance.reshape(shape), float)
+        _fill_factors(covariances, factors.reshape(shape))
+    return factors
+
+
+def fill_factors(covariances: Array, factors: Array) -> None:
+    """Compute the factors (n, d, d) of covariances (n, d, d); see `factorise`."""
+    for each in range(len(factors)):
+        factorise(covariances[each], factors[each])
+
+
+def factorise(covariance: Array, factor: Array) -> None:
+    """Compute the lower triangle of a Cholesky factor (d, d); see `_factors`."""
+    for row in range(len(factor)):
+        for column in range(row + 1):
+            entry = covariance[row, column]
+            if np.isinf(covariance[row, row]) or np.isinf(covariance[column, column]):
+                entry = 1.0 if row == column else 0.0
+            explained = 0.0
+            for place in range(column):
+                explained += factor[row, place] * factor[column, place]
+            rest = entry - explained
+            if column < row:
+                factor[row, column] = rest / factor[column, column]
+            elif rest > ROUNDING * entry:
+                factor[row, row] = np.sqrt(rest)
+            else:
+                factor[row, row] = np.nan
+
+
+def dot(left: Array, right: Array, size: int) -> float:
+    """Compute the product of the first elements of two vectors, in the order in which NumPy sums."""
+    whole = size - size % 8 if size >= 8 else 0
+    total = 0.0
+    if whole:
+        lane = np.zeros(8)
+        for place in range(whole):
+            lane[place % 8] += left[place] * right[place]
+        total = ((lane[0] + lane[1]) + (lane[2] + lane[3])) + ((lane[4] + lane[5]) + (lane[6] + lane[7]))
+    for place in range(whole, size):
+        total += left[place] * right[place]
+    return total
+
+
+_fill_squares, _fill_factors = compiled(fill_squares), compiled(fill_factors)

@@ -14,6 +14,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.log import Stream
 from fuselog.recorders.models.orientation import compose, conjugate
 from fuselog.recorders.models.planar import wrap_angle
@@ -175,16 +176,75 @@ def states_at(
         kinds: one for each component.
         gap_limit_s: the longest gap in s to interpolate over.
     """
-    if len(times) == 0:
+    return states_of_runs([(times, state)], time_ns, np.array([0, len(time_ns)]), kinds, gap_limit_s)
+
+
+def states_of_runs(
+    known: Sequence[tuple[NDArray[np.int64], Floats]],
+    time_ns: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    kinds: Sequence[str],
+    gap_limit_s: float,
+) -> Floats:
+    """Interpolate states of several runs to stamps (n,) of the same runs; see `states_at`.
+
+    Args:
+        known: for each run, times (m,) in ns and in order, and the states (m, d) at them.
+        time_ns: (n,), stamps in ns, run by run.
+        offsets: (runs + 1,), first stamp of each run.
+        kinds: one for each component.
+        gap_limit_s: the longest gap in s to interpolate over.
+    """
+    times, state = (np.concatenate(parts) for parts in zip(*known, strict=True))
+    if not len(state):
         return np.full((len(time_ns), len(kinds)), np.nan)
-    right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
-    left = np.where(times[right] > time_ns, right - 1, right).clip(0)
-    span = times[right] - times[left]
-    weight = (time_ns - times[left]) / np.maximum(span, 1)
-    value = between(state[left], state[right], weight, kinds)
-    inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
-    value[~inside] = np.nan
-    return value
+    starts = np.cumsum([0, *(len(own) for own, _ in known)])
+    left, right = np.zeros((2, len(time_ns)), np.int64)
+    weight = np.empty(len(time_ns))
+    _bracket(times, starts, time_ns, offsets, gap_limit_s * 1e9, left, right, weight)
+    return between(state[left], state[right], weight, kinds)
+
+
+def bracket(
+    times: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    longest_ns: float,
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    weight: Floats,
+) -> None:
+    """Find the states before and after stamps, and the weight of the later one.
+
+    Args:
+        times: (m,), times of states in ns, run by run and in order.
+        starts: (runs + 1,), first state of each run.
+        time_ns: (n,), stamps in ns, run by run; fast if they are in order.
+        offsets: (runs + 1,), first stamp of each run.
+        longest_ns: the longest gap to interpolate over.
+        left, right: (n,), filled unless a run has no states; equal at a stamp that has a state.
+        weight: (n,), filled; NaN if the state is unknown.
+    """
+    for run in range(len(offsets) - 1):
+        begin, end = starts[run], starts[run + 1]
+        at = begin
+        for row in range(offsets[run], offsets[run + 1]):
+            weight[row] = np.nan
+            if begin < end:
+                stamp_ns = time_ns[row]
+                while at < end - 1 and times[at] < stamp_ns:
+                    at += 1
+                while at > begin and times[at - 1] >= stamp_ns:
+                    at -= 1
+                before = max(at - 1, begin) if times[at] > stamp_ns else at
+                left[row], right[row] = before, at
+                span_ns = times[at] - times[before]
+                if times[before] <= stamp_ns <= times[at] and span_ns <= longest_ns:
+                    weight[row] = (stamp_ns - times[before]) / max(span_ns, 1)
+
+
+_bracket = compiled(bracket)
 
 
 def rotation_vector(x: Floats) -> Floats:

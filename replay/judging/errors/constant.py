@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
 
 SHARE = 0.5  # fraction of the mean squared error above which a constant dominates it
@@ -112,14 +113,13 @@ class ConstantSums:
         if not known.all():
             errors = errors_at(errors, known)
         error = np.array([errors.error[:, axis] for axis in place])
-        weight = _inverse(np.array([[errors.covariance[:, i, j] for j in place] for i in place]))
-        time_s = errors.elapsed_s
-        self.fixed.add(error, weight, time_s)
+        covariance = np.array([[errors.covariance[:, i, j] for j in place] for i in place])
+        weight = _inverse(covariance)
+        self.fixed.add(error, weight, errors.elapsed_s)
         if errors.heading_rad is not None:
-            cosine, sine = np.cos(errors.heading_rad), np.sin(errors.heading_rad)
-            rows = _turned(weight, cosine, sine)
-            both = _turned(rows.swapaxes(0, 1), cosine, sine)
-            self.turned.add(_turned(error, cosine, sine), both, time_s)
+            weight = weight.swapaxes(0, 1).copy()  # symmetric, except for rounding
+            _turn(np.cos(errors.heading_rad), np.sin(errors.heading_rad), error, weight)
+            self.turned.add(error, weight, errors.elapsed_s)
 
     def merge(self, other: "ConstantSums") -> None:
         """Add the sums of other runs."""
@@ -150,9 +150,25 @@ def _inverse(covariance: Floats) -> Floats:
     return np.array([[c, -b], [-b, a]]) / (a * c - b * b)
 
 
-def _turned(vector: Floats, cosine: Floats, sine: Floats) -> Floats:
-    """Rotate vectors (axes, ..., n) into the frames of bodies with these headings (n,)."""
-    turned = vector.copy()
-    turned[0] = cosine * vector[0] + sine * vector[1]
-    turned[1] = cosine * vector[1] - sine * vector[0]
-    return turned
+def turn(cosine: Floats, sine: Floats, error: Floats, weight: Floats) -> None:
+    """Rotate errors (axes, n) and weights (axes, axes, n) into the frames of bodies, in place.
+
+    Args:
+        cosine, sine: (n,) of the headings.
+        error: (axes, n).
+        weight: (axes, axes, n).
+    """
+    axes = len(error)
+    for row in range(len(cosine)):
+        c, s = cosine[row], sine[row]
+        x, y = error[0, row], error[1, row]
+        error[0, row], error[1, row] = c * x + s * y, c * y - s * x
+        for axis in range(axes):
+            x, y = weight[axis, 0, row], weight[axis, 1, row]
+            weight[axis, 0, row], weight[axis, 1, row] = c * x + s * y, c * y - s * x
+        for axis in range(axes):
+            x, y = weight[0, axis, row], weight[1, axis, row]
+            weight[0, axis, row], weight[1, axis, row] = c * x + s * y, c * y - s * x
+
+
+_turn = compiled(turn)

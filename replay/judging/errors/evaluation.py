@@ -18,6 +18,7 @@ from fuselog.recorders.log import Stream
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.orientation import heading
 from fuselog.replay.engine import chi2
+from fuselog.replay.engine.arrays import over_columns
 from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 from fuselog.replay.engine.streams.planes import into_plane_of
 from fuselog.replay.engine.streams.sources import Source
@@ -34,8 +35,9 @@ from fuselog.replay.engine.vectors.tangent import (
     are_kinds,
     difference,
     manifold_blocks,
+    states_at,
+    states_of_runs,
     tangent_components,
-    truth_at,
 )
 from fuselog.replay.judging.errors.planes import ALIGNED, FirstFixes, planes_of, unlike
 from fuselog.replay.judging.errors.truths import Truths
@@ -265,25 +267,36 @@ def errors_of(
         return None
     planes = planes_of(stream, len(sources), first_fixes)
     names, kinds = list(judged), list(judged.values())
-    truth = np.concatenate(
-        [
-            reference(truth, truth_topic, judged, estimates.of_run(run), gap_limit_s, planes[run])
-            for run, truth in enumerate(truths)
-        ]
-    )
+    time_ns, offsets = stream.publish_time_ns, estimates.offsets
+    there = [
+        _truth_around(
+            truth,
+            truth_topic,
+            judged,
+            time_ns[offsets[run] : offsets[run + 1]],
+            gap_limit_s,
+            stream.topic,
+            None if ALIGNED in stream.metadata else planes[run],
+        )
+        for run, truth in enumerate(truths)
+    ]
+    truth = states_of_runs(there, time_ns, offsets, kinds, gap_limit_s)
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, judged, where)
     mean = stream["mean"].reshape(len(stream), len(components))[:, columns]
-    error = difference(mean, truth, kinds)
+    error = np.ascontiguousarray(difference(mean, truth, kinds))  # its layout decides how sums round
     tangent = tangent_components(names, kinds)
     size = len(tangent_components(list(components), list(components.values())))
-    known = np.isfinite(error).all(axis=1)
-    run = run_of_rows(estimates.offsets)
-    before = estimates.offsets[:-1] if steps is None else estimates.offsets[:-1] - steps
+    is_known = over_columns(np.logical_and, np.isfinite(error))
+    known = slice(None) if is_known.all() else is_known
+    run = run_of_rows(offsets)
+    before = offsets[:-1] if steps is None else offsets[:-1] - steps
     step = np.arange(len(stream)) - before[run]
     epochs = np.array([source.epoch_ns for source in sources])
     rows = match_tangent(stream.metadata, judged, where)
-    covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
+    covariance = stream["covariance"].reshape(len(stream), size, size)[known]
+    if rows != list(range(size)):
+        covariance = covariance[:, rows][:, :, rows]
     is_bound = BOUND in stream.metadata
     nees = normalized_error_squared(error[known], covariance)
     return Errors(
@@ -292,12 +305,12 @@ def errors_of(
         tuple(kind for _, kind in tangent),
         first_run + run[known],
         step[known],
-        stream.publish_time_ns[known],
-        (stream.publish_time_ns - epochs[run])[known] * 1e-9,
+        time_ns[known],
+        (time_ns - epochs[run])[known] * 1e-9,
         error[known],
         covariance,
         np.full(len(nees), np.nan) if is_bound else nees,
-        int((~known).sum()),
+        int((~is_known).sum()),
         lacking,
         is_bound,
         _heading_of(truth[known], judged),
@@ -402,15 +415,32 @@ def reference(
 
     Raises BadInput if the truth lacks a component.
     """
-    times = estimates.publish_time_ns
-    truth = truths.around(topic, times, gap_limit_s, estimates.topic)
+    time_ns = estimates.publish_time_ns
+    into = None if ALIGNED in estimates.metadata else plane
+    known = _truth_around(truths, topic, components, time_ns, gap_limit_s, estimates.topic, into)
+    return states_at(*known, time_ns, list(components.values()), gap_limit_s)
+
+
+def _truth_around(
+    truths: Truths,
+    topic: str,
+    components: Components,
+    time_ns: NDArray[np.int64],
+    gap_limit_s: float,
+    reader: str,
+    plane: Origin | None,
+) -> tuple[NDArray[np.int64], Floats]:
+    """Return stamps (m,) and states (m, components) that determine the truth at the stamps (n,).
+
+    `reader` is the topic of the estimates, in the given plane; see `reference`.
+    """
+    truth = truths.around(topic, time_ns, gap_limit_s, reader)
     if len(truth) == 0:
-        return np.full((len(estimates), len(components)), np.nan)
-    if plane is not None and ALIGNED not in estimates.metadata:
+        return truth.publish_time_ns, np.empty((0, len(components)))
+    if plane is not None:
         truth = into_plane_of(truth, plane)
     columns = match_components(truth.metadata, components, f"{truths.source.name}: topic {topic}")
-    known = replace(truth, columns={"state": truth["state"][:, columns]})
-    return truth_at(known, times, list(components.values()), gap_limit_s)
+    return truth.publish_time_ns, truth["state"][:, columns]
 
 
 def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
@@ -423,6 +453,6 @@ def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
         stream.stream.publish_time_ns,
         stream["accepted"] != 0,
         stream["normalised_innovation_squared"],
-        np.isfinite(stream["innovation"]).sum(axis=1),
+        over_columns(np.add, np.isfinite(stream["innovation"]).astype(np.int64)),
         stream.stream.columns.get("log_likelihood"),
     )

@@ -38,12 +38,12 @@ class Uninformed:
         if not self.names:
             self.names = [name for name in components if name in tangent]
             self.still = np.ones(len(self.names), bool)
-        if not self.still.any():
-            return
         columns = [list(components).index(name) for name in self.names]
         rows = [tangent.index(name) for name in self.names]
         size = len(tangent)
         for run in np.flatnonzero(np.diff(estimates.offsets)).tolist():
+            if not self.still.any():
+                return
             own = estimates.of_run(run)
             mean = own["mean"].reshape(len(own), len(components))[:, columns]
             variance = own["covariance"].reshape(len(own), size, size)[:, rows, rows]

@@ -101,9 +101,12 @@ def _add_nees(state: Consistent, errors: Errors) -> Consistent:
     if errors.is_bound:
         return state
     finite = np.isfinite(errors.nees)
-    state.count += int(finite.sum())
-    state.total += float(errors.nees[finite].sum())
-    state.missing += int((~finite).sum())
+    step, nees = errors.step, errors.nees
+    if not finite.all():
+        step, nees = step[finite], nees[finite]
+    state.count += len(nees)
+    state.total += float(nees.sum())
+    state.missing += len(finite) - len(nees)
     state.components = len(errors.components)
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
@@ -111,7 +114,7 @@ def _add_nees(state: Consistent, errors: Errors) -> Consistent:
         known = squared[np.isfinite(squared)]
         state.places += len(known)
         state.of_places += float(known.sum())
-    state.by_step.add(errors.step[finite], errors.nees[finite, None])
+    state.by_step.add(step, nees[:, None])
     return state
 
 
@@ -179,7 +182,7 @@ def _log_likelihoods(innovations: Innovations) -> Sums:
     accepted_likelihood = np.array([np.nan]) if stated is None else stated[innovations.accepted]
     return {
         "log_likelihood": float(accepted_likelihood.sum()),
-        "runs": set(np.unique(innovations.run).tolist()),
+        "runs": set(innovations.run[np.flatnonzero(np.diff(innovations.run, prepend=-1))].tolist()),
     }
 
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.judging.errors.constant import ConstantSums
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, Innovations
 from fuselog.replay.judging.metrics.sums import BinnedSums, Integers
@@ -33,20 +34,56 @@ class Quantities:
 
 def columns_of(errors: Errors) -> Floats:
     """Compute the rows (n, 6 + d) to sum; see `Quantities`."""
-    squared = errors.squared
-    main = errors.main.columns
-    covariance = errors.covariance[:, main][:, :, main]
-    return np.column_stack(
-        [
-            errors.elapsed_s,
-            squared[:, errors.position].sum(axis=1),
-            squared[:, errors.rotation].sum(axis=1),
-            squared,
-            np.trace(covariance, axis1=1, axis2=2),
-            np.sum(covariance**2, axis=(1, 2)),
-            errors.nees,
-        ]
+    columns = np.empty((len(errors.nees), 6 + len(errors.components)))
+    position, rotation, main = (
+        np.array(each, np.int64) for each in (errors.position, errors.rotation, errors.main.columns)
     )
+    squared = errors.elapsed_s, errors.squared, errors.covariance, errors.nees
+    _fill_columns(*squared, position, rotation, main, columns)
+    return columns
+
+
+def fill_columns(
+    elapsed_s: Floats,
+    squared: Floats,
+    covariance: Floats,
+    nees: Floats,
+    position: Integers,
+    rotation: Integers,
+    main: Integers,
+    columns: Floats,
+) -> None:
+    """Fill the rows (n, 6 + d) to sum; see `Quantities`.
+
+    Args:
+        elapsed_s: (n,) elapsed time.
+        squared: (n, d) squared errors.
+        covariance: (n, d, d).
+        nees: (n,).
+        position, rotation, main: components of the position, the rotation and the main quantity.
+        columns: (n, 6 + d), filled.
+    """
+    size = squared.shape[1]
+    for row in range(len(nees)):
+        columns[row, 0], columns[row, 5 + size] = elapsed_s[row], nees[row]
+        for column in range(1, 3):
+            columns[row, column] = 0.0
+        for place in range(len(position)):
+            columns[row, 1] += squared[row, position[place]]
+        for place in range(len(rotation)):
+            columns[row, 2] += squared[row, rotation[place]]
+        for column in range(size):
+            columns[row, 3 + column] = squared[row, column]
+        trace, of_square = 0.0, 0.0
+        for column in range(len(main)):
+            trace += covariance[row, main[column], main[column]]
+            for other in range(len(main)):
+                entry = covariance[row, main[other], main[column]]
+                of_square += entry * entry
+        columns[row, 3 + size], columns[row, 4 + size] = trace, of_square
+
+
+_fill_columns = compiled(fill_columns)
 
 
 class OfRuns(NamedTuple):
@@ -79,9 +116,9 @@ class InnovationSums:
         stated, accepted = innovations.log_likelihood, innovations.accepted
         accepted_likelihood = np.where(accepted, np.nan if stated is None else stated, 0.0)
         degrees = innovations.degrees
-        columns = np.column_stack(
-            [accepted, degrees, degrees * accepted, innovations.squared, accepted_likelihood]
-        ).astype(float)
+        columns = np.empty((len(accepted), len(OfRuns._fields) - 1))
+        columns[:, 0], columns[:, 1], columns[:, 2] = accepted, degrees, degrees * accepted
+        columns[:, 3], columns[:, 4] = innovations.squared, accepted_likelihood
         self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
 
     def merge(self, other: "InnovationSums") -> None:

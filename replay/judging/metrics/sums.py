@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -40,16 +42,12 @@ class BinnedSums:
             return
         group = np.zeros(len(position), np.int64) if group is None else group - self._first
         self._widen(int(position.max()))
-        bins = np.maximum(position, 0) // self.width
-        low, high = int(bins.min()), int(bins.max()) + 1
-        first, last = int(group.min()), int(group.max()) + 1
-        self._reserve(last, high)
-        cell = (group - first) * (high - low) + (bins - low)
-        shape, part = (last - first, high - low), self._sums[first:last, low:high]
-        part[:, :, 0] += np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
-        for column in range(values.shape[1]):
-            sums = np.bincount(cell, values[:, column], shape[0] * shape[1])
-            part[:, :, 1 + column] += sums.reshape(shape)
+        low, high = (max(int(end), 0) // self.width for end in (position.min(), position.max()))
+        first, last = int(group.min()), int(group.max())
+        self._reserve(last + 1, high + 1)
+        sums = np.zeros((last + 1 - first, high + 1 - low, self._sums.shape[2]))
+        _fill_sums(position, group - first, self.width, low, values, sums)
+        self._sums[first : last + 1, low : high + 1] += sums
 
     def merge(self, other: "BinnedSums") -> None:
         """Add other sums with the same columns and with no group before the first group here."""
@@ -103,3 +101,26 @@ def _halved(sums: Floats) -> Floats:
     """Add up pairs of adjacent bins."""
     even = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, 0)))
     return even[:, 0::2] + even[:, 1::2]
+
+
+def fill_sums(
+    position: Integers, group: Integers, width: int, low: int, values: Floats, sums: Floats
+) -> None:
+    """Sum rows of numbers by group and bin.
+
+    Args:
+        position: (n,) positions.
+        group: (n,) groups.
+        width: width of a bin.
+        low: the first bin of `sums`.
+        values: (n, columns), the rows.
+        sums: (groups, bins, 1 + columns), numbers of rows and their sums, updated.
+    """
+    for row in range(len(values)):
+        cell = sums[group[row], max(position[row], 0) // width - low]
+        cell[0] += 1.0
+        for column in range(values.shape[1]):
+            cell[1 + column] += values[row, column]
+
+
+_fill_sums = compiled(fill_sums)

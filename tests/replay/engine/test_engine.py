@@ -16,6 +16,7 @@ from fuselog.recorders.log import Clock, LogWriter, RunMetadata, Stream, make_st
 from fuselog.recorders.recording import Recording, record_run
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import Report, collect, replay
+from fuselog.replay.engine.streams import ensembles
 from fuselog.replay.engine.streams.blocks import (
     Block,
     Ragged,
@@ -27,6 +28,8 @@ from fuselog.replay.engine.streams.blocks import (
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.results import state_stream
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
+from fuselog.replay.inference.run import events
+from fuselog.replay.inference.run.events import filter_events
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 
@@ -385,3 +388,23 @@ def test_an_ensemble_lays_its_recordings_end_to_end_once(order: Clock):
     assert_array_equal(
         one[topics[1]].of_run(1).times(order), np.sort(sources[1].streams[topics[1]].times(order))
     )
+
+
+@pytest.mark.parametrize("few", [0, ensembles.FEW_MESSAGES], ids=["long", "short"])
+def test_filters_of_the_same_topics_share_their_events(few: int, monkeypatch: pytest.MonkeyPatch):
+    """Also of long runs, whose blocks are not kept for another replay."""
+    made = []
+
+    def counted(*arguments: object) -> object:
+        made.append(arguments)
+        return filter_events(*arguments)
+
+    monkeypatch.setattr(ensembles, "FEW_MESSAGES", few)
+    monkeypatch.setattr(events, "filter_events", counted)
+    sources = [record(run) for run in range(2)]
+    bounds = [each for label in ("ekf", "ukf") for each in bind(label, sources, {})]
+    together = collect(replay(sources, bounds))
+    assert len(made) == 1
+    for each in bounds:
+        alone = {topic: rows.stream for topic, rows in collect(replay(sources, [each])).items()}
+        assert_equal(alone, {topic: together[topic].stream for topic in alone})

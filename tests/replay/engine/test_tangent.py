@@ -17,8 +17,9 @@ from fuselog.replay.engine.vectors.tangent import (
     difference,
     named_now,
     tangent_components,
+    truth_at,
 )
-from fuselog.replay.judging.errors.evaluation import errors_of, truth_at
+from fuselog.replay.judging.errors.evaluation import errors_of
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.metrics.metrics import ACCURACY
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.priors import priors_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.engine.vectors.covariances import normalized_error_squared
-from fuselog.replay.engine.vectors.tangent import truth_at
+from fuselog.replay.engine.vectors.tangent import states_at, states_of_runs, truth_at
 from fuselog.replay.judging.errors.alignment import Alignment, aligned_estimates
 from fuselog.replay.judging.errors.evaluation import (
     chi_square_interval,
@@ -130,6 +130,21 @@ def test_truth_at_agrees_with_numpy_where_it_answers(stamps: list[int], limit: i
     answered = (inside & (span <= limit)) | np.isin(asked, stamps)
     assert_array_equal(np.isfinite(found), answered)
     assert_allclose(found[answered], np.interp(asked[answered], stamps, values), atol=1e-9)
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_runs_together_have_the_truths_of_each_alone(data: st.DataObject):
+    """Whatever the order of the stamps, and for runs without truth or without stamps."""
+    draw = data.draw
+    truths = [np.array(sorted(draw(st.lists(st.integers(0, 50), max_size=8))), int) for _ in range(4)]
+    known = [(times, np.sin([times, times + 1.0]).T * 3.0) for times in truths]
+    asked = [np.array(draw(st.lists(st.integers(-5, 55), max_size=8)), int) for _ in known]
+    kinds, limit_s = ["linear", "angle"], 9e-9
+    offsets = np.cumsum([0, *map(len, asked)])
+    found = states_of_runs(known, np.concatenate(asked), offsets, kinds, limit_s)
+    alone = [states_at(*own, at, kinds, limit_s) for own, at in zip(known, asked, strict=True)]
+    assert_array_equal(found, np.concatenate(alone))
 
 
 # Errors and NEES.
@@ -362,6 +377,13 @@ def test_normalized_error_squared_is_the_quadratic_form(size: int, seed: int):
     covariance, error = roots @ roots.transpose(0, 2, 1), generator.normal(size=(20, size))
     expected = [e @ np.linalg.inv(p) @ e for e, p in zip(error, covariance, strict=True)]
     assert_allclose(normalized_error_squared(error, covariance), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 16, 23])
+def test_nees_sums_its_squares_in_the_order_of_numpy(size: int):
+    """Results keep their bytes: with unit covariances, nothing but the sum rounds."""
+    error = np.random.default_rng(size).normal(size=(50, size))
+    assert_array_equal(normalized_error_squared(error, np.eye(size)), np.sum(error**2, axis=1))
 
 
 def test_covariances_that_are_none_give_nan_alone():
