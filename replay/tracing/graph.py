@@ -76,7 +76,7 @@ class Graph:
         if found is None:
             if len(self.nodes) == MOST_NODES:
                 raise BadInput(
-                    f"it needs more than {MOST_NODES:,} operations with unrolled loops; use fewer iterations"
+                    f"it needs more than {MOST_NODES:,} operations after unrolling; use fewer iterations"
                 )
             found = self._known[key] = Node(len(self.nodes), operation, arguments, value)
             self.nodes.append(found)
