@@ -23,7 +23,7 @@ from tests.replay.foreign.test_programs import program, python
 from tests.replay.foreign.test_what_filters_are_told import DESCRIPTION
 
 __all__ = ["compile_filter"]
-TRUTH, REFUSED = "/car/truth", r"{} is a truth.*a filter must not read it.*under a name of its own"
+TRUTH, REFUSED = "/car/truth", r"{} is a truth.*filters must not read it.*under another name"
 ORIGIN = {"origin_latitude_deg": "48", "origin_longitude_deg": "11", "origin_altitude_m": "500"}
 
 

@@ -97,7 +97,7 @@ def test_a_program_that_does_not_describe_itself_as_this_version_is_refused(tmp_
     silent = tmp_path / "silent.py"
     silent.write_text("import time; time.sleep(600)")
     mine = program(python(silent), time_limit_s=0.5)
-    with pytest.raises(BadInput, match=r"took longer than 0\.5 s \(time_limit_s\) before it gave its"):
+    with pytest.raises(BadInput, match=r"took longer than 0\.5 s \(time_limit_s\) before it sent its"):
         fl.replay(run_with(SANE), {"mine": mine})
 
 
