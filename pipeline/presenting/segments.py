@@ -19,11 +19,9 @@ from fuselog.pipeline.runs.experiment import Stated
 from fuselog.pipeline.runs.initial_states import order_of
 from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.pipeline.runs.runner import Runner, runner_again
-from fuselog.pipeline.runs.sweeps import settings_at
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
-from fuselog.replay.judging.tables import joined
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -251,6 +249,8 @@ def _part_of(folder: Path, runner: Runner, run: int) -> Part:
 
 def _of_sweep(folder: Path, result: Result) -> Runs:
     """Return the runs at all points of a sweep."""
+    from fuselog.pipeline.runs.sweeps import settings_at  # slow to import
+
     points = result.settings["sweep"]
     runner = runner_again(folder, result)
     entries = runner.experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
@@ -276,6 +276,8 @@ def _of_sweep(folder: Path, result: Result) -> Runs:
 
 def _of_folder(folder: Path, gap_limit_s: float) -> Runs | None:
     """Return the logs in a folder and their estimates; None if there are none."""
+    from fuselog.replay.judging.tables import joined  # slow to import
+
     files = sorted(folder.glob("*.mcap"))
     parts: dict[str, list[Part]] = {}
     logs: dict[str, Path] = {}
