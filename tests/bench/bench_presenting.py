@@ -1,6 +1,5 @@
 """Opening a result of 2,000 runs as a dataset: the table, one run, and the same again."""
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -37,10 +36,10 @@ def main() -> list[tuple[str, str, str, str]]:
 
 
 def _opened(result: Path, *options: str) -> tuple[float, float]:
-    """Return the seconds until a dataset can be seen in a browser, and the memory that was used in MB."""
+    """Return the seconds until a browser can show the dataset, and the memory that was used in MB."""
     begin = perf_counter()
     command = [FUSELOG, "view", str(result), "--web", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         most = [0]
         Thread(target=_watch, args=(process.pid, most), daemon=True).start()
         assert process.stdout is not None
