@@ -408,17 +408,19 @@ def _runs_of(paths: Sequence[Path], gap_limit_s: float, *, is_asked: bool) -> "R
 
     Raises BadInput if several runs are requested and there are none.
     """
-    from fuselog.pipeline.presenting.segments import runs_in, together
+    from fuselog.pipeline.presenting.segments import runs_in, runs_of_logs, together
     from fuselog.replay.timeline.catalog import EXTRA, has_catalog
 
+    if len(paths) > 1 and all(path.suffix == ".mcap" for path in paths):
+        return runs_of_logs(paths[0], paths, gap_limit_s)
     given = [runs_in(path, gap_limit_s) for path in paths]
     found = [each for each in given if each is not None]
     if len(found) < len(paths):
         if is_asked:
             without = paths[given.index(None)]
             raise BadInput(
-                f"{without}: has no row for each run; give a result of fuselog run or sweep, or a "
-                "folder of logs, or leave out --runs and --port"
+                f"{without}: has no row for each run; give results of fuselog run or sweep, such as "
+                "those of a comparison, or logs, or leave out --runs and --port"
             )
         return None
     if not is_asked and (paths[0] / RESULT_FILE).is_file():

@@ -191,7 +191,7 @@ def view(paths: tuple[Path, ...], **options: Any) -> None:
     """Open PATHS in the Rerun viewer: a log, an estimates log, a result, an .rrd, or a folder of logs.
 
     Results with several runs and folders of logs open as a sortable table of runs, the worst first.
-    Several results of the same runs are shown together, each with its own colours.
+    Several results of the same runs, or several estimates logs of one log, are drawn in one scene.
     """
     from fuselog.pipeline.command_line.commands import view_path
 

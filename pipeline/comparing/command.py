@@ -1,5 +1,6 @@
 """The command `fuselog compare`, which prints verdicts with intervals and writes the chosen outputs."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -50,6 +51,7 @@ def compare_candidates(
     """
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     alterations, own = split_texts(settings)
+    given = candidates
     candidates = with_logs_of_folders(candidates, labels, recover=recover)
     has = recorded_labels(candidates, recover=recover)
     recorded = [label for label in labels if label in has]
@@ -100,4 +102,6 @@ def compare_candidates(
         say(sentence)
     for path in written:
         say(str(path))
+    if not labels and all(each.is_dir() or each.suffix == ".mcap" for each in given):
+        say(f"to see the runs with all of them: fuselog view {shlex.join(map(str, given))}")
     return not worse

@@ -37,7 +37,6 @@ from fuselog.replay.timeline.catalog import (
     write_table_layout,
 )
 from fuselog.replay.timeline.drawing.canvas import escaped
-from fuselog.replay.timeline.show import Drawing
 
 MARKER = "fuselog.json"
 LAYOUT, TABLE = "layout.rbl", "table.rbl"
@@ -151,6 +150,8 @@ def draw(segment: Segment, gap_limit_s: float, place: Path) -> list[str]:
 
     Returns sentences on errors that differ from those of the result, since the code has changed.
     """
+    from fuselog.replay.timeline.show import Drawing  # slow to import
+
     source, estimates, versions = segment.load()
     with whole_folder(place, _refuse) as new:
         whole = new / "whole.rrd"

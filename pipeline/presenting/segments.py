@@ -19,11 +19,9 @@ from fuselog.pipeline.runs.experiment import Stated
 from fuselog.pipeline.runs.initial_states import order_of
 from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.pipeline.runs.runner import Runner, runner_again
-from fuselog.pipeline.runs.sweeps import settings_at
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
-from fuselog.replay.judging.tables import joined
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -176,7 +174,8 @@ def runs_in(path: Path, gap_limit_s: float) -> Runs | None:
     if not path.is_dir():
         return None
     if not (path / RESULT_FILE).is_file():
-        return _of_folder(path, gap_limit_s)
+        files = sorted(path.glob("*.mcap"))
+        return runs_of_logs(path, files, gap_limit_s) if files else None
     result = read_result(path)
     if "sweep" in result.settings:
         return _of_sweep(path, result)
@@ -251,6 +250,8 @@ def _part_of(folder: Path, runner: Runner, run: int) -> Part:
 
 def _of_sweep(folder: Path, result: Result) -> Runs:
     """Return the runs at all points of a sweep."""
+    from fuselog.pipeline.runs.sweeps import settings_at  # slow to import
+
     points = result.settings["sweep"]
     runner = runner_again(folder, result)
     entries = runner.experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
@@ -274,9 +275,18 @@ def _of_sweep(folder: Path, result: Result) -> Runs:
     return _sorted(folder, rows, parts, about, runner.experiment.gap_limit_s)
 
 
-def _of_folder(folder: Path, gap_limit_s: float) -> Runs | None:
-    """Return the logs in a folder and their estimates; None if there are none."""
-    files = sorted(folder.glob("*.mcap"))
+def runs_of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
+    """Return a run for each log, with the estimates in all estimates logs of it as versions.
+
+    Args:
+        path: next to which the drawings are kept.
+        files: logs and estimates logs.
+        gap_limit_s: longest gap over which the truth is interpolated.
+
+    Raises BadInput if a log cannot be read, or the log of estimates is missing.
+    """
+    from fuselog.replay.judging.tables import joined  # slow to import
+
     parts: dict[str, list[Part]] = {}
     logs: dict[str, Path] = {}
     for file in files:
@@ -290,8 +300,6 @@ def _of_folder(folder: Path, gap_limit_s: float) -> Runs | None:
             logs[file.stem] = file
     for name, file in logs.items():
         parts.setdefault(name, [Part(log=file, estimates=file if labels_of(open_log(file)) else None)])
-    if not parts:
-        return None
     segments = [
         Segment(name, tuple(sorted(own, key=lambda part: (part.title != name, part.title))), {})
         for name, own in parts.items()
@@ -301,7 +309,7 @@ def _of_folder(folder: Path, gap_limit_s: float) -> Runs | None:
         each.name: {"log": str(each.parts[0].log)} for each in segments
     }
     versions = {each.name: each.parts for each in segments}
-    return _sorted(folder, rows, versions, about, gap_limit_s)
+    return _sorted(path, rows, versions, about, gap_limit_s)
 
 
 def _judged(segment: Segment, gap_limit_s: float) -> "pd.DataFrame":

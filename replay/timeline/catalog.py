@@ -18,7 +18,7 @@ from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
 from rerun.server import Server
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.timeline.show import ABOUT
+from fuselog.replay.timeline.drawing.canvas import ABOUT
 
 LOOPBACK = "127.0.0.1"
 PROPERTIES, BASE = "properties", "base"

@@ -20,7 +20,7 @@ from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.divergence import Divergence, find_divergence
 from fuselog.replay.judging.errors.evaluation import Errors, errors_at
 from fuselog.replay.judging.errors.moments import Moments
-from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
+from fuselog.replay.timeline.drawing.canvas import ABOUT, DRAWN_ROWS, Canvas, Scene, Timeline
 from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 from fuselog.replay.timeline.fanning import Fan, draw_fans
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
@@ -28,8 +28,6 @@ from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
-# The entity of the text about a segment of a dataset.
-ABOUT = "about"
 # Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
 

@@ -3,6 +3,7 @@
 import shutil
 import socket
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 
 from fuselog.pipeline.output.results import read_table
 from fuselog.pipeline.presenting import segments
-from fuselog.pipeline.presenting.making import Kept
+from fuselog.pipeline.presenting.making import Kept, draw
 from fuselog.pipeline.presenting.segments import runs_in
 from fuselog.recorders.log import open_log, read_streams
 from fuselog.replay.timeline import catalog, viewer
@@ -145,6 +146,58 @@ def test_two_versions_of_an_estimator_are_in_one_scene(
     assert {name for _, name in made.layers} == {"base", "ekf", "ekf new"}
 
 
+def test_a_run_that_is_not_replayed_as_it_was_is_reported(result: Path, tmp_path: Path) -> None:
+    runs = runs_in(result, 0.2)
+    assert runs is not None
+    (segment,) = runs.chosen("2")
+    assert draw(segment, runs.gap_limit_s, tmp_path / "same") == []
+    ekf = segment.properties["ekf"]
+    stated = {**segment.properties, "ekf": {**ekf, "nees": 2.0 * float(ekf["nees"])}}
+    (sentence,) = draw(replace(segment, properties=stated), runs.gap_limit_s, tmp_path / "other")
+    assert sentence.startswith("run-0002: drawn now, nees of ekf is")
+
+
+@pytest.mark.paper
+def test_two_results_of_the_same_runs_are_shown_together(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """The estimates of the second have its name; other runs are refused."""
+    common = ["landmarks", "--runs", str(RUNS), "--set", "duration_s=2", "--logs", "0"]
+    old = tmp_path / "old"
+    assert fuselog("run", *common, "--set", "ekf.sigma_range_m=1", "--out", old).code == 0
+    said = fuselog("view", result, old, "--runs", "2", "--save", tmp_path / "set")
+    assert said.code == 0, said.err
+    (server, *_), table = read_back(tmp_path / "set")
+    server.shutdown()
+    for folder, label in ((result, "ekf"), (old, "ekf old")):
+        rows = read_table(folder / segments.RUNS).query("estimator == 'ekf'").sort_values("run")
+        shown = [each[0] for each in table[catalog.column_of(label, "nees")]]
+        np.testing.assert_array_equal(shown, rows["nees"])
+    other = tmp_path / "other"
+    assert fuselog("run", *common, "--seed", "9", "--out", other).code == 0
+    said = fuselog("view", result, other, "--save", tmp_path / "none")
+    assert said.code == 2
+    assert "give results of the same runs" in said.err
+
+
+@pytest.mark.paper
+def test_points_of_a_sweep_have_their_parameters(fuselog: Fuselog, tmp_path: Path) -> None:
+    """A run is replayed with the parameters of its point, so that its error is that of the table."""
+    swept = ["--over", "ekf.sigma_range_m=0.05,0.5", "--runs", "2", "--set", "duration_s=2"]
+    assert fuselog("sweep", "landmarks", *swept, "--out", tmp_path / "swept").code == 0
+    said = fuselog("view", tmp_path / "swept", "--runs", "point-0001", "--save", tmp_path / "set")
+    assert said.code == 0
+    assert said.err == ""  # nothing differs from the result
+    (server, *_), table = read_back(tmp_path / "set")
+    server.shutdown()
+    shown = table[catalog.column_of("run", "ekf.sigma_range_m")].map(lambda each: each[0])
+    assert shown.to_dict() == {
+        f"point-{point:04d}-run-{run:04d}": value
+        for point, value in enumerate([0.05, 0.5])
+        for run in range(2)
+    }
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -180,6 +233,7 @@ def test_a_port_in_use_is_refused(result: Path, fuselog: Fuselog) -> None:
     assert said.err.count("\n") == 1
 
 
+@pytest.mark.paper
 def test_a_run_without_log_and_seed_is_refused(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     shutil.copy(result / "logs" / "run-0000.mcap", log)
@@ -206,6 +260,7 @@ def test_without_the_extra_the_first_run_is_shown(
     assert "needs the extra catalog" in said.err
 
 
+@pytest.mark.paper
 def test_a_report_has_the_command_that_opens_the_worst_run(
     result: Path, fuselog: Fuselog, tmp_path: Path
 ) -> None:
