@@ -9,6 +9,7 @@ from fuselog.pipeline.checking.junit import JUNIT, write_junit
 from fuselog.pipeline.checking.stored import Golden, read
 from fuselog.pipeline.output.outputs import check_files
 from fuselog.pipeline.output.terminal import print_json, say
+from fuselog.pipeline.output.words import count
 from fuselog.pipeline.runs.ensemble import Settings
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators
 from fuselog.recorders.errors import BadInput
@@ -51,8 +52,7 @@ def check_path(
         )
         streams = sum(len(run["streams"]) for run in made["runs"].values())
         size_kb = golden.stat().st_size / 1e3
-        runs = len(made["runs"])
-        say(f"{golden}: {runs} run{'s' * (runs != 1)}, {streams} streams, {size_kb:.0f} kB")
+        say(f"{golden}: {count(len(made['runs']), 'run')}, {streams} streams, {size_kb:.0f} kB")
         return True
     if junit is not None:
         check_files([(junit, JUNIT)], {"golden": [golden]})

@@ -18,7 +18,6 @@ from fuselog.pipeline.comparing.groups import (
     inputs_of,
     kind_of,
     named_in,
-    runs_of,
     table_of_runs,
     unlike_runs,
     with_logs_of_folders,
@@ -30,6 +29,7 @@ from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve, leve
 from fuselog.pipeline.output.coverage import coverage_table, sentences
 from fuselog.pipeline.output.outputs import TIMELINE, check_files, check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
+from fuselog.pipeline.output.words import count
 from fuselog.pipeline.runs.ensemble import Progress, judge_logs, no_progress
 from fuselog.pipeline.runs.estimates import hash_files
 from fuselog.pipeline.stressing.stressing import stress as stress_logs
@@ -112,8 +112,7 @@ class Differences:
         if runs < FEWEST_RUNS:
             raise BadInput(
                 f"an interval needs at least {FEWEST_RUNS} runs, and the comparison has only "
-                f"{runs_of(runs)}; "
-                "give more runs, or leave out --fail-if-worse"
+                f"{count(runs, 'run')}; give more runs, or leave out --fail-if-worse"
             )
         worse = [
             each for each in judged if each.found.verdict == Comparison.WORSE and not each.is_withheld
@@ -345,7 +344,7 @@ def _compared(
         rows = known[known["quantity"] == quantity]
         missing = len(set(both["run"])) - len(set(rows["run"]))
         if missing:
-            notes.append(f"{quantity}: {runs_of(missing)} without it are left out")
+            notes.append(f"{quantity}: {count(missing, 'run')} without it are left out")
         scale = NATS if quantity == "log_likelihood" else None
         cases = list(dict.fromkeys(rows["case"]))
         sizes = {first.sizes.get((quantity, case), target_of(quantity)) for case in cases}

@@ -19,6 +19,7 @@ from fuselog.pipeline.comparing.candidates import (
 )
 from fuselog.pipeline.logs.folders import recordings_in
 from fuselog.pipeline.output.results import RESULT_FILE
+from fuselog.pipeline.output.words import count
 from fuselog.pipeline.runs.ensemble import Progress
 from fuselog.pipeline.runs.estimates import labels_of, recorded_estimators
 from fuselog.recorders.errors import BadInput, choices, some_of
@@ -30,11 +31,6 @@ from fuselog.replay.judging.errors.trajectory_streams import truth_of
 # Largest number of differing settings that a note names.
 NAMED = 8
 IN_LOGS = ("estimates", "log")
-
-
-def runs_of(count: int) -> str:
-    """Format a number of runs."""
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 def inputs_of(
@@ -206,22 +202,21 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         alone = [run for run in own if run not in set(common)]
         if alone:
             yield (
-                f"only {candidate.name} has {runs_of(len(alone))}, left out: {', '.join(alone[:3])}"
+                f"only {candidate.name} has {count(len(alone), 'run')}, left out: {', '.join(alone[:3])}"
                 + (", ..." if len(alone) > 3 else "")
             )
     judged = [run for run in common if run in first.truths and run in second.truths]
     apart = [run for run in judged if first.truths[run] != second.truths[run]]
     if apart:
-        count = runs_of(len(apart))
-        yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
+        runs_apart = count(len(apart), "run")
+        yield f"{first.name} and {second.name} have different truths in {runs_apart}: {apart[0]}"
     ours, theirs = first.settings or {}, second.settings or {}
     # settings that only one candidate has belong to its method, so they are not compared
     both = {name: (ours[name], theirs[name]) for name in ours if name in theirs}
     differing = [f"{name} {_stated(a)} and {_stated(b)}" for name, (a, b) in both.items() if a != b]
     if differing:
-        more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
-        what = ", ".join(differing[:NAMED])
-        yield f"settings differ between {first.name} and {second.name}: {what}{more}"
+        named = some_of(differing, NAMED)
+        yield f"settings differ between {first.name} and {second.name}: {named}"
 
 
 def _stated(value: Any) -> Any:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from fuselog.pipeline.comparing.groups import runs_of
 from fuselog.pipeline.output.alarms import Stressing
+from fuselog.pipeline.output.words import count
 from fuselog.replay.judging.errors.differences import Difference, Target
 from fuselog.replay.judging.intervals import FEWEST_RUNS, too_few
 from fuselog.replay.judging.verdicts import DIFFER, Comparison
@@ -52,7 +52,7 @@ class Paired(NamedTuple):
             equal = "equal in every run; " if found.verdict == Comparison.TIE else ""
             return f"{self.quantity}{of}: {values}; {equal}{too_few(found.runs)}"
         interval = f"difference {found.more}"
-        of_runs = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
+        of_runs = f"{count(found.runs, 'run')}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
         if found.verdict == Comparison.UNDECIDED:
             verdict = f"{self.second} and {self.first} may or may not differ by more than the margin"

@@ -169,22 +169,20 @@ class SensorNoise:
         from fuselog.replay.timeline.drawing.curves import CurvePanel, save_curves
         from fuselog.replay.timeline.drawing.plane import Stroke
 
-        interval_stroke = Stroke(MUTED, 1.0)
         strokes = {
-            "measured": Stroke(PALETTE[0], 1.5),
-            "95 % from": interval_stroke,
-            "95 % to": interval_stroke,
-            "fitted model": Stroke(PALETTE[1], 1.0),
+            "measured": ("deviation", Stroke(PALETTE[0], 1.5)),
+            "95 % from": ("low", Stroke(MUTED, 1.0)),
+            "95 % to": ("high", Stroke(MUTED, 1.0)),
+            "fitted model": ("model", Stroke(PALETTE[1], 1.0)),
         }
-        panels = []
-        for name, of_column in self.curves.groupby("column", sort=False):
-            taus_s = of_column["tau_s"].to_numpy()
-            columns = zip(strokes, ("deviation", "low", "high", "model"), strict=True)
-            curves = {
-                each: np.stack([taus_s, of_column[key].to_numpy()], axis=1) for each, key in columns
-            }
-            title = f"{name}: Allan deviation over averaging time (s)"
-            panels.append(CurvePanel(title, curves, strokes))
+        panels = [
+            CurvePanel(
+                f"{name}: Allan deviation over averaging time (s)",
+                {label: rows[["tau_s", key]].to_numpy() for label, (key, _) in strokes.items()},
+                {label: stroke for label, (_, stroke) in strokes.items()},
+            )
+            for name, rows in self.curves.groupby("column", sort=False)
+        ]
         save_curves(f"noise of {self.name}", panels, rrd)
 
     def save(self, folder: str | Path) -> ResultFolder:
