@@ -25,6 +25,7 @@ from fuselog.replay.inference.linear_algebra.gaussian import (
     drop_missing,
     kalman_step,
     whiten,
+    whiten_kept,
     wrap,
 )
 from fuselog.replay.inference.linear_algebra.inflation import inflate, inflation
@@ -330,10 +331,7 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
             return NOT_POSITIVE_DEFINITE
         write_innovation(innovation, record)
         size = drop_missing(innovation)
-        if size == m:  # a number that the kernel knows, so that it needs no loops
-            squared, determinant = whiten(innovation, m)
-        else:
-            squared, determinant = whiten(innovation, size)
+        squared, determinant = whiten_kept(innovation, size, m)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
@@ -341,7 +339,7 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
         if accepted:
             if factor != 1.0:
                 inflate(innovation, size, factor)
-            if size == m:
+            if size == m:  # a number that the kernel knows, so that it needs no loops
                 reduce(covariance, innovation, m, work)
             else:
                 reduce(covariance, innovation, size, work)

@@ -185,6 +185,13 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     return whiten_by(factor, difference, size)
 
 
+def whiten_kept(innovation: Innovation, size: int, components: int) -> tuple[float, float]:
+    """Call `whiten`, without loops if all components are measured, whose number a kernel knows."""
+    if size == components:
+        return whiten(innovation, components)
+    return whiten(innovation, size)
+
+
 def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, float]:
     """Replace v by L^-1 v, and return its square and log det L L'.
 

@@ -20,7 +20,7 @@ from fuselog.replay.inference.kalman.steps import (
     UpdateRun,
 )
 from fuselog.replay.inference.kalman.update import innovation_components, writing_innovation
-from fuselog.replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
+from fuselog.replay.inference.linear_algebra.gaussian import drop_missing, whiten_kept, wrap
 from fuselog.replay.inference.linear_algebra.tuples import range_of
 from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.modes.mixing import MixtureMemory
@@ -146,7 +146,7 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
                     entry += probability[mode] * (records.covariance[mode, row, column] + spread)
                 covariance[i, j] = covariance[j, i] = entry
         write_innovation(innovation, record)
-        squared = whiten(innovation, drop_missing(innovation))[0]
+        squared = whiten_kept(innovation, drop_missing(innovation), m)[0]
         if np.isnan(squared):  # singular at the precision of covariances: use the mean NIS of the modes
             squared = 0.0
             for mode in range(len(probability)):

@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 
 from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.compiling.kernels.functions import FUNCTIONS
+from fuselog.recorders.compiling.kernels.words import high_word
 
 # Exactly rounded, or made of nothing else: the same in every bit.
 EXACT = [
@@ -112,12 +113,28 @@ def divided(run: int, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     out[run, 4], out[run, 5] = a & b, a ^ b
 
 
+@given(*(st.integers(0, 2**64 - 1) | st.just(2**64 - 1),) * 2)
+def test_high_words_are_those_of_integers(x: int, y: int):
+    out = np.zeros(1, np.uint64)
+    loop_of_words()(1, np.array([x], np.uint64), np.array([y], np.uint64), out)
+    with np.errstate(over="ignore"):
+        assert int(out[0]) == int(high_word(np.uint64(x), np.uint64(y))) == (x * y) >> 64
+
+
+@cache
+def loop_of_words() -> Callable[..., None]:
+    def once(run: int, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+        out[run] = high_word(x[run], y[run])
+
+    return compile_over_runs(once)
+
+
 def test_every_function_of_numbers_is_compared_somewhere():
     """Those that are left are operators under other names, conversions, choices and `frexp`.
 
     What `math` has of them is the same functions.
     """
-    compared = {*EXACT, *OF_ONE, *ROUNDED, *ROUNDED_OF_TWO}
+    compared = {*EXACT, *OF_ONE, *ROUNDED, *ROUNDED_OF_TWO, high_word}
     same = {
         each for name, each in vars(math).items() if name[0] != "_" and name not in ("frexp", "sqrt")
     }
