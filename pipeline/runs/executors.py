@@ -1,9 +1,11 @@
 """Workers for a campaign's cells: this process, others on this machine, a Dask cluster."""
 
+import ctypes
 import hashlib
 import logging
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
@@ -30,6 +32,8 @@ from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
 
 # With fewer runs, starting processes takes longer than they save.
 PAYING_RUNS = 1000
+# Parameters of glibc's mallopt.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 PACKAGES = ("fuselog.recorders", "fuselog.replay", "fuselog.pipeline")
 
 
@@ -95,6 +99,18 @@ class InlineExecutor(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+@cache
+def keep_freed_memory() -> None:
+    """Keep the memory of freed arrays for new ones, because the system clears each page that it gives.
+
+    Only glibc has such settings; arrays above 32 MB, its largest limit, are not affected.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, 32 << 20)
+        mallopt(_TRIM_THRESHOLD, 1 << 30)
 
 
 @contextmanager
