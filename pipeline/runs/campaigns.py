@@ -25,6 +25,7 @@ from fuselog.pipeline.runs.ensemble import Pass, parts_of
 from fuselog.pipeline.runs.executors import (
     PoolFactory,
     inline_pool,
+    keep_freed_memory,
     states_of,
     version_of_code,
 )
@@ -83,6 +84,7 @@ class Cell:
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
         """Record or open the runs, replay and judge them, and write files to the folder."""
+        keep_freed_memory()
         if setting is None:
             logs = self.first + self.logs
             setting = Setting(folder, self.place, logs=logs, draws=self.draws, errors=self.errors)

@@ -1,9 +1,11 @@
 """Workers for the cells of an experiment: this process, local processes, or a Dask cluster."""
 
+import ctypes
 import hashlib
 import logging
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
@@ -30,6 +32,8 @@ from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
 
 # Smallest number of runs for which starting processes saves time.
 PAYING_RUNS = 1000
+# Parameters of glibc's mallopt.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 PACKAGES = ("fuselog.recorders", "fuselog.replay", "fuselog.pipeline")
 
 
@@ -96,6 +100,18 @@ class InlineExecutor(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+@cache
+def keep_freed_memory() -> None:
+    """Keep the memory of freed arrays for new ones, because the system clears each page that it gives.
+
+    Only glibc has such settings; arrays above 32 MB, its largest limit, are not affected.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, 32 << 20)
+        mallopt(_TRIM_THRESHOLD, 1 << 30)
 
 
 @contextmanager

@@ -233,15 +233,10 @@ def _look(
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
     outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
     pose = robot.pose_at(times_s)
-    places = np.array(
-        [
-            each.pose_at(times_s)[:, :2].T
-            if isinstance(each, Drive)
-            else np.broadcast_to(each[:, None], (2, len(times_s)))
-            for each in targets.values()
-        ]
-    ).reshape(len(targets), 2, len(times_s))
-    distance, bearing = range_bearing(pose.T[:, None, :], places.transpose(1, 0, 2))
+    places = np.empty((2, len(targets), len(times_s)))
+    for place, each in zip(places.swapaxes(0, 1), targets.values(), strict=True):
+        place[:] = each.pose_at(times_s)[:, :2].T if isinstance(each, Drive) else each[:, None]
+    distance, bearing = range_bearing(pose.T[:, None, :], places)
     bearing = wrap_angle(bearing)
     half_view = np.radians(sensor.field_of_view_deg) / 2
     visible = (distance <= sensor.maximum_range_m) & (np.abs(bearing) <= half_view) & ~dead

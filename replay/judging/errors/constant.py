@@ -147,7 +147,10 @@ def _inverse(covariance: Floats) -> Floats:
     if not np.isfinite(a + c).all():
         a, c = (np.where(np.isfinite(each), each, 1e150) for each in (a, c))
         b = np.where(np.isfinite(b), b, 0.0)
-    return np.array([[c, -b], [-b, a]]) / (a * c - b * b)
+    weight, determinant = np.empty(covariance.shape), a * c - b * b
+    weight[0, 0], weight[1, 1] = c / determinant, a / determinant
+    weight[0, 1] = weight[1, 0] = -b / determinant
+    return weight
 
 
 def turn(cosine: Floats, sine: Floats, error: Floats, weight: Floats) -> None:
