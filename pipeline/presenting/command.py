@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
+from shlex import quote
 
 from fuselog.pipeline.output.outputs import PICTURE, check_files, check_folder
 from fuselog.pipeline.output.terminal import progress, say, status, warn
@@ -24,7 +25,7 @@ def save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
     made = _all_made(kept, chosen)
     kept.save(folder, made)
     say(f"{folder}: {len(runs.segments)} runs, {runs.order}; {len(made)} with streams and estimates")
-    say(f"next: rerun server --host 127.0.0.1 -d {folder}")
+    say(f"to serve it: rerun server --host 127.0.0.1 -d {quote(str(folder))}")
 
 
 def show_dataset(
