@@ -51,7 +51,8 @@ def show_dataset(
             dataset.lay_out(place / TABLE, table=True)
             made = kept.made()
             dataset.add([layer for each in made for layer in each.layers])
-            for each in made[:1]:
+            drawn = [each for each in made if each.segment in chosen] or made
+            for each in drawn[:1]:
                 dataset.lay_out(each.folder / LAYOUT)
         missing = _missing(chosen, made)
         say(f"{runs.path}: {len(runs.segments)} runs, {runs.order}; {dataset.url}")
@@ -87,7 +88,8 @@ def _add(dataset: Dataset, kept: Kept, missing: Sequence[Segment], listener: Lis
         for each in progress(making, "drawing runs", len(missing)):
             _tell(each)
             dataset.add(each.layers)
-            dataset.lay_out(each.folder / LAYOUT)
+            if not dataset.has_layout or listener is None:
+                dataset.lay_out(each.folder / LAYOUT)
             if listener is not None and listener.process.poll() is not None:
                 return
 

@@ -66,6 +66,11 @@ class Dataset:
         """Set the layout of all segments, or that of the table of segments, from an .rbl file."""
         self._entry.register_blueprint(blueprint.resolve().as_uri(), segment_table=table)
 
+    @property
+    def has_layout(self) -> bool:
+        """Test whether the segments have a layout."""
+        return self._entry.default_blueprint() is not None
+
     def url_of(self, segment: str, at_s: float | None = None) -> str:
         """Return the address of a segment, at a time in seconds since the run's epoch."""
         if at_s is None:
