@@ -413,7 +413,14 @@ def _runs_of(paths: Sequence[Path], gap_limit_s: float, *, is_asked: bool) -> "R
 
     if len(paths) > 1 and all(path.suffix == ".mcap" for path in paths):
         return runs_of_logs(paths[0], paths, gap_limit_s)
-    given = [runs_in(path, gap_limit_s) for path in paths]
+    is_result = (paths[0] / RESULT_FILE).is_file()
+    try:
+        given = [runs_in(path, gap_limit_s) for path in paths]
+    except BadInput as error:
+        if is_asked or not is_result:
+            raise
+        warn(f"{error}; showing the first run")
+        return None
     found = [each for each in given if each is not None]
     if len(found) < len(paths):
         if is_asked:
@@ -423,7 +430,7 @@ def _runs_of(paths: Sequence[Path], gap_limit_s: float, *, is_asked: bool) -> "R
                 "those of a comparison, or logs, or leave out --runs and --port"
             )
         return None
-    if not is_asked and (paths[0] / RESULT_FILE).is_file():
+    if not is_asked and is_result:
         if len(found[0].segments) < 2:
             return None
         if not has_catalog():

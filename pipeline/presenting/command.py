@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
+from shlex import quote
 
 from fuselog.pipeline.output.outputs import PICTURE, check_files, check_folder
 from fuselog.pipeline.output.terminal import progress, say, status, warn
@@ -24,7 +25,7 @@ def save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
     made = _all_made(kept, chosen)
     kept.save(folder, made)
     say(f"{folder}: {len(runs.segments)} runs, {runs.order}; {len(made)} with streams and estimates")
-    say(f"next: rerun server --host 127.0.0.1 -d {folder}")
+    say(f"to serve it: rerun server --host 127.0.0.1 -d {quote(str(folder))}")
 
 
 def show_dataset(
@@ -50,7 +51,8 @@ def show_dataset(
             dataset.lay_out(place / TABLE, table=True)
             made = kept.made()
             dataset.add([layer for each in made for layer in each.layers])
-            for each in made[:1]:
+            drawn = [each for each in made if each.segment in chosen] or made
+            for each in drawn[:1]:
                 dataset.lay_out(each.folder / LAYOUT)
         missing = _missing(chosen, made)
         say(f"{runs.path}: {len(runs.segments)} runs, {runs.order}; {dataset.url}")
@@ -86,7 +88,8 @@ def _add(dataset: Dataset, kept: Kept, missing: Sequence[Segment], listener: Lis
         for each in progress(making, "drawing runs", len(missing)):
             _tell(each)
             dataset.add(each.layers)
-            dataset.lay_out(each.folder / LAYOUT)
+            if not dataset.has_layout or listener is None:
+                dataset.lay_out(each.folder / LAYOUT)
             if listener is not None and listener.process.poll() is not None:
                 return
 

@@ -14,8 +14,10 @@ import math
 import shutil
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
 from pathlib import Path
 from shlex import quote
+from time import monotonic, sleep
 from typing import Any, NamedTuple
 from urllib.parse import quote as file_name
 from urllib.parse import unquote
@@ -39,6 +41,8 @@ from fuselog.replay.timeline.catalog import (
 from fuselog.replay.timeline.drawing.canvas import escaped
 
 MARKER = "fuselog.json"
+# Time in which terminated workers end.
+ENDING_S = 5.0
 LAYOUT, TABLE = "layout.rbl", "table.rbl"
 APPLICATION = "fuselog"
 
@@ -73,6 +77,7 @@ class Kept:
         _require_ours(self.folder, "move it away")
         with whole_file(self.folder / MARKER) as new:
             new.write_text(json.dumps({"of": place.name}) + "\n", encoding="utf-8")
+        self._clear()
 
     def properties(self) -> Path:
         """Return the folder of the layer of properties of all segments; make it if it is not there."""
@@ -119,8 +124,18 @@ class Kept:
                         _remove_others(place)
                         yield Made(segment, place, warnings)
         finally:
-            for segment in pending.values():
-                clear_leftovers(self._place(segment))
+            end_s = monotonic() + ENDING_S
+            while self._clear() and monotonic() < end_s:  # workers that were terminated still end
+                sleep(0.05)
+
+    def _clear(self) -> bool:
+        """Remove what interrupted drawings left; return whether one is still active."""
+        left = {part.parent / part.name.split(".")[1] for part in self.folder.glob("*/.*.part")}
+        active = [place for place in left if clear_leftovers(place)]
+        for folder in {place.parent for place in left}:
+            with suppress(OSError):
+                folder.rmdir()
+        return bool(active)
 
     def _place(self, segment: Segment) -> Path:
         return self.folder / file_name(segment.name) / segment.key

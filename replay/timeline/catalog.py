@@ -4,6 +4,7 @@ A dataset has segments, one for each run. A segment has layers, each a file: its
 columns of the dataset's table, what was recorded, and one for each estimator.
 """
 
+import errno
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -64,6 +65,11 @@ class Dataset:
     def lay_out(self, blueprint: Path, *, table: bool = False) -> None:
         """Set the layout of all segments, or that of the table of segments, from an .rbl file."""
         self._entry.register_blueprint(blueprint.resolve().as_uri(), segment_table=table)
+
+    @property
+    def has_layout(self) -> bool:
+        """Test whether the segments have a layout."""
+        return self._entry.default_blueprint() is not None
 
     def url_of(self, segment: str, at_s: float | None = None) -> str:
         """Return the address of a segment, at a time in seconds since the run's epoch."""
@@ -140,12 +146,12 @@ def _values(values: Mapping[str, Any]) -> rr.AnyValues:
 
 
 def write_chunks(path: Path, application: str, name: str, chunks: Sequence[rc.Chunk]) -> None:
-    """Write chunks of a segment to an .rrd file; raises BadInput if that fails."""
+    """Write chunks of a segment to an .rrd file; raises OSError if that fails."""
     try:
         stream = rc.LazyChunkStream.from_iter(chunks)
         stream.write_rrd(path, application_id=application, recording_id=name)
     except Exception as error:  # rerun does not document its exceptions
-        raise BadInput(f"{path.parent}: cannot be written ({error})") from error
+        raise OSError(errno.EIO, str(error), str(path)) from error
 
 
 def read_chunks(path: Path) -> list[rc.Chunk]:

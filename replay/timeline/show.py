@@ -158,6 +158,7 @@ class Drawing:
             known = choices(self._focus, scene.cases)
             raise BadInput(f"--focus {self._focus}: no case in this log has this name; {known}")
         canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
+        canvas = replace(canvas, is_shared=self._layout is not None)
         layout = self._timeline.draw(canvas, scene)
         keep_moments(recording, scene.moments)
         if self._sides:

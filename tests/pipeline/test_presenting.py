@@ -97,6 +97,7 @@ def test_layers_are_what_was_recorded_and_each_estimator(result: Path, dataset: 
         layers = served._entry.segment_table().to_pandas().set_index("rerun_segment_id")
         found = {name: {*of} for name, of in layers["rerun_layer_names"].items()}
         assert served._entry.default_blueprint() in served._entry.blueprints()
+        assert served.has_layout
         process = psutil.Process()
         listening = [each for each in process.net_connections() if each.status == psutil.CONN_LISTEN]
         assert listening
@@ -155,6 +156,36 @@ def test_a_run_that_is_not_replayed_as_it_was_is_reported(result: Path, tmp_path
     stated = {**segment.properties, "ekf": {**ekf, "nees": 2.0 * float(ekf["nees"])}}
     (sentence,) = draw(replace(segment, properties=stated), runs.gap_limit_s, tmp_path / "other")
     assert sentence.startswith("run-0002: drawn now, nees of ekf is")
+
+
+def test_the_layout_that_runs_share_counts_nothing(result: Path, tmp_path: Path) -> None:
+    """What is outside the range of a plot differs from run to run."""
+
+    def titles(file: Path) -> set[str]:
+        from rerun.chunk import RrdReader
+
+        reader = RrdReader(str(file))
+        (layout,) = reader.blueprints()
+        views = [each.to_record_batch() for each in reader.stream(store=layout)]
+        return {
+            name[0]
+            for batch in views
+            for name in (
+                batch.column("ViewBlueprint:display_name").to_pylist()
+                if "ViewBlueprint:display_name" in batch.schema.names
+                else []
+            )
+            if name
+        }
+
+    runs = runs_in(result, 0.2)
+    assert runs is not None
+    draw(runs.chosen("0")[0], runs.gap_limit_s, tmp_path / "drawn")
+    of_one = titles(result / "timeline.rrd")
+    assert any("outside" in title for title in of_one)
+    shared = titles(tmp_path / "drawn" / "layout.rbl")
+    assert len(shared) == len(of_one) + 1
+    assert not any("outside" in title for title in shared)
 
 
 @pytest.mark.paper

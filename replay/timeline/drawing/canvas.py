@@ -227,6 +227,7 @@ class Canvas:
         steps_ns: distinct times of estimates, which `step` counts.
         is_still: whether moving entities are left out because they have already been sent.
         dates: dates of stamps, if stamps are not dates.
+        is_shared: whether the layout is for other runs as well, so that titles count nothing.
     """
 
     recording: rr.RecordingStream
@@ -235,6 +236,7 @@ class Canvas:
     steps_ns: Times
     is_still: bool = False
     dates: Dates | None = None
+    is_shared: bool = False
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
         """Send all rows of an entity in one call.

@@ -92,7 +92,7 @@ def map_view(
         trail_s: length of these trails in s.
     """
     near = are_near(degrees)
-    left_out = "" if near.all() else f", without {(~near).sum()} distant points"
+    left_out = "" if near.all() or canvas.is_shared else f", without {(~near).sum()} distant points"
     trail = trail_of(canvas, trail_s)
     return rrb.MapView(
         origin=escaped(root),

@@ -204,7 +204,7 @@ def _draw_error(
         if np.mean(beyond) > SILENT_SHARE:
             outside.append(f"{errors.estimator} {np.count_nonzero(beyond)} of {len(beyond)}")
     note = f", axis to ±{extent:g}, bands ±{SIGMAS:g} sigma"
-    note += f"; outside: {', '.join(outside)}" if outside else ""
+    note += f"; outside: {', '.join(outside)}" if outside and not canvas.is_shared else ""
     return plot_view(plot, f"Error of {quantity}", unit, (-extent, extent), note=note, legend=False)
 
 
@@ -299,7 +299,8 @@ def _draw_squares(
             if above.any():
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
                 counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
-        note = f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
+        is_counted = counted and not canvas.is_shared
+        note = f"; above {end:.3g}: {', '.join(counted)}" if is_counted else ""
         note += f"; 95 % within {low:.3g} to {high:.3g}" if high < 0.2 * end or not legend else ""
         title = f"{_TITLES[name]} {of or f'{degrees} component' + 's' * (degrees != 1)}"
         extent, locked = (-0.1 * end, end), not counted
