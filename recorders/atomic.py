@@ -32,8 +32,8 @@ _LOG = logging.getLogger(__name__)
 def settled(place: Path) -> Path:
     """Resolve `..` in a path as if its missing folders already existed.
 
-    `MISSING/../FILE` is the same file as FILE, although no system finds it before MISSING exists. If the
-    path itself is a link, the link is not followed.
+    `MISSING/../FILE` is the same file as FILE, but the operating system cannot find it before MISSING
+    exists. If the path itself is a link, the link is not followed.
     """
     if place.name in ("", ".."):  # `.` has an empty name
         return Path(os.path.realpath(place))
@@ -42,7 +42,7 @@ def settled(place: Path) -> Path:
 
 @contextmanager
 def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
-    """Yield a path to write; if no exception occurs, the file there replaces `place` in one step.
+    """Yield a path to write to; if no exception occurs, the new file replaces `place` in one step.
 
     Args:
         place: destination of the file.
@@ -214,9 +214,9 @@ def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _telling(place: Path, work: Path | None = None) -> Iterator[None]:
-    """Convert the system's errors to BadInput; with a working folder, only errors on its contents.
+    """Convert the system's errors to BadInput; if `work` is given, only errors on files in that folder.
 
-    Errors without a number, which Python code raised, and errors on other files are passed on.
+    Errors without an `errno`, which Python code raised itself, and errors on other files are passed on.
     """
     try:
         yield

@@ -1,7 +1,8 @@
 """The motion of a body according to its topics: positions, velocities, wheels, turns.
 
-All values are columns over time in seconds since the log's first stamp. Both held values and samples
-are integrated over time, so distances and turns can be compared over windows without common stamps.
+All quantities are arrays over time, in seconds since the log's first stamp. Both held and sampled
+quantities are integrated over time, so topics without common stamps can be compared by the distances
+and turns in a window.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +57,8 @@ class Series:
 class PlaceSeries(Series):
     """Positions (n, 2) east and north, or along x and y, with their stated variances (n,).
 
-    If `is_flat`, they are in metres and not latitudes and longitudes, so they may have a scale error.
+    If `is_flat`, the positions were logged in metres, so they may have a scale error; otherwise they
+    were logged as latitudes and longitudes.
     """
 
     variances_m2: Floats = field(default_factory=lambda: np.empty(0))

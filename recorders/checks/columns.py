@@ -105,7 +105,7 @@ def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find negative distances: one number is a code for a missing value, others may be noise."""
+    """Find negative distances: a repeated one is a code for a missing value, others may be noise."""
     if "range_m" not in stream.columns:
         return
     ranges_m = stream["range_m"]
@@ -281,7 +281,7 @@ def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, 
 
 
 def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Test which runs of equal values result from rounding, by the grid steps to their neighbours."""
+    """Test which runs of equal values result from rounding: both neighbours are few grid steps away."""
     steps = np.abs(np.diff(column[edges]))
     farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
     levels = np.unique(column[np.isfinite(column)])

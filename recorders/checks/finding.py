@@ -77,8 +77,8 @@ class Finding:
         where: topic or parameter; for a judged replay the estimator.
         part: field of the topic; for a judged replay the case.
         value: size of the fault, as in the evidence: a factor, seconds, radians or a share; for a judged
-            replay the ratio of a number to the bound for a consistent filter.
-        evidence: a sentence.
+            replay the ratio of a statistic to its bound for a consistent filter.
+        evidence: what was found, in a sentence.
         setting: value for `--set` that corrects the fault in a replay, such as `/fix.delay_s=0.3`; empty
             if there is none.
         otherwise: another correction, such as a line of the import's mapping.
@@ -129,7 +129,7 @@ class Finding:
 
 
 def since_first(stream: "Stream", stamp_ns: int) -> str:
-    """Write a stamp of a topic relative to its first one."""
+    """Describe a stamp by the time since the topic's first stamp."""
     since_ns = int(stamp_ns) - int(stream.publish_time_ns.min())
     return f"{since_ns * 1e-9:.4g} s after its first stamp"
 

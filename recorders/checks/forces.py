@@ -27,7 +27,7 @@ UPRIGHT = {
 
 
 def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose forces, turn rates or fields are exactly zero throughout: not measured."""
+    """Find sensors whose forces, turn rates or fields are zero throughout, so were not measured."""
     if stream.schema.full_name not in UNITS or len(stream) < FEWEST:
         return
     for field, what in MEASURED.items():
@@ -45,7 +45,7 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find units whose z axis is not up at rest, unless orientations in the log explain it."""
+    """Find inertial units whose z axis is not up at rest, unless the log contains orientations."""
     if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
         return
     if any(_turns(each) for each in streams.values()):

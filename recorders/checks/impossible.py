@@ -27,7 +27,7 @@ def beyond(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def integers(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find numbers too small for full precision, as when the bits of integers are read as doubles."""
+    """Find numbers smaller than any measurement, as when the bits of integers are read as doubles."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or column.dtype.kind != "f":

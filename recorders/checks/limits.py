@@ -112,7 +112,7 @@ def _noise_m(places: Floats) -> float:
 
 
 def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find headings that turn faster than the speed of the fixes allows, as in a wrong unit."""
+    """Find headings that turn too fast for the fixes' speed, or stay the same while the course turns."""
     if stream.schema.full_name != schemas.ORIENTATION.full_name or len(stream) < FEWEST:
         return
     speed = max((_speed(other) for other in streams.values()), default=0.0)
@@ -165,7 +165,7 @@ def _speed(stream: Stream) -> float:
 
 
 def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps before 2000 that do not count from 1970, swapped days and months, and time zones."""
+    """Find dates from 1971 to 2000, days swapped with months, and wrongly stated time zones."""
     first_ns, last_ns = int(stream.publish_time_ns.min()), int(stream.publish_time_ns.max())
     if EARLIEST_NS < first_ns < LATEST_NS:
         yield of_stamps(

@@ -1,4 +1,4 @@
-"""Tables of the checks of a log, and their application, portion by portion to limit memory."""
+"""Tables of the checks, and their application to a log, portion by portion to limit memory."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
@@ -109,7 +109,8 @@ def lint(
         portions: number of portions to check; by default all.
 
     Returns:
-        The findings, the worst first; empty for a log without faults: thresholds are far from chance.
+        The findings, hints last; empty for a log without faults, since the thresholds are hardly ever
+        exceeded by chance.
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
     for index, whole in enumerate(islice(_portions(blocks), portions)):

@@ -123,7 +123,7 @@ def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def is_measured(stream: Stream) -> bool:
-    """Test whether messages are measurements, and not the truth or events without numbers."""
+    """Test whether messages contain measured numbers, unlike the truth and mere events."""
     is_number = any(each.kind in ("real", "vector") for each in stream.schema)
     return is_number and stream.schema.full_name != schemas.TRUTH_STATE.full_name
 
@@ -155,7 +155,7 @@ def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find clocks at another rate than the recorder's, of all topics (as in simulations) or of one."""
+    """Find clocks with another rate than that of other topics, or of the recorder (as if simulated)."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }
@@ -187,7 +187,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """Return how long 1 s of a topic's stamps lasts for the recorder; None if this is uncertain."""
+    """Estimate the seconds on the recorder's clock per second of a topic's stamps; None if uncertain."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

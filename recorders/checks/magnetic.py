@@ -1,4 +1,4 @@
-"""Checks of magnetic fields: the unit, and iron near the sensor, by the circle of a full turn."""
+"""Checks of magnetic fields: their unit, and iron near the sensor, from the fields in a full turn."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple

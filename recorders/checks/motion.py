@@ -37,9 +37,10 @@ class Slope(NamedTuple):
     """The ratio between the readings of two topics, over windows.
 
     Attributes:
-        value: the multiple, by least squares through zero.
-        likeness: correlation about zero; zero if a few windows determine the multiple.
-        spread: relative difference of single windows from it; infinite if a few windows determine it.
+        value: the ratio, by least squares through zero.
+        likeness: correlation about zero; zero if a few windows determine the ratio.
+        spread: median relative difference of a single window's ratio from `value`; infinite if a few
+            windows determine the ratio.
         windows: number of windows.
     """
 
@@ -165,7 +166,8 @@ class BodyMotion:
     def delays_s(self) -> dict[str, float]:
         """Compute how late each topic's stamps are compared with most topics, if this is certain.
 
-        Of two topics, the later one is late: messages are late, never early.
+        If two topics differ, the later one counts as delayed, since messages may be late, but never
+        early.
         """
         late_s: dict[str, float] = {}
         if self.places is not None and self.speed_lags:
@@ -189,7 +191,7 @@ class BodyMotion:
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
     def goes_where_it_points(self, lag: Lag) -> bool:
-        """Test by forces in the body's axes whether the course is the heading."""
+        """Test, by forces in the body's axes, whether the body moves in the direction of its heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
                 found = self.forces(force.moved(-lag.timing.lag_s))
@@ -248,9 +250,9 @@ class BodyMotion:
     def turn(self, source: Series) -> Slope | None:
         """Compute how much the course turns for each radian of a turn rate.
 
-        If it correlates with the course without a lag, no lag is used, since half a period of a
-        winding road would look like a lag. If several lags fit better, some with opposite signs, the
-        sign is unknown.
+        If the turn rate correlates with the course without a lag, no lag is used, since half a period
+        of a winding road would look like a lag. If several lags fit better, some with opposite signs,
+        the sign is unknown.
         """
         if self.courses is None:
             return None
@@ -335,7 +337,8 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 class Forces(NamedTuple):
     """The angle (rad) by which horizontal forces have to be rotated to match the course.
 
-    `fit` states how well the rotated forces match, up to 1, `mirrored` the same for their mirror image.
+    `fit` (at most 1) states how well the rotated forces match; `mirrored` states the same for their
+    mirror image.
     """
 
     angle_rad: float
@@ -344,7 +347,7 @@ class Forces(NamedTuple):
 
 
 def _hold_s(source: Series) -> float:
-    """Return the delay that the definition of a topic may imply: half a step, or a full one."""
+    """Return the delay that a topic may have by definition: half a step, or a full step for vectors."""
     step_s = float(np.median(np.diff(source.times_s)))
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 

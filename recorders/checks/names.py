@@ -1,4 +1,4 @@
-"""Checks of names: frames by REP 103, duplicate units by REP 145, topics alone in their namespace."""
+"""Checks of names: frames (REP 103), inertial units recorded twice (REP 145), isolated topics."""
 
 import re
 from collections.abc import Iterator, Mapping

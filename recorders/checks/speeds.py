@@ -199,7 +199,7 @@ def _filled(values: Floats) -> Floats:
 def chance(degrees: int, sigmas: float) -> float:
     """Compute a quantile of chi-square over its degrees of freedom, from that of a Gaussian.
 
-    Wilson and Hilferty, PNAS 17, 1931: accurate to 2 % from 18 degrees on.
+    Wilson and Hilferty, PNAS 17, 1931: accurate to 2 % for at least 18 degrees of freedom.
     """
     part = 2.0 / (9.0 * degrees)
     return float((1.0 - part + sigmas * part**0.5) ** 3)

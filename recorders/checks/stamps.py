@@ -78,7 +78,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps that go back between messages, and equal stamps of single measurements."""
+    """Find stamps that go back, and repeated stamps in topics with one measurement at a time."""
     is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
     rows = np.argsort(stream.log_time_ns if is_late else stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
@@ -170,7 +170,7 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a clock that is slightly fast or slow; `losses.drifts` reports more than 1e-3."""
+    """Find a clock that is slightly fast or slow; `losses.drifts` reports errors above 1e-3."""
     if len(stream) < FEWEST or np.array_equal(stream.publish_time_ns, stream.log_time_ns):
         return
     measured_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
@@ -205,7 +205,7 @@ def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]
 
 
 def of_stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:
-    """Make a finding about the stamps of a topic, with a correction of the mapping."""
+    """Make a finding about a topic's stamps; `mapping` names what to correct in the mapping."""
     return Finding("stamps", stream.topic, "", value, f"{stream.topic}: {words}", otherwise=mapping)
 
 

@@ -30,7 +30,8 @@ class Timing(NamedTuple):
         gain: gain of the source's clock, in s/s.
         likeness: correlation at this lag and gain, -1 to 1.
         evidence: log-likelihood minus that without lag and gain.
-        is_needed: whether, without a lag, more of the motion than a misfit remains unexplained.
+        is_needed: whether the lag still fits clearly better if a share `MISFIT` of the motion always
+            counts as unexplained.
         tolerance_s: lags up to this size are ignored.
         spread_s: largest difference of equally likely lags, plus the tolerance.
         is_alone: whether only neighbouring lags explain the motion equally well, and no lag that is a
@@ -90,9 +91,9 @@ def _changes(windows: Windows) -> int:
 
 
 def _is_one_peak(likeness: Floats, count: float) -> bool:
-    """Test whether the lags that fit about equally well are neighbours, and exclude both ends.
+    """Test whether the lags that fit about equally well are adjacent, and exclude the first and last.
 
-    The height of a peak between lags comes from the parabola through three of them.
+    The height of a peak between lags comes from the parabola through three neighbouring lags.
     """
     size = np.abs(likeness)
     below, above = size[1:-1] - size[:-2], size[1:-1] - size[2:]
@@ -138,8 +139,8 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
 def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
     """Estimate the number of independent windows.
 
-    They do not overlap, and count less if the residual persists from one to the next, as the motion of a
-    lever arm does; the reduction follows from a first-order autoregression.
+    Only windows that do not overlap are counted. They count less if residuals persist from one window to
+    the next, as those due to a lever arm do; the reduction follows from a first-order autoregression.
     """
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)

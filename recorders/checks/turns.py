@@ -67,7 +67,7 @@ def _by_forces(motion: BodyMotion, source: Series) -> int:
 
 
 def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """Report that a rate or a frame is mirrored: the frame, if a witness confirms the rate."""
+    """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else the rate."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
@@ -115,7 +115,7 @@ def _compass(orientation: Series, others: str) -> Finding:
 
 
 def degrees(motion: BodyMotion) -> Iterator[Finding]:
-    """Find turn rates in deg/s, or read as such, by the course or because no body turns so fast."""
+    """Find turn rates in deg/s, or converted from it by mistake, by the course or by their size."""
     for source in motion.body.turns:
         ratio = motion.turn(source)
         rates = np.abs(
@@ -177,7 +177,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def mounting(motion: BodyMotion) -> Iterator[Finding]:
-    """Find units whose forward axis is not the body's, by forces in curves and at changes of speed."""
+    """Find inertial units whose forward axis is not the body's, by forces in turns and accelerations."""
     for force in motion.body.forces:
         found = motion.forces(motion.aligned(force))
         if (
@@ -318,7 +318,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
-    """Compute the rms difference (rad/s) of quaternions from rates, by order; empty at rest."""
+    """Compute rms differences (rad/s) of quaternions from rates, by component order; empty at rest."""
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]

@@ -73,7 +73,8 @@ def jumps(fixes: Series) -> NDArray[np.bool_]:
     """Find the steps (n - 1,) between positions that are jumps of the receiver.
 
     A jump is a single step that differs from its neighbours by more than the noise, and is longer than
-    nearly all steps. Several long steps in one direction, or many of them, are motion and not jumps.
+    nearly all steps. Successive long steps in one direction, or frequent long steps, are motion and not
+    jumps.
     """
     steps, step_s = np.diff(fixes.values, axis=0), np.diff(fixes.times_s)
     if len(steps) < FEWEST:
@@ -126,7 +127,7 @@ def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 def _moves(fixes: PlaceSeries) -> bool:
-    """Test whether positions leave their stated error, within which a receiver at rest wanders too."""
+    """Test whether positions move farther than the stated errors of a receiver at rest explain."""
     stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
     sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0
     away_m = np.linalg.norm(fixes.values - np.median(fixes.values, axis=0), axis=1)
@@ -154,7 +155,7 @@ def distances(places: Series, span_s: float) -> Windows | None:
 
 
 def clear_moves(places: Series) -> Windows | None:
-    """Find moves (k, 2) well above the noise of positions, in the shortest windows that have some."""
+    """Find moves (k, 2) well above the noise of positions, in the shortest windows with enough moves."""
     noise = noise_of(places.values)
     for span_s in SPANS_S:
         moved = chords(places, span_s)

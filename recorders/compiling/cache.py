@@ -27,8 +27,9 @@ _TURN_S = 120.0
 def is_private(folder: Path) -> bool:
     """Test whether only this user can have written to a folder of the cache; warn if not.
 
-    A missing folder is private, since `write_checked` creates it as such. Its parent may belong to root
-    and be writable for others if it is sticky like /tmp: other users cannot move its entries then.
+    A missing folder is private, since `write_checked` creates it as such. The parent folder may belong
+    to root and be writable for others if it is sticky, like /tmp, because other users can then not move
+    its entries.
     """
     for place in (folder.parent, folder):
         try:
@@ -112,10 +113,10 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
 
 @contextmanager
 def in_turn(path: Path) -> Iterator[bool]:
-    """Wait until no other process makes this file; yield whether one did, so the file may exist now.
+    """Wait while another process makes this file; yield whether one did, as the file may exist now.
 
-    The lock is released when its process ends. If a process keeps the lock for very long, or the disk
-    does not support locks, the work is done twice, which is harmless.
+    The system releases the lock if the process ends. If a process keeps the lock for very long, or the
+    disk does not support locks, two processes make the file, which is harmless.
     """
     lock = FileLock(path.with_suffix(".lock"), timeout=0)
     waited = False

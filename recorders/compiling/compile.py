@@ -34,7 +34,7 @@ class Loop(Protocol):
     ) -> Callable[[int, int], None]:
         """Return a function that processes the runs from a first one up to an end.
 
-        The memory, if there is one, is the last argument.
+        If `memory` is given, it is the last argument of the compiled function.
         """
         ...
 

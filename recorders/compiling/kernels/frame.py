@@ -22,7 +22,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """An exception for a variable that needs memory for another kind of number than its first value."""
+    """An exception for a variable that needs memory for a wider kind of number than it began with."""
 
 
 class Frame(Expressions):

@@ -47,7 +47,7 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class _Layout:
-    """The kinds of a core's working memory; equal kinds are one object, which makes lookup fast."""
+    """The kinds of a core's working memory; equal kinds share one object, which makes lookup fast."""
 
     def __init__(self, kinds: tuple[Value, ...]) -> None:
         self.kinds = kinds

@@ -110,7 +110,7 @@ class Program:
         returned: Value,
         few: int = FEW,
     ) -> Instance:
-        """Add a function with this body and result, which is always inlined below `few` lines."""
+        """Add a function with this body and result; below `few` lines, it is always inlined."""
         found = list(leaves(returned))
         results = [*found, ("i64", "0")] if body.can_fail else found
         kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"

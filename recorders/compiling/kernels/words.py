@@ -1,4 +1,4 @@
-"""Arithmetic of words of 64 bits that neither Python nor NumPy has as one operation."""
+"""Arithmetic of 64-bit words for which neither Python nor NumPy has a single operation."""
 
 import numpy as np
 

@@ -131,7 +131,8 @@ def local_estimate_covariances(
 ) -> tuple[Component, Component, Component]:
     """Compute the variance of the range estimate, and its covariances with azimuth and trajectory.
 
-    Eq (26), whose numerator has c^2 sigma_tau^2, in m^2; eqs (17) and (18) in m rad.
+    The variance (m^2) is eq (26), with c^2 sigma_tau^2 in the numerator; the covariances (m rad) are eqs
+    (17) and (18).
     """
     missing = 1.0 - np.cos(separation)
     lever = distance * np.sin(separation) / missing

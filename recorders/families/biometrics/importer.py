@@ -1,4 +1,4 @@
-"""Importer of score matrices of biometric matchers, as in NIST's Biometric Scores Set: one CSV each.
+"""Importer of biometric score matrices, one CSV per matcher, as in NIST's Biometric Scores Set.
 
 The first row contains the gallery's user ids, the first column the probes' user ids. Matchers are listed
 in the parameters, or in a file `matchers.toml` in the folder:

@@ -125,7 +125,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Draw effects of users; a few have poor fingers, the others better ones, so the marginals stay."""
+    """Draw users' effects; a few have poor fingers, others better ones, so that the marginals stay."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
@@ -168,7 +168,7 @@ def _impostors(users: Users, rng: np.random.Generator) -> Floats:
 
 
 def _user_correlation() -> Floats:
-    """Return the correlation (12, 12) of g, a and b, projected to a positive semidefinite matrix."""
+    """Return the correlation (12, 12) of the users' effects, projected to be positive semidefinite."""
     names = [effect + matcher for effect in "gab" for matcher in "CGLR"]
     correlation = np.eye(len(names))
     for pair, value in USER_CORRELATION.items():

@@ -31,10 +31,10 @@ class OpticalParameters(Parameters):
     Attributes:
         sensor_position_m: positions of the sensors (x, y, z).
         target_position_m: positions of the targets (x, y, z).
-        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row for each or for all; 0
-            if not set.
-        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs, one row for each or
+        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row per sensor or one row
             for all; 0 if not set.
+        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs, one row per sensor or
+            one row for all; 0 if not set.
         sigma_rad: standard deviation of azimuth and elevation.
         interval_s: time between sightings.
         passes: number of passes over all targets.

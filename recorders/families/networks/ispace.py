@@ -1,9 +1,9 @@
 """A room of networked sensor nodes that track one moving target: DIND nodes.
 
-Jin, Lee, Hashimoto, DIND networks, sections 3 to 5. The paper states no numbers for the room, so these
-are ours. Every node observes the target with its own sensor and rate, sends its estimate over directed
-links, and loses messages. The content of a message depends on the estimator, so the log contains only
-the link events.
+Jin, Lee, Hashimoto, DIND networks, sections 3 to 5. The paper gives no values for the room, so the
+defaults are our own. Every node observes the target with its own sensor and rate, and sends its
+estimate over directed links, on which messages may be lost. The content of a message depends on the
+estimator, so the log contains only the link events.
 """
 
 from typing import Annotated
@@ -74,8 +74,8 @@ class IspaceParameters(Parameters):
         start_sigma: standard deviations of the initial state, in m and m/s.
         nodes: the sensor of each node.
         links: pairs of nodes, by number from 1, that are linked in both directions.
-        random_nodes: number of nodes of a random graph; if above 0, every run has another ring of this
-            many nodes, which use the sensors of `nodes` in turn.
+        random_nodes: number of nodes of a random graph; if above 0, every run has a different ring of
+            this many nodes, which use the sensors of `nodes` in turn.
         random_chords: number of additional links in a random graph.
         loss_probability: probability that a message over a link is lost.
         duplicate_probability: probability that a message over a link arrives twice.

@@ -11,12 +11,12 @@ SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 
 
 def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
-    """Compute the rectangle's point at `scale` times the half sides from the centre, each in [-1, 1]."""
+    """Compute the rectangle's point at `scale` (-1 to 1 each) times the half sides from the centre."""
     return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
 
 
 def quadratic(point: Components) -> tuple[Component, Component, Component, Component]:
-    """Return a point and its squares, which a linear filter needs to estimate the size."""
+    """Return a point and its squared coordinates, which a linear filter needs to estimate the size."""
     return point[0], point[1], point[0] * point[0], point[1] * point[1]
 
 

@@ -5,9 +5,10 @@ environment", Ocean Engineering 252, 2022; data CC0 1.0. A scenario is a folder 
 NAME_detections.json, and a list of the targets' positions, NAME_groundTruth.json.
 
 In the log's plane, x points east and y north. Detections are positions relative to the ownship
-(/ownship/fix, one message per scan), bearings are anticlockwise from east. Both are in the plane's axes,
-since the files state no heading. A scan arrives in the log at the latest stamp so far: a scan after one
-with a later stamp is out of sequence by the difference. All scans are recorded, including empty ones.
+(/ownship/fix, one message per scan), or bearings anticlockwise from east. Both are in the plane's axes,
+since the files state no heading. The arrival time of a scan is the latest stamp so far, so a scan that
+follows one with a later stamp is out of sequence by the difference. All scans are recorded, including
+empty ones.
 """
 
 from collections.abc import Callable, Iterator
@@ -136,7 +137,7 @@ class Scans(NamedTuple):
 def read(folder: Path, parameters: AutoferryParameters) -> Recording:
     """Read a scenario; the notes count its scans, and the empty and late ones.
 
-    Raises BadInput with the file and the entry if one is missing or not as published.
+    Raises BadInput with the file and the entry if one of them is missing, or not in the published form.
     """
     scans = _scans(_file(folder, "detections"))
     truths = _truths(_file(folder, "groundTruth"))
@@ -253,7 +254,7 @@ def _of(entry: Any, key: str, where: str) -> Any:
 
 
 def _stamp_ns(entry: Any, where: str) -> int:
-    """Read the time of an entry, whole seconds separately, as a double of 1e9 s does not resolve ns."""
+    """Read an entry's time; whole seconds are converted separately, to avoid rounding errors."""
     [time_s] = _numbers([_of(entry, "time", where)], where, "time", 1)
     if not 0.0 <= time_s < 9e9:
         raise BadInput(f"{where}: time is {time_s:g}; expected seconds since 1970")
