@@ -184,7 +184,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 continue
             is_there = column == end
             others = [other for of, which, other in entries if (of, which) != (field, name)]
-            varying = [other for other in others if np.nanmax(other) > np.nanmin(other)]
+            varying = [other for other in others if len(np.unique(other[np.isfinite(other)])) > 1]
             is_end = _is_end_of_range(stream, field, known, end)
             usual = max(len(known) / len(levels), counts[-2 if at else 1])
             is_clipped = _is_clipped(is_there, len(levels), usual, varying)

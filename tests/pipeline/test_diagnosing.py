@@ -454,7 +454,9 @@ def test_what_is_wrong_with_messages_is_said() -> None:
 
     def ranges(stamps_ns: np.ndarray) -> fl.Stream:
         ids = {"anchor_id": np.ones(300, int), "tag_id": np.ones(300, int)}
-        return fl.make_stream("/r", fl.schemas.ANCHOR_RANGE, stamps_ns, **ids, range_m=place[:, 0])
+        return fl.make_stream(
+            "/r", fl.schemas.ANCHOR_RANGE, stamps_ns, **ids, range_m=50.0 + place[:, 0]
+        )
 
     for step_ns in (200_000_000, 10**6):  # bursts of a sensor, as ranges to four anchors
         bursts_ns = np.arange(300) // 4 * 10**9 + np.arange(300) % 4 * step_ns
