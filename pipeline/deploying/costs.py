@@ -144,8 +144,9 @@ def _sampling(sampled: SampledFunction) -> Cost:
     mean = Cost(2 * count * sampled.size)
     if sampled.recentre is None:
         return added(own, mean, Cost(sampled.size))
-    again = added(mean, _cost_of_step(sampled.move), _in_loop(sampled.recentre, SETTLING, count))
-    return added(own, *[again] * MEANS)
+    curved = _cost(needed([sampled.move.outputs["centre", (i,)] for i in sampled.curved]))
+    again = added(mean, curved, _in_loop(sampled.recentre, SETTLING, count))
+    return added(own, mean, _cost_of_step(sampled.move), *[again] * MEANS)
 
 
 def _narrowing(sampled: SampledFunction) -> Cost:

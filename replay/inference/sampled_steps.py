@@ -15,6 +15,7 @@ from fuselog.replay.inference.kalman.wide_angles import turning, unsuspected_rad
 from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
+    curved_blocks,
     manifold_blocks,
     recentring,
     tangent_size,
@@ -46,6 +47,7 @@ class SampledFunction(NamedTuple):
             moved centre, and `again`, whether another iteration may be necessary. None if all values are
             linear.
         given: number of arguments of the step.
+        curved, curved_values: components and tangent components of the values that are not linear.
         turns: angles and rotations of the state, which limit the spread of the samples; see
             `wide_angles`.
         unsuspected: largest standard deviation at which the spread is not limited.
@@ -59,6 +61,8 @@ class SampledFunction(NamedTuple):
     move: Step
     recentre: Step | None
     given: int
+    curved: tuple[int, ...]
+    curved_values: tuple[int, ...]
     turns: tuple[tuple[int, int, float], ...]
     unsuspected: float
 
@@ -136,12 +140,11 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
 
     def recentre(_: TracedValue, __: TracedValue, shift: TracedValue, value: TracedValue) -> TracedValue:
         found, again = list[TracedValue](), False
-        for kind, _component, first, width in manifold_blocks(outputs):
+        found[:] = [value[i] for i in range(values)]
+        for kind, _component, first, width in curved_blocks(outputs):
             own = slice(first, first + width)
-            still, *moved = _recentred(kind)(tuple(value[own]), tuple(shift[own]))
-            found += moved
-            if kind != "linear":
-                again = still if again is False else again | still
+            still, *found[own] = _recentred(kind)(tuple(value[own]), tuple(shift[own]))
+            again = still if again is False else again | still
         return {"value": found, "again": [again]}
 
     shift, centre = Shape((values,)), Shape((components,))
@@ -155,6 +158,8 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         traced_step(what, move, (*gaussian, shift, centre)),
         None if straight else traced_step(what, recentre, (*gaussian, shift, shift)),
         len(given),
+        tuple(c + i for kind, c, _, _ in curved_blocks(outputs) for i in range(WIDTHS[kind])),
+        tuple(t + i for _, _, t, width in curved_blocks(outputs) for i in range(width)),
         turning(kinds),
         unsuspected_rad(points),
     )

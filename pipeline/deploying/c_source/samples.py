@@ -323,31 +323,37 @@ def _settling(made: CFilter, number: int) -> list[str]:
         return []
     outputs = sampled.recentre.outputs
     moved = {f"moved_{place[0]}": node for (_, place), node in sampled.move.outputs.items()}
-    values = {f"value_{i}": outputs["value", (i,)] for i in range(sampled.size)}
+    turned = {name: moved[name] for name in (f"moved_{i}" for i in sampled.curved)}
+    values = {f"value_{i}": outputs["value", (i,)] for i in sampled.curved_values}
     move_names, _ = Inputs(made, name).names(sampled.move, "shift", "centre")
     names, _ = Inputs(made, name).names(sampled.recentre, "shift", "value")
     before, inside = _in_loop(made, values, names, SETTLING)
     again = truth_text(outputs["again", (0,)], names, made.precision)
     if made.precision.ending:
         again = again.replace(made.precision.number(SETTLED), made.precision.number(SETTLED_IN_SINGLE))
+    find = f"find_shift(samples, {weighed(sampled)}, {sampled.size});"
     lines = [
         "REAL *const centre = samples->centre, *const shift = samples->shift;",
-        f"for (int round = 0; round < {MEANS}; round++) {{",
-        "    int again = 0;",
-        f"    find_shift(samples, {weighed(sampled)}, {sampled.size});",
+        find,
+        "{",
         *(f"    {each}" for each in c_lines(moved, move_names, made.precision)),
         *(f"    centre[{i}] = moved_{i};" for i in range(len(moved))),
+        "}",
+        f"for (int round = 0; round < {MEANS}; round++) {{",
+        "    int again = 0;",
         *(f"    {each}" for each in before),
         f"    for (int index = 0; index < {len(sampled.points)}; index++) {{",
         "        REAL *const value = samples->values[index];",
         *(f"        {each}" for each in inside),
         f"        again = again || ({again});",
-        *(f"        value[{i}] = value_{i};" for i in range(sampled.size)),
+        *(f"        value[{i}] = value_{i};" for i in sampled.curved_values),
         "    }",
-        f"    for (int i = 0; i < {sampled.size}; i++)",
-        "        shift[i] = 0.0_S;",
+        *(f"    shift[{i}] = 0.0_S;" for i in sampled.curved_values),
         "    if (!again)",
         "        return;",
+        f"    {find}",
+        *(f"    {each}" for each in c_lines(turned, move_names, made.precision)),
+        *(f"    centre[{i}] = moved_{i};" for i in sampled.curved),
         "}",
     ]
     head = (
