@@ -297,6 +297,8 @@ def test_tangent_vectors_from_a_shifted_centre_lead_to_the_same_states(seed: int
     centre = np.array([2.0, 3.0, 0.6, 0.8, 1.0, 0.0, 0.0, 0.0])
     away, shifted = values.copy(), centre.copy()
     again = recentring(kinds)(away, shift)
+    assert away[:, 0].tolist() == values[:, 0].tolist()  # linear: the caller subtracts the shift
+    away[:, 0] -= shift[0]
     add, differ, apart = boxplus(kinds), boxminus(kinds), np.empty((5, 6))
     add(shifted, shift)
     for row, (old, new) in enumerate(zip(values, away, strict=True)):
