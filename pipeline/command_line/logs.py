@@ -220,14 +220,15 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 
 
 @command(
-    "Export streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove.",
+    "Export streams as TUM, KITTI, ROS 2, MOT, CSV, Parquet or Foxglove.",
     "fuselog export est.mcap --to tum",
+    "fuselog export est.mcap --to ros2 -o bag",
     "fuselog export run.mcap --to csv --topic /robot1/odometry -o odometry.csv",
 )
 @click.argument("path", type=ANY_PATH)
 @click.option(
     "--to",
-    type=click.Choice(["tum", "kitti", "mot", "csv", "parquet", "foxglove"]),
+    type=click.Choice(["tum", "kitti", "ros2", "ros2-sqlite3", "mot", "csv", "parquet", "foxglove"]),
     required=True,
     help="The format.",
 )
@@ -242,9 +243,10 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    tum and kitti are for trajectories: poses, and estimates and truths with a position. mot is for
-    tracks and truths, frame by frame, as TrackEval reads them. csv and parquet are for any stream, as a
-    table. foxglove writes one log with messages that Foxglove and Rerun show.
+    tum and kitti are for trajectories: poses, and estimates and truths with a position. ros2
+    writes a bag with these and geodetic fixes, as messages and TF, stored as MCAP; ros2-sqlite3 writes a
+    .db3. mot is for tracks and truths, frame by frame, as TrackEval reads them. csv and parquet are for
+    any stream, as a table. foxglove writes one log with messages that Foxglove and Rerun show.
     """
     from fuselog.pipeline.logs.exporting import export as export_log
 

@@ -38,6 +38,8 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 from fuselog.replay.judging.metrics.metrics import rmse_of
 from fuselog.replay.judging.tables import joined
 
+# The mean age of estimates, which the judge leaves out if it is zero.
+AGE = "estimate_age_s"
 # Relative tolerance between a result and its replay, because CPUs differ in the last digits.
 SAME = 1e-6
 # Entries of an experiment that affect its results.
@@ -104,7 +106,10 @@ class Given:
 def measured(
     name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any] | None
 ) -> Candidate:
-    """Judge the estimates of a label run by run; each of the `pairs` is a log with its estimates."""
+    """Judge the estimates of a label run by run; each of the `pairs` is a log with its estimates.
+
+    Estimates in the order of measurement have an age too: it is zero.
+    """
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []
     times: list[pd.DataFrame] = []
@@ -123,6 +128,9 @@ def measured(
             sizes["position_nees", errors.case] = float(len(errors.position))
         doubts = judge.doubts | doubts
         truths[run] = _hash_of_truth(source, own)
+    aged = {(run, case) for run, case, quantity, _ in rows if quantity == AGE}
+    judged = {(run, case): None for run, case, quantity, _ in rows if "rmse" in str(quantity)}
+    rows += [(*each, AGE, 0.0) for each in judged if each not in aged]
     values = pd.DataFrame(rows, columns=["run", "case", "quantity", "value"])
     return Candidate(name, label, values, joined(times), sizes, settings, truths, pairs, doubts=doubts)
 
@@ -375,6 +383,7 @@ def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: flo
 
     def candidate(label: str, name: str) -> Candidate:
         found = measured(name, label, pairs, gap_limit_s, {})
-        return replace(found, notes=trajectory.notes)
+        rows = found.rows[found.rows["quantity"] != AGE]  # a file does not state when poses were known
+        return replace(found, rows=rows, notes=trajectory.notes)
 
     return Given(name, [name], candidate)

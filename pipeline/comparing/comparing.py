@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import pandas as pd
 
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.planning import Kind
-from fuselog.pipeline.comparing.candidates import Candidate
+from fuselog.pipeline.comparing.candidates import AGE, Candidate
 from fuselog.pipeline.comparing.groups import (
     comparable_groups,
     inputs_of,
@@ -297,7 +297,7 @@ def compare(
     givens = inputs_of(
         paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
-    groups = list(comparable_groups(givens, named))
+    groups = list(map(_with_ages, comparable_groups(givens, named)))
     notes = [note for group in groups for candidate in group for note in candidate.notes]
     paired: list[Paired] = []
     times: list[pd.DataFrame] = []
@@ -322,6 +322,24 @@ def compare(
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
 
 
+def _with_ages(group: Sequence[Candidate]) -> list[Candidate]:
+    """Leave the age of estimates out if it is zero for all candidates."""
+    rows = pd.concat([each.rows for each in group])
+    if (rows["value"][rows["quantity"] == AGE] > 0.0).any():
+        return list(group)
+    return [replace(each, rows=each.rows[each.rows["quantity"] != AGE]) for each in group]
+
+
+def _by_importance(quantities: Iterable[str]) -> list[str]:
+    """Move the age of estimates to the errors, since waiting makes errors smaller."""
+    found = list(dict.fromkeys(quantities))
+    others = [name for name in found if name != AGE]
+    errors = [number for number, name in enumerate(others, 1) if "rmse" in name]
+    if AGE in found:
+        others.insert(errors[-1] if errors else 0, AGE)
+    return others
+
+
 def _compared(
     first: Candidate, second: Candidate, margin: float, notes: list[str]
 ) -> tuple[list[Paired], pd.DataFrame]:
@@ -340,7 +358,7 @@ def _compared(
         )
     over_time = _over_time(first, second, margin)
     paired: list[Paired] = []
-    for quantity in dict.fromkeys(known["quantity"]):
+    for quantity in _by_importance(known["quantity"]):
         rows = known[known["quantity"] == quantity]
         missing = len(set(both["run"])) - len(set(rows["run"]))
         if missing:

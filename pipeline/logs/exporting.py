@@ -4,6 +4,7 @@ A log is read once, block by block, so memory does not grow with its length. Tra
 they are exported frame by frame. Existing files are never replaced.
 """
 
+import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from fuselog.recorders.registry import available, load
 from fuselog.recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from fuselog.replay.judging.errors.trajectory_streams import trajectory_of
 
-To = Literal["tum", "kitti", "mot", "csv", "parquet", "foxglove"]
+To = Literal["tum", "kitti", "ros2", "ros2-sqlite3", "mot", "csv", "parquet", "foxglove"]
 SUFFIXES: dict[To, str] = {
     "tum": ".txt",
     "kitti": ".txt",
@@ -31,6 +32,9 @@ TRAJECTORIES: dict[str, tuple[str, Callable[[Trajectory], list[str]]]] = {
     "tum": ("# timestamp tx ty tz qx qy qz qw\n", tum_lines),
     "kitti": ("", kitti_lines),
 }
+# The storage of bags, as ROS names it.
+BAGS = {"ros2": "mcap", "ros2-sqlite3": "sqlite3"}
+POSES = {*TRAJECTORIES, *BAGS}
 
 Write = Callable[[Stream], None]
 FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]]
@@ -57,11 +61,13 @@ def export(
     Args:
         path: the log, or estimates log.
         to: the format. "tum" and "kitti" are trajectories of poses, and of estimates and truths with a
-            position. "mot" has a file of tracks for each tracker and one of all truths; see
-            `fuselog.pipeline.families.tracking.mot`. "csv" and "parquet" are tables. "foxglove" is one
-            log with messages that Foxglove shows; see `fuselog.pipeline.logs.foxglove`.
+            position. "ros2" and "ros2-sqlite3" are a bag of ROS 2 with these and geodetic fixes, as
+            MCAP or SQLite; see `fuselog.pipeline.logs.ros2`. "mot" has a file of tracks for each
+            tracker and one of all truths; see `fuselog.pipeline.families.tracking.mot`. "csv" and
+            "parquet" are tables. "foxglove" is one log with messages that Foxglove shows; see
+            `fuselog.pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; the file itself for a single topic
-            (except with "mot") and for "foxglove".
+            (except with "mot" and bags) and for "foxglove".
         topics: the topics to export; all suitable topics if empty.
         recover: read the intact part of a log that was cut off or damaged.
 
@@ -79,6 +85,8 @@ def export(
     chosen = _chosen(log, to, topics, notes)
     if to == "foxglove":
         return _export_mirrors(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
+    if to in BAGS:
+        return _export_bag(log, to, chosen, Path(out or f"{log.path.stem}-{to}"), notes)
     names = {topic: _file_name(topic, to) for topic in chosen}
     for topic, name in names.items():
         if list(names.values()).count(name) > 1:
@@ -107,20 +115,16 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             raise UnknownName(f"{log.path}: no topic {topic}; {choices(topic, log.topics)}")
         try:
             empty = read_empty(log, topic)
-            if to in TRAJECTORIES and not _is_state(log, topic):
-                raise BadInput(
-                    f"{log.path}: topic {topic}: is not an estimate, truth or Pose; export it as csv"
-                )
-            if to in TRAJECTORIES and trajectory_of(empty) is None:
-                raise BadInput(f"{log.path}: topic {topic}: has no position; export it as csv")
+            if to in POSES and (lacks := _lacking(empty, to)):
+                raise BadInput(f"{log.path}: topic {topic}: {lacks}; export it as csv")
         except BadInput as error:
             if topics:
                 raise
-            if to not in TRAJECTORIES:
+            if to not in POSES:
                 notes.append(str(error))
             continue
         chosen.append(topic)
-    if not chosen and to in TRAJECTORIES:
+    if not chosen and to in POSES:
         raise BadInput(
             f"{log.path}: has no estimates, truths or poses to export to {to}; export it as csv"
         )
@@ -148,6 +152,27 @@ def _export_mirrors(log: Log, topics: Sequence[str], place: Path, notes: list[st
     return Exported({topic: place for topic, messages in written.items() if messages}, notes)
 
 
+def _export_bag(log: Log, to: To, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """Write the folder of a bag."""
+    from rosbags.rosbag2 import StoragePlugin
+
+    from fuselog.pipeline.logs.ros2 import write_bag  # slow to import
+
+    check_folder(place, {"log": [log.path]})
+    with whole_folder(place, _refuse) as part:
+        bag = part / place.name  # its files have the name of its folder
+        try:
+            written = write_bag(log, topics, bag, StoragePlugin[BAGS[to].upper()], notes)
+        except sqlite3.Error as error:
+            raise BadInput(f"{place}: cannot be written ({error})") from error
+        if not written:
+            raise BadInput(f"{log.path}: has no finite poses to export to {to}; export it as csv")
+        for file in bag.iterdir():
+            file.rename(part / file.name)
+        bag.rmdir()
+    return Exported(dict.fromkeys(written, place), notes)
+
+
 def _export_frames(log: Log, to: To, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
     """Write a folder with the files that an entry point of `fuselog.exports` makes from a log.
 
@@ -170,11 +195,15 @@ def _new(to: To) -> Kind:
     return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 
-def _is_state(log: Log, topic: str) -> bool:
-    """Test whether a topic has estimates, a truth or poses; a prior does not count as an estimate."""
-    schema = log.topics[topic].schema_name
-    is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
-    return is_estimate or schema in (schemas.TRUTH_STATE.full_name, schemas.POSE.full_name)
+def _lacking(empty: Stream, to: To) -> str:
+    """Return why a stream, without its messages, has no poses; a prior does not count as an estimate."""
+    schema = empty.schema.full_name
+    if to in BAGS and schema == schemas.GEODETIC_FIX.full_name:
+        return ""
+    is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and empty.topic.startswith("/estimates/")
+    if not is_estimate and schema not in (schemas.TRUTH_STATE.full_name, schemas.POSE.full_name):
+        return f"is not an estimate, truth{', Pose or GeodeticFix' if to in BAGS else ' or Pose'}"
+    return "" if trajectory_of(empty) is not None else "has no position"
 
 
 def _file_name(topic: str, to: To) -> str:

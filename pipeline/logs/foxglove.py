@@ -17,7 +17,8 @@ from fuselog.recorders.errors import some_of
 from fuselog.recorders.extras import extra
 from fuselog.recorders.log import Log, Mirror, Stream, schemas
 from fuselog.recorders.log.mirrors import MIRROR_OF
-from fuselog.recorders.log.planes import FRAME, body_of
+from fuselog.recorders.log.planes import body_of, world_of
+from fuselog.replay.engine.streams.geodetic import covariances_of_fixes
 from fuselog.replay.engine.streams.measurements import PLANE, covariances_of
 from fuselog.replay.engine.vectors.tangent import manifold_blocks
 from fuselog.replay.judging.consistency.consistency import ellipses
@@ -33,8 +34,6 @@ with extra("foxglove", "messages of Foxglove"):
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-# Viewers need a frame name, and a log has none.
-WORLD = "map"
 POINT_M = 0.3
 LABEL_PX = 12.0
 LINE_PX = 2.0
@@ -166,29 +165,25 @@ def _poses(
 def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
     """Yield a pose for each position (n, 3) and quaternion (n, 4); the default is the identity."""
     for row, place in enumerate(places):
-        pose = PoseInFrame(frame_id=_frame_of(stream))
+        pose = PoseInFrame(frame_id=world_of(stream.metadata))
         pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
         _set_pose(pose.pose, place, None if quaternions is None else quaternions[row])
         yield pose
 
 
 def _location_fixes(stream: Stream) -> Made:
-    for row in range(len(stream)):
+    for row, covariance in enumerate(covariances_of_fixes(stream)):
         fix = LocationFix(
-            frame_id=_frame_of(stream),
+            frame_id=world_of(stream.metadata),
             latitude=stream["latitude_deg"][row],
             longitude=stream["longitude_deg"][row],
             altitude=stream["altitude_m"][row],
         )
         fix.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
-        stated = stream["covariance_m2"][row] if "covariance_m2" in stream.columns else np.empty(0)
-        covariance = np.zeros((3, 3))
-        size = round(len(stated) ** 0.5)
-        covariance[:size, :size] = stated.reshape(size, size)
-        is_known = size > 0 and bool(np.isfinite(covariance).all())
+        is_known = bool(np.isfinite(covariance[:2, :2]).all())
         fix.position_covariance_type = LocationFix.KNOWN if is_known else LocationFix.UNKNOWN
         if is_known:
-            fix.position_covariance.extend(covariance.ravel().tolist())
+            fix.position_covariance.extend(np.nan_to_num(covariance).ravel().tolist())
         yield "location", fix, row
 
 
@@ -235,7 +230,7 @@ def _detections(stream: Stream) -> Made:
 def _scans(stream: Stream, places: Floats) -> Made:
     """Make a message for each stamp with its positions, from the positions (n, 3) of all stamps."""
     for rows in _by_stamp(stream):
-        poses = PosesInFrame(frame_id=_frame_of(stream))
+        poses = PosesInFrame(frame_id=world_of(stream.metadata))
         poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))
         for row in rows:
             _set_pose(poses.poses.add(), places[row], None)
@@ -256,7 +251,7 @@ def _outlines(stream: Stream) -> Floats:
 
 
 def _add_entity(scene: Any, stream: Stream, row: int, name: str) -> Any:
-    entity = scene.entities.add(frame_id=_frame_of(stream), id=name)
+    entity = scene.entities.add(frame_id=world_of(stream.metadata), id=name)
     entity.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
     return entity
 
@@ -304,11 +299,6 @@ def _padded(places: Floats) -> Floats:
     padded = np.zeros((len(places), 3))
     padded[:, : places.shape[1]] = places[:, :3]
     return padded
-
-
-def _frame_of(stream: Stream) -> str:
-    """Return the frame in the stream's metadata, or that of the log."""
-    return stream.metadata.get(FRAME) or WORLD
 
 
 _MAKERS: dict[str, Callable[[Stream], Made]] = {

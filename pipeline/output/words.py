@@ -73,6 +73,9 @@ QUANTITIES: dict[str, Quantity] = {
     "heading_rmse_rad": Quantity(
         "heading error, RMS", f"Angle to the true heading. {_RMS}", ACCURACY, "rad"
     ),
+    "estimate_age_s": Quantity(
+        "age of an estimate", "Time from the stamp of an estimate until it was available.", ACCURACY, "s"
+    ),
     "nees": Quantity(
         "NEES", "Squared errors, normalised by the covariance that the estimator claims.", CONSISTENCY
     ),
@@ -107,9 +110,6 @@ QUANTITIES: dict[str, Quantity] = {
         "estimates without truth", "Estimates at times without truth in the log.", COST
     ),
     "skipped_measurements": Quantity("measurements skipped", "Measurements that had no effect.", COST),
-    "estimate_age_s": Quantity(
-        "age of an estimate", "Time from the stamp of an estimate until it was available.", COST, "s"
-    ),
 }
 LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "localisation_m2")
 

@@ -27,6 +27,8 @@ LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
     "origin_altitude_m",
 )
 FRAME, BODY = "frame_id", "child_frame_id"
+# The name of the log's frame in files of other tools, which need one; as in REP 105.
+WORLD = "map"
 EXAMPLE = "latitude and longitude in deg, and altitude in m, such as 49.01,8.4,115"
 _STATES = (TRUTH_STATE.full_name, GAUSSIAN_ESTIMATE.full_name)
 _PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_FIX, GEODETIC_FIX)}
@@ -86,6 +88,11 @@ def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
 def frame_of(metadata: Mapping[str, str]) -> str:
     """Return the frame that a channel names; empty for the plane of the log."""
     return "" if LATITUDE in metadata else metadata.get(FRAME, "")
+
+
+def world_of(metadata: Mapping[str, str]) -> str:
+    """Return the frame that a channel names, or `WORLD`."""
+    return metadata.get(FRAME) or WORLD
 
 
 def in_frame(frame: str) -> dict[str, str]:

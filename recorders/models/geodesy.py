@@ -51,23 +51,23 @@ def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[n
 def out_of_tangent_plane(
     place_m: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Compute latitude, longitude (deg) and height (m) of a position (east, north) in the plane.
+    """Compute latitude, longitude (deg) and height (m) of a position: east, north and perhaps up.
 
     Bowring's formula, Survey Review 23, 1976: accurate to less than a micrometre near the ground.
     """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
-    east, north = place_m
+    east, north, up = (*place_m, 0.0)[:3]
     x, y, z = earth_centred(*origin_deg)
-    outward = -np.sin(latitude) * north
+    outward = np.cos(latitude) * up - np.sin(latitude) * north
     x = x - np.sin(longitude) * east + np.cos(longitude) * outward
     y = y + np.cos(longitude) * east + np.sin(longitude) * outward
-    z = z + np.cos(latitude) * north
+    z = z + np.cos(latitude) * north + np.sin(latitude) * up
     from_axis = np.hypot(x, y)
     reduced = np.arctan2(z * SEMI_MAJOR_M, from_axis * SEMI_MINOR_M)
     ratio = ECCENTRICITY_SQUARED / (1.0 - ECCENTRICITY_SQUARED)
-    up = z + ratio * SEMI_MINOR_M * np.sin(reduced) ** 3
+    rise = z + ratio * SEMI_MINOR_M * np.sin(reduced) ** 3
     out = from_axis - ECCENTRICITY_SQUARED * SEMI_MAJOR_M * np.cos(reduced) ** 3
-    found = np.arctan2(up, out)
+    found = np.arctan2(rise, out)
     sine = np.sin(found)
     height = (
         from_axis * np.cos(found)

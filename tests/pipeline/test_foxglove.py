@@ -226,6 +226,20 @@ def test_any_log_goes_to_foxglove(fuselog: Fuselog) -> None:
     assert found["/foxglove/radar/detections/poses"][0].frame_id == "radar"
 
 
+def test_fixes_with_the_diagonals_of_their_covariances(fuselog: Fuselog) -> None:
+    columns = {"latitude_deg": [49.0], "longitude_deg": [8.0], "altitude_m": [100.0]}
+    gps, car = (
+        make_stream(topic, schemas.GEODETIC_FIX, STAMPS[:1], **columns, covariance_m2=[diagonal])
+        for topic, diagonal in (("/gps", [4.0, 9.0, 1.0]), ("/car", [4.0, 9.0]))
+    )
+    write_log("own.mcap", [gps, car])
+    assert fuselog("export", "own.mcap", "--to", "foxglove").code == 0
+    found = decoded("own-foxglove.mcap")
+    for topic, height in (("gps", 1.0), ("car", 0.0)):
+        (fix,) = found[f"/foxglove/{topic}/location"]
+        assert fix.position_covariance == [4, 0, 0, 0, 9, 0, 0, 0, height]
+
+
 def test_what_has_no_message_and_a_place_that_is_taken_are_refused(fuselog: Fuselog) -> None:
     write_log("air.mcap", seen()[-1:])
     said = fuselog("export", "air.mcap", "--to", "foxglove")

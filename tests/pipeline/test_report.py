@@ -646,3 +646,35 @@ def test_control_characters_are_shown_by_their_numbers(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert {each for each in page if not each.isprintable()} <= {*"\n\t\u00a0\u2009\u202f"}
     assert "<title>a\\x9b2J\\x1b[2J\\x07\\u202e\\u2028b: fuselog report</title>" in page
+
+
+def test_waiting_for_late_messages_shows_its_price_next_to_the_error(
+    fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the table of a comparison and on its page; without late messages no age is shown."""
+    monkeypatch.chdir(tmp_path)
+    late = ["duration_s=8", "range_bearing.latency_s=0.2", "range_bearing.latency_jitter_s=0.3"]
+    record = (
+        "record",
+        "landmarks",
+        "-o",
+        "run.mcap",
+        *(word for each in late for word in ("--set", each)),
+    )
+    assert fuselog(*record).code == 0
+    for name, options in (("order", ()), ("wait", ("--arrival-order", "--late", "wait:0.9"))):
+        assert fuselog("replay", "run.mcap", "-e", "ekf", "-o", f"{name}.mcap", *options).code == 0
+    rows = fuselog("compare", "order.mcap", "wait.mcap", "--json", "--out", "both").json["differences"]
+    names = [row["quantity"] for row in rows]
+    at = names.index("estimate_age_s")
+    assert ["rmse" in name for name in names] == [number < at for number in range(len(names))]
+    assert (rows[at]["first_mean"], rows[at]["aim"]) == (0.0, "low")
+    assert rows[at]["second_mean"] == pytest.approx(0.9, abs=0.02)
+    assert fuselog("report", "both", "-o", "page.html").code == 0
+    page = Path("page.html").read_text()
+    assert page.count("Its estimates are on average 0.9") == 1
+    accuracy, consistency = (page.index(f">{group}<") for group in ("Accuracy", "Consistency"))
+    assert accuracy < page.index("age of an estimate", accuracy) < consistency
+    Path("again.mcap").write_bytes(Path("order.mcap").read_bytes())
+    rows = fuselog("compare", "order.mcap", "again.mcap", "--json").json["differences"]
+    assert "estimate_age_s" not in {row["quantity"] for row in rows}

@@ -50,6 +50,7 @@ class Evidence:
         runs: the number of runs, over all cases.
         share: the share of the time with estimates.
         outside: the number of cases in which it is inconsistent, and the number of all cases.
+        age_s: the mean age of estimates when they are available, in the case with the oldest.
     """
 
     estimator: str
@@ -59,6 +60,7 @@ class Evidence:
     runs: int
     share: float
     outside: tuple[int, int] = (0, 1)
+    age_s: float = 0.0
 
     @property
     def has_failed(self) -> bool:
@@ -220,6 +222,7 @@ class Findings:
             self.runs * max(len(failed), 1),
             min(self.values(label, "estimated_share") or [1.0]),
             (sum(place != "within" for place in judged), max(len(judged), 1)),
+            max(self.values(label, "estimate_age_s"), default=0.0),
         )
 
     def _error(self, label: str) -> Interval | None:

@@ -370,6 +370,10 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
     if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
         nis = number(each.squares[1].found.value)
         notes.append(f"According to its innovations, NIS is {nis} per component; 1 is ideal.")
+    if each.age_s:
+        own = scale("s", each.age_s)
+        age = f"{own.text(each.age_s)} {own.sign}"
+        notes.append(f"Its estimates are on average {age} old when they are available.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes

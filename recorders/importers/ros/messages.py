@@ -259,16 +259,20 @@ def as_truth(part: Part) -> Part:
 def as_estimate(part: Part, truth: str) -> Part:
     """Convert poses to the estimates of another filter, which are compared with the topic `truth`.
 
-    The covariance of a pose is that of x, y, z and rotations about the fixed axes.
+    The covariance of a pose is that of x, y, z and rotations about the fixed axes. An unknown covariance
+    becomes zero, so that the estimates have no NEES.
     """
     components = {name: kind for name, kind in TRUTH.items() if kind != "angle"}
     metadata = {"components": ",".join(components), "kinds": ",".join(components.values())}
+    is_unknown = np.isnan(part.columns["covariance"]).all(axis=1)
     columns = {
         "mean": np.column_stack([part.columns["position_m"], part.columns["quaternion"]]),
-        "covariance": part.columns["covariance"],
+        "covariance": np.where(is_unknown[:, None], 0.0, part.columns["covariance"]),
     }
     metadata |= {"rotation_axes": "world", "truth": truth}
-    return Part("estimate", schemas.GAUSSIAN_ESTIMATE, columns, metadata, dropped=part.dropped)
+    doubtful = {"without a covariance, so without NEES": is_unknown}
+    schema = schemas.GAUSSIAN_ESTIMATE
+    return Part("estimate", schema, columns, metadata, dropped=part.dropped, doubtful=doubtful)
 
 
 def _twists(path: str, uncertainty: str = "") -> Taken:

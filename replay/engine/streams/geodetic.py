@@ -89,6 +89,17 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
 
 def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
     """Rotate the fixes' covariances (n, 9) from their own axes to `axes` (n, 3, 3); NaN if missing."""
+    covariance = covariances_of_fixes(stream)
+    turn, unknown = axes @ own.transpose(0, 2, 1), np.isnan(covariance)
+    turned = turn @ np.where(unknown, 0.0, covariance) @ turn.transpose(0, 2, 1)
+    return np.where(unknown, np.nan, turned).reshape(-1, 9)
+
+
+def covariances_of_fixes(stream: Stream) -> Floats:
+    """Read the covariances (n, 3, 3) of fixes, in m^2 east, north and up; NaN if missing.
+
+    Raises BadInput if their width is invalid.
+    """
     given = stream.columns.get("covariance_m2", np.empty((len(stream), 0)))
     size = {0: 0, 2: 2, 3: 3, 4: 2, 9: 3}.get(given.shape[1])
     if size is None:
@@ -101,6 +112,4 @@ def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
         is_full = given.shape[1] == size**2
         own_axes = given.reshape(-1, size, size) if is_full else given[:, :, None] * np.eye(size)
         covariance[:, :size, :size] = own_axes
-    turn, unknown = axes @ own.transpose(0, 2, 1), np.isnan(covariance)
-    turned = turn @ np.where(unknown, 0.0, covariance) @ turn.transpose(0, 2, 1)
-    return np.where(unknown, np.nan, turned).reshape(-1, 9)
+    return covariance

@@ -98,23 +98,33 @@ def in_body_axes(stream: Stream) -> Stream:
     Some channels state rotation errors about world axes, as in ROS: `rotation_axes` = "world". Raises
     BadInput if a channel states other axes, or no kinds.
     """
+    return _in_axes(stream, "body")
+
+
+def in_world_axes(stream: Stream) -> Stream:
+    """Convert Gaussian estimates like `in_body_axes`, but to rotation errors about world axes."""
+    return _in_axes(stream, "world")
+
+
+def _in_axes(stream: Stream, wanted: str) -> Stream:
     axes = stream.metadata.get(ROTATION_AXES, "body")
-    if axes == "body":
+    if axes == wanted:
         return stream
     where = f"topic {stream.topic}"
-    if axes != "world":
+    if axes not in ("body", "world"):
         raise BadInput(f"{where}: its channel states {ROTATION_AXES} = {axes}; state body or world")
     kinds = list(stated_components(stream.metadata, {}, where).values())
     size = sum(TANGENT_WIDTHS[kind] for kind, _ in manifold_blocks(kinds))
     turn, row = np.tile(np.eye(size), (len(stream), 1, 1)), 0
     for kind, columns in manifold_blocks(kinds):
-        if kind == "quaternion":  # its rows are the world axes in body coordinates
-            back = conjugate(stream["mean"].reshape(len(stream), len(kinds))[:, None, columns])
-            turn[:, row : row + 3, row : row + 3] = rotate(back, np.eye(3)).swapaxes(1, 2)
+        if kind == "quaternion":  # its columns are the stated axes in coordinates of the wanted ones
+            into = stream["mean"].reshape(len(stream), len(kinds))[:, None, columns]
+            into = into if wanted == "world" else conjugate(into)
+            turn[:, row : row + 3, row : row + 3] = rotate(into, np.eye(3)).swapaxes(1, 2)
         row += TANGENT_WIDTHS[kind]
     covariance = turn @ stream["covariance"].reshape(-1, size, size) @ turn.swapaxes(1, 2)
     return replace(
         stream,
         columns={**stream.columns, "covariance": covariance.reshape(len(stream), size * size)},
-        metadata={**stream.metadata, ROTATION_AXES: "body"},
+        metadata={**stream.metadata, ROTATION_AXES: wanted},
     )

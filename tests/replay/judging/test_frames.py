@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fuselog.pipeline.logs.foxglove import WORLD, mirrors
+from fuselog.pipeline.logs.foxglove import mirrors
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, schemas
-from fuselog.recorders.log.planes import FRAME, frame_of
+from fuselog.recorders.log.planes import FRAME, WORLD, frame_of
 from fuselog.recorders.models.planar import into_frame
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, record_run
 from fuselog.recorders.registry import available, load
