@@ -1,4 +1,4 @@
-"""The page's texts as HTML, by the macros of `markup.html`: verdicts, numbers, labels of sliders."""
+"""The texts of the page as HTML, by the macros of its template: verdicts, numbers, labels of sliders."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -53,7 +53,7 @@ def test_every_parameter_says_what_it_means() -> None:
         ("tune a.mcap -e ukf --free a --model robot --set sigma_range_m=?", ["from the log"]),
         ("check a.mcap --against a.golden.xz -e ekf --set topics=?", ["empty name"]),
         ("compare a b -e smoother:iterated -e ekf --set loss=?", ["square, huber, cauchy"]),
-        ("diagnose a.mcap -e ekf --set bias_range_m=?", ["ekf of robot", "measured minus true"]),
+        ("diagnose a.mcap -e ekf --set bias_range_m=?", ["bias_range_m   ekf", "measured minus true"]),
         (
             "diagnose a.mcap -e ekf --set /fix.delay_s=?",
             ["/fix.delay_s", "delay of the stamps, which is subtracted"],

@@ -566,7 +566,7 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/truth")}
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert any(note.startswith("no truth: errors and NEES are missing") for note in found.notes)
-    assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
+    assert any(note.startswith("there is only one run") for note in fl.diagnose(run, "ekf").notes)
 
 
 def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:

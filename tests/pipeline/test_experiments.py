@@ -522,7 +522,7 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
     of_page = alike([mean, low, high], Scale())
     expected = f"NEES {of_page[0]} (95 % {of_page[1]} to {of_page[2]}); 3 is ideal"
     assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
-    assert printed.splitlines()[-2] == f"{out}: figures, tables, timeline.rrd, {TIMINGS}, result.json"
+    assert printed.splitlines()[-3] == f"{out}: figures, tables, timeline.rrd, {TIMINGS}, result.json"
     names = {"figures", "tables", "timeline.rrd", TIMINGS, "result.json"}
     assert {path.name for path in out.iterdir()} == names
     four = fuselog(*run, "--runs", "4").out

@@ -240,7 +240,7 @@ def test_the_command_writes_what_others_read(
         numbers[f"/imu.turn_rate_radps.{axis}", "white noise N (rad/s/sqrt(Hz))"] for axis in "xyz"
     )
     assert white == pytest.approx(1e-3, rel=0.05)
-    assert sum("times that" in note for note in said.json["notes"]) == 3
+    assert sum("times this value" in note for note in said.json["notes"]) == 3
     none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
     assert sum("turn_rate" in note for note in none_found) == 3
     lines = Path("noise/px4.params").read_text().splitlines()
@@ -305,7 +305,7 @@ def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: P
         assert file is not None
         turn_radps = np.radians(np.load(io.BytesIO(file.read()))[:, 1].astype(float))
     found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
-    assert any("yours is 1.28 (" in note for note in found.notes)
+    assert any("the estimate is 1.28 (" in note for note in found.notes)
     assert len(found.densities.doubts) == 1
 
 

@@ -213,7 +213,7 @@ def test_a_start_by_arrival_is_compared_with_the_priors_arrival(
         (["--start", "30", "--start-from", "EARLY"], ["ends 20", "before the start"]),
         (["--start", "30", "--start-from", "LATER"], ["no estimate before the start"]),
         (["--start", "30", "--start-from", "OTHER"], ["estimates of landmarks, seed 4"]),
-        (["-e", "ukf", "--start", "30", "--start-from", "BOTH"], ["to start ukf", "several"]),
+        (["-e", "ukf", "--start", "30", "--start-from", "BOTH"], ["starting ukf", "several"]),
     ],
 )
 def test_what_cannot_be_started_from(
