@@ -479,7 +479,12 @@ def _view_one(
                 else:
                     name = str(path)
                     source, judged = _read_log(path, recover=recover)
-                _draw(source, judged, name, rrd, connect, focus, at, span, gap_limit_s)
+                judge = _draw(source, judged, name, rrd, connect, focus, at, span, gap_limit_s)
+                if segment is not None and span == (None, None):
+                    from fuselog.pipeline.presenting.making import differing
+
+                    for sentence in differing(segment, judge):
+                        warn(sentence)
         elif any(given is not None for given in (*span, focus, connect)):
             raise BadInput(
                 f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log, "
@@ -535,8 +540,8 @@ def _draw(
     at: float | str | None,
     span: tuple[float | None, float | None],
     gap_limit_s: float,
-) -> None:
-    """Draw a span of a run in seconds, with its estimates if there are any."""
+) -> Judge:
+    """Draw a span of a run in seconds, with its estimates if there are any, and judge them."""
     from fuselog.replay.timeline.show import Drawing
 
     shown = span_of(source, *span, "publish_time")
@@ -550,3 +555,4 @@ def _draw(
         warn(sentence)
     for topic in source.rejections:
         say(f"{topic}: {source.rejections.sentence(topic)}")
+    return judge

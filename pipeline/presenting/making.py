@@ -12,13 +12,13 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
 from time import monotonic, sleep
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote as file_name
 from urllib.parse import unquote
 
@@ -30,6 +30,7 @@ from fuselog.pipeline.runs.executors import PoolFactory, version_of_code
 from fuselog.recorders.atomic import clear_leftovers, whole_file, whole_folder
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parsing import parse_json
+from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.catalog import (
     BASE,
     PROPERTIES,
@@ -138,7 +139,8 @@ class Kept:
         return bool(active)
 
     def _place(self, segment: Segment) -> Path:
-        return self.folder / file_name(segment.name) / segment.key
+        key = hashlib.sha256(f"{segment.key} {self._runs.gap_limit_s}".encode()).hexdigest()[:16]
+        return self.folder / file_name(segment.name) / key
 
     def save(self, folder: Path, made: Sequence[Made]) -> None:
         """Write the dataset to a folder, one file for each segment, for `rerun server -d FOLDER`."""
@@ -180,14 +182,14 @@ def draw(segment: Segment, gap_limit_s: float, place: Path) -> list[str]:
         whole.unlink()
         for label, chunks in layers.items():
             write_chunks(new / f"{file_name(label)}.rrd", APPLICATION, segment.name, chunks)
+    return differing(segment, judge)
+
+
+def differing(segment: Segment, judge: Judge) -> list[str]:
+    """Describe the first error of a replay that differs from what the result states, if any does."""
     if segment.parts[0].runner is None:
         return []
-    return _differing(segment, judge.runs_table.to_dict("records"))
-
-
-def _differing(segment: Segment, rows: Sequence[Mapping[Any, Any]]) -> list[str]:
-    """Describe the first error of a replay that differs from what the result states."""
-    for row in rows:
+    for row in judge.runs_table.to_dict("records"):
         label, case = str(row["estimator"]), str(row["case"])
         stated = segment.properties.get(label) or segment.properties.get(f"{label} {case}") or {}
         for key, value in stated.items():

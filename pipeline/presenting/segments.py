@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -116,7 +117,10 @@ class Segment:
         for part in self.parts[1:]:
             _, other = part.load()
             for label in labels_of(other):
-                name = label if label not in versions else f"{label} {part.title}"
+                names = chain(
+                    [label, named := f"{label} {part.title}"], map(f"{named} {{}}".format, count(2))
+                )
+                name = next(each for each in names if each not in versions)
                 versions[name] = part.title
                 own = Renamed(other, label, name)
                 streams |= own.read([*own.topics])

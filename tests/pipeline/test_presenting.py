@@ -145,6 +145,10 @@ def test_two_versions_of_an_estimator_are_in_one_scene(
     assert runs is not None
     (made,) = Kept(runs).made()
     assert {name for _, name in made.layers} == {"base", "ekf", "ekf new"}
+    (segment,) = runs.segments
+    again = replace(segment, parts=(*segment.parts, segment.parts[1]))
+    assert list(again.load()[2]) == ["ekf", "ekf new", "ekf new 2"]
+    assert Kept(runs._replace(gap_limit_s=9.0)).made() == []
 
 
 def test_a_run_that_is_not_replayed_as_it_was_is_reported(result: Path, tmp_path: Path) -> None:
