@@ -10,7 +10,7 @@
 Units, axes and frames are those of REP 103 and REP 105. Covariances are row-major, of positions and of
 rotations about the fixed axes; unknown ones are zero. A robot in the plane has zero height, roll and
 pitch with zero variances, as in amcl. If a covariance is known only in part, the other variances are
-`UNKNOWN`, as in the controllers of ros2_control.
+`UNKNOWN`, as in configurations of diff_drive_controller.
 """
 
 import re
