@@ -10,7 +10,7 @@
 Units, axes and frames are those of REP 103 and REP 105. Covariances are row-major, of positions and of
 rotations about the fixed axes; unknown ones are zero. A robot in the plane has zero height, roll and
 pitch with zero variances, as in amcl. If a covariance is known only in part, the other variances are
-`UNKNOWN`, as in the controllers of ros2_control.
+`UNKNOWN`, as in configurations of diff_drive_controller.
 """
 
 import re
@@ -42,6 +42,8 @@ BASE, TRANSFORMS = "base_link", "/tf"
 PLACE, TURN, VELOCITY = range(3), range(3, 6), range(6, 9)
 # The version of metadata.yaml; ROS before Jazzy does not read later ones.
 _VERSION: Literal[8] = 8
+# Messages of ROS are Python objects, about 5 kB for each row, so blocks are small.
+_BLOCK_MESSAGES = 1 << 14
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -79,7 +81,7 @@ def write_bag(
     written, omitted = Counter[str](), Counter[str]()
     connections: dict[tuple[str, str], Any] = {}
     with Writer(folder, version=_VERSION, storage_plugin=storage) as bag:
-        for block in read_blocks(log, topics):
+        for block in read_blocks(log, topics, block_messages=_BLOCK_MESSAGES):
             for topic, stream in block.items():
                 known = in_plane(stream.take(_finite(stream)), origin)
                 omitted[topic] += len(stream) - len(known)
