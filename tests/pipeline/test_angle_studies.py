@@ -36,7 +36,7 @@ def test_table_iii_is_refuted_as_stated_and_confirmed_as_reproduced(three_sensor
 
 
 def test_field_of_view_and_start_are_refuted(three_sensors: tuple) -> None:
-    for start in ("every sensor has all targets", "eqs (21)-(23)"):
+    for start in ("every sensor sees all targets", "eqs. (21)-(23)"):
         assert list(verdicts(three_sensors[1], start).values()) == ["refuted"]
 
 
@@ -58,11 +58,11 @@ def test_acoustic_refutes_what_does_not_hold(tmp_path: Path) -> None:
     settings = {"shots": 4, "options": {"multipliers": [0.1, 1.0, 1.5], "maps": {"step_m": 25.0}}}
     result = run("acoustic", tmp_path / "result", settings, 4)
     expected = {
-        "CRLB of native measurements is lower": "refuted",
-        "estimating the sensors along improves": "refuted",
-        "eq (48) with the covariances": "refuted",
-        "scenario 2: who hears the shockwave": "confirmed",
-        "scenario 3: what other measurements add": "confirmed",
+        "the CRLB of native measurements is lower": "refuted",
+        "estimating the sensors together with the shooter": "refuted",
+        "eq. (48), with the covariances": "refuted",
+        "scenario 2: which sensors hear the shockwave": "confirmed",
+        "scenario 3: improvement from measurements other than bearings": "confirmed",
         "figure 22": "not reproducible",
     }
     for start, verdict in expected.items():

@@ -42,5 +42,5 @@ def test_stamps_count_once_aligned_and_each_estimator_is_claimed(monkeypatch: py
     _, experiment = load_experiment("navigation-heading", {}, {})
     claims = decide(experiment.claims, outcome.metrics, {}, {"aligned_s": 5.0, "runs": 200.0})
     assert [claim.verdict for claim in claims] == ["confirmed", "refuted"]
-    assert claims[0].claim.startswith("good: from 5 s on, the mean NEES over the runs lies in its")
+    assert claims[0].claim.startswith("good: from 5 s on, the mean NEES over the runs is in its")
     assert claims[1].ours == "80.0 % of the stamps, 200 runs; mean NEES 3.00"

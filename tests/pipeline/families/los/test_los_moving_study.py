@@ -82,7 +82,7 @@ def verdicts(case: str, least: float, left: float) -> list[str]:
     _measure(case, table.assign(**dict.fromkeys(unjudged, np.nan)), told, sigma, outcome)
     _, experiment = load_experiment("los-moving", {}, {})
     claims = decide(experiment.claims, outcome.metrics, outcome.intervals, {})
-    beginnings = (f"{case}: the measurements determine", f"{case}: the roll")
+    beginnings = (f"{case}: in the weakest direction", f"{case}: after smoothing")
     return [claim.verdict for claim in claims if claim.claim.startswith(beginnings)]
 
 

@@ -119,7 +119,7 @@ def test_a_path_without_a_window_is_not_held_to_errors_of_a_part_of_it(
     alone = experiment.model_copy(update={"estimators": {"ekf": experiment.estimators["ekf"]}})
     result = run_experiment(name, alone, tmp_path / "out", data=tmp_path, logs=0)
     assert [claim.claim.partition(": ")[2] for claim in result.claims] == [
-        "robust filters of ranges alone are better than the published tracks"
+        "robust filters that use only ranges are more accurate than the published tracks"
     ]
 
 
