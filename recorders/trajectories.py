@@ -85,7 +85,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """The layout of a line: a description, the numbers it may have, and the columns of its parts."""
+    """The layout of a line: a description, its least and largest number of cells, and its columns."""
 
     columns: str
     least: int

@@ -91,16 +91,16 @@ class Body:
 
     @property
     def roles(self) -> list[Sequence[Series]]:
-        """Return the topics of every role."""
+        """Return the topics of each kind, one list per attribute."""
         measured = self.rates, self.forces, self.orientations, self.references
         return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
 
 
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
-    """Group topics by body: one per namespace, or a single one if no role occurs twice.
+    """Group topics by body: one body per namespace, or only one if no kind of topic occurs twice.
 
-    A nested namespace also has the topics of the outer one: the body of `/imu2/inertial` also has the
-    positions of `/fix`.
+    A nested namespace includes the topics of the outer one, so the body of `/imu2/inertial` has the
+    positions of `/fix` too.
     """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0

@@ -99,7 +99,7 @@ def clocks(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def factors(motion: BodyMotion) -> Iterator[Finding]:
-    """Find speeds in other units, by how far positions move."""
+    """Find speeds in wrong units, by comparison with how far positions move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
         ratio = motion.speed(source)
         if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:

@@ -75,8 +75,8 @@ class CarParameters(Parameters):
         rest_s: time at rest, before 5 s of acceleration.
         begin: "of the prior" draws the first pose from the prior, whose mean is zero; "any heading"
             begins at zero in a random direction, which is the prior's mean.
-        prior_sigma_m, prior_sigma_rad: standard deviations of the prior, of a position per axis, of the
-            heading.
+        prior_sigma_m, prior_sigma_rad: standard deviations of the position, per axis, and of the heading
+            in the prior.
         odometry_step_s, fix_step_s, compass_step_s: times between messages.
         first_fix_s: time of the first fix.
         forward_noise_density: noise density of the wheels' forward speed, in m/s/sqrt(Hz).

@@ -228,7 +228,7 @@ class _Lowering(Frame):
             self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
-        """Lower the statements in the body of a loop, which continues at `then`."""
+        """Lower the statements in the body of a loop; after them, the loop continues at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)

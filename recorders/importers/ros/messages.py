@@ -87,7 +87,7 @@ def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray
 
 
 def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:
-    """Read the numbers (n, d) that a field such as a Vector3 has under `names`."""
+    """Read the members `names` of a field such as a Vector3, (n, d)."""
     return np.stack([messages.numbers(f"{path}.{name}") for name in names], axis=1).astype(float)
 
 
@@ -343,7 +343,7 @@ def _detections(names: str, unit: str) -> Taken:
 
 
 def _measured(components: Mapping[str, str]) -> Taken:
-    """Read numbers whose meaning the type does not define: fields by the names of components."""
+    """Make a reader of numbers whose meaning the type does not define: `components` names the fields."""
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * len(components))}
 
     def parts(messages: Messages) -> Iterator[Part]:

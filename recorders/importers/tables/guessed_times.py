@@ -334,7 +334,7 @@ def _passed_over(table: _Table, used: set[str]) -> list[str]:
 def _tried(
     table: _Table, mapping: TimeMapping, comments: list[str], refusals: list[BadInput]
 ) -> GuessedTime | None:
-    """Try one candidate; return None if it is not the time, and add a refusal if it might be."""
+    """Try one candidate; if it cannot be the time, return None, usually with a reason in `refusals`."""
     columns = mapping.columns
     try:
         stamps = _stamps(table, mapping)

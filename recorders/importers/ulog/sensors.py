@@ -25,8 +25,8 @@ FARTHEST_M = 150.0
 class Part:
     """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
-    The maker of the stream leaves out rows in which a required number is not finite; `facts` counts
-    others that are left out or changed.
+    The maker of the stream leaves out rows in which a required number is not finite; `facts` counts rows
+    that are left out or changed for other reasons.
     """
 
     topic: str

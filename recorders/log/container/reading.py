@@ -123,7 +123,7 @@ class _Index(NamedTuple):
 
 
 class NotMcap(BadInput):
-    """An error for files that are not MCAP, some of which a command may accept in another way."""
+    """An error for files that are not MCAP; a command may catch it and read another format."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
