@@ -267,7 +267,7 @@ def resolution(values: Floats) -> float:
 
 
 def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of every component, for regular topics or all measured ones."""
+    """Yield field, name and values (n,) of each component of a measured (or only of a regular) topic."""
     if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:

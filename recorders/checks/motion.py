@@ -1,6 +1,6 @@
 """Comparisons of a body's topics in pairs: their lags, and the factors or angles between them.
 
-Lags are found first, because a topic that is 18 s late seems to turn in the wrong direction.
+Lags are found first, because a topic with a large delay may seem to turn in the wrong direction.
 """
 
 from collections.abc import Iterator

@@ -150,7 +150,7 @@ def _is_degrees(ratio: Slope) -> bool:
 
 
 def headings(motion: BodyMotion) -> Iterator[Finding]:
-    """Find headings with a constant offset from the course, for bodies that move where they point."""
+    """Find headings with a constant offset from the course, if the body moves the way it points."""
     for orientation in motion.body.orientations:
         ratio = motion.heading_course(orientation)
         offsets = motion.heading_offsets(orientation)

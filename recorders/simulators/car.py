@@ -1,6 +1,6 @@
 """Simulator of a car with wheels, a receiver of fixes, and a compass, all with errors.
 
-The car drives on exact arcs, one for each step of its odometry. It tests diagnosis and calibration.
+The car drives on exact arcs, one for each step of its odometry. Its logs test diagnosis and calibration.
 Begin with `drive`; `streams_of` makes a log.
 """
 
@@ -25,7 +25,7 @@ SPEED_MPS, TURN_RADPS, CIRCLE_S = 8.0, 0.4, 15.708
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Return speeds and turn rates (n,) at times (n,) of a straight drive, like the other motions."""
+    """Return the rates of a straight drive: speeds and turn rates (n,) at times (n,)."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 

@@ -315,7 +315,7 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 
 
 def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
-    """Draw the prior: the truth with an error, whose rotation is a turn about up and a tilt.
+    """Draw the prior: the truth with an error; the error of the orientation is a turn and a tilt.
 
     The turn is about the up axis of the mean, so that an unknown heading does not affect the tilt.
     """

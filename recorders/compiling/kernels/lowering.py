@@ -132,7 +132,7 @@ class _Lowering(Frame):
             self.give(target, found)
 
     def give(self, target: ast.expr, value: Value) -> None:
-        """Assign to a name, names, or a part of an array."""
+        """Assign to one or several names, or to a part of an array."""
         if isinstance(target, ast.Name):
             self.assign(target.id, value)
         elif isinstance(target, ast.Tuple):

@@ -165,7 +165,7 @@ class Drive(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Unordered scans: the number of detections of each, and all detections (n, 2), scan after scan."""
+    """Unordered scans: the number of detections in each, and all detections (n, 2), scan after scan."""
 
     counts: Integers
     places: Floats

@@ -40,7 +40,7 @@ class Part:
         kind: last part of the stream's name.
         columns: fields (k,) or (k, width) of the stream's schema.
         metadata: metadata of the channel.
-        constants: columns (k, width) whose first value becomes metadata, by their names there.
+        constants: columns (k, width) whose first row becomes metadata, by the name of the metadata.
         noise: variances (k,) of readings, by the noise density that the channel states for them.
         rows: message of each row; None if there is one row for each message.
         dropped: rows (k,) to leave out, by reason.

@@ -309,7 +309,7 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
         places: east and north of the rows; empty if unknown.
 
     Returns:
-        "enu", "ned", or an empty string if the steps are not clear.
+        "enu", "ned", or an empty string if the steps fit neither clearly.
     """
     if not places:
         return ""
@@ -327,7 +327,7 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
 
 
 def _angle_units(largest: float) -> list[str]:
-    """Return the possible units of angles up to a largest one, the likeliest first."""
+    """Return the possible units of angles with this largest value, the likeliest first."""
     if largest <= 720.0:
         return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
     scales = ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")

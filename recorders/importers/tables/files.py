@@ -240,7 +240,7 @@ def open_decompressed(path: Path) -> BinaryIO:
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open a text as decompressed bytes; lines that end with CR only get newlines."""
+    """Open a text as decompressed bytes; line ends that are only CR become newlines."""
     file = open_decompressed(path)
     head = file.read(_HEAD_BYTES).strip()
     file.seek(0)

@@ -116,7 +116,7 @@ _ARDUPILOT, _RECEIVED = "TimeUS", "timestamp"
 
 
 class GuessedTime(NamedTuple):
-    """A table's time: TOML, the columns that it uses, and comments with facts and assumptions.
+    """A table's time: its TOML, the columns that it uses, and comments with facts and assumptions.
 
     `stamps` (n,) are the stamps of the rows, or None if no column has them; `vehicle` is the column that
     identifies the vehicle of each row.

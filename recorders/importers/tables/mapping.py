@@ -79,7 +79,7 @@ class Geodetic(Parameters):
 
 
 class Attitude(Parameters):
-    """Columns with angles of a body with axes forward, left, up, made into quaternion_w to quaternion_z.
+    """Columns with a body's angles (axes forward, left, up), converted to quaternion_w to quaternion_z.
 
     The quaternion rotates to a frame of east, north, up.
 

@@ -1,4 +1,4 @@
-"""Stamps of tables: numbers since a zero, dates, GPS weeks, or a rate; exact to the nanosecond."""
+"""Stamps of tables: numbers that count from a zero, dates, GPS weeks, or a rate; exact to 1 ns."""
 
 import re
 import struct
@@ -268,7 +268,7 @@ class Reading:
         self.is_second = False  # whether a repeated hour is there for the second time
 
     def continued_ns(self, counted: Stamps, rollover_ns: int, label: str) -> Stamps:
-        """Unwrap the numbers (n,) of a counter beyond its rollovers."""
+        """Unwrap the readings (n,) of a counter that rolls over."""
         known = counted != NOT_A_TIME
         if not known.any():
             return counted
@@ -404,7 +404,7 @@ def _dates_ns(
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
-    """Convert cells to texts; a date whose time of day is in another column loses its midnight."""
+    """Convert cells to texts; if the time of day is in another column, only the dates are kept."""
     if is_part and pa.types.is_timestamp(cells.type):
         return pc.strftime(cells, format="%Y-%m-%d")
     return pc.utf8_trim_whitespace(cells.cast(pa.string()))
@@ -451,7 +451,7 @@ def _from_zone(
 ) -> Stamps:
     """Convert stamps (n,) from a zone's local time to UTC.
 
-    In an hour that occurs twice, rows belong to the second one after their times go back. Raises
+    If an hour occurs twice, rows belong to its second occurrence after their times go back. Raises
     BadInput for a time that the clocks skip.
     """
     known = np.flatnonzero(local_ns != NOT_A_TIME)

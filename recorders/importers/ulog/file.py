@@ -85,7 +85,7 @@ class UlogFile:
         texts: messages of the autopilot.
         dropouts: stamp and length in us of losses that the logger reported.
         rows: number of rows of each topic and instance so far.
-        losses: unreadable parts in words, with their numbers.
+        losses: number of unreadable parts, by description.
     """
 
     def __init__(self, path: Path) -> None:
@@ -226,7 +226,7 @@ class UlogFile:
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
-        """Parse a piece at `place`; return the last message's end, whether one broke, and the rows."""
+        """Parse a piece at `place`; return where the messages end, if one is broken, and the rows."""
         found = walk(data, size)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:

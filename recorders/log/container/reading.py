@@ -351,7 +351,7 @@ def _attachment_name(file: BinaryIO, place: _Place) -> str:
 
 
 def _declare(found: Container, declarations: Iterable[Any]) -> None:
-    """Add schemas and channels. Raises Damaged if one number has two meanings."""
+    """Add schemas and channels. Raises Damaged if one id has two meanings."""
     known: dict[type, dict] = {records.Schema: found.schemas, records.Channel: found.channels}
     for record in declarations:
         kind = type(record)
