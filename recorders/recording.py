@@ -45,7 +45,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
 def named_generator(
     rng: np.random.Generator, name: str, numbers: Mapping[str, int] | None = None
 ) -> np.random.Generator:
-    """Return a generator for this name; further names do not change the numbers of existing ones.
+    """Return a generator for this name; new names do not change the random numbers of existing ones.
 
     Args:
         rng: generator of the run, or of a part of it; nothing is drawn from it.

@@ -85,7 +85,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """The layout of a line: a description, the numbers it may have, and the columns of its parts."""
+    """The layout of a line: a description, its least and largest number of cells, and its columns."""
 
     columns: str
     least: int
@@ -100,7 +100,7 @@ def _seconds_ns(text: str) -> int:
 
 
 def _exact(text: str) -> Decimal:
-    """Read a number that is finite as a double; an exponent beyond Decimal's range gives zero."""
+    """Read a number exactly if it is finite as a double; exponents beyond Decimal's range give zero."""
     try:
         return Decimal(text)
     except InvalidOperation:

@@ -47,7 +47,7 @@ class Series:
         return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
 
     def moved(self, by_s: float, gain: float = 0.0) -> "Series":
-        """Return the series with stamps corrected for a delay, and for a clock that gains."""
+        """Return the series with stamps corrected for a delay, and for the gain of its clock."""
         first_s = self.times_s[0]
         times_s = self.times_s - gain * (self.times_s - first_s) - by_s
         return Series(self.topic, self.field, times_s, self.values, self.holds)
@@ -91,16 +91,16 @@ class Body:
 
     @property
     def roles(self) -> list[Sequence[Series]]:
-        """Return the topics of every role."""
+        """Return the topics of each kind, one list per attribute."""
         measured = self.rates, self.forces, self.orientations, self.references
         return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
 
 
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
-    """Group topics by body: one per namespace, or a single one if no role occurs twice.
+    """Group topics by body: one body per namespace, or only one if no kind of topic occurs twice.
 
-    A nested namespace also has the topics of the outer one: the body of `/imu2/inertial` also has the
-    positions of `/fix`.
+    A nested namespace includes the topics of the outer one, so the body of `/imu2/inertial` has the
+    positions of `/fix` too.
     """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
@@ -174,7 +174,7 @@ _TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
 def _fixes(
     places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True
 ) -> PlaceSeries:
-    """Return positions with the mean of their two stated variances, NaN if there are none."""
+    """Return positions with the mean of their two stated horizontal variances, NaN without these."""
     column = stream.columns.get("covariance_m2")
     variances = np.full(len(places.times_s), np.nan)
     if column is not None and len(places.times_s) == len(rows) and column.shape[1]:

@@ -37,7 +37,8 @@ _DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # where exact z
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find a value that stays the same far longer than usual, while other columns change.
 
-    A rounded column that continues within two grid steps of the value was at rest, and not frozen.
+    A rounded column whose values before and after are at most two grid steps away was at rest, and not
+    frozen.
     """
     entries = list(_entries(stream))
     for field, name, column in entries:
@@ -69,7 +70,7 @@ def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def codes(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a number that recurs although it is far from the values before and after it."""
+    """Find a number that recurs far from the values around it, as codes for missing values do."""
     entries = [(*each, np.inf) for each in _entries(stream) if each[0] not in RANGES]
     if stream.schema.full_name == schemas.ORIENTATION.full_name:
         entries = [("quaternion", "the heading in rad", heading(stream["quaternion"]), np.pi)]
@@ -229,7 +230,7 @@ def _is_code(levels: Floats, at: int) -> bool:
 
 
 def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> bool:
-    """Test whether an inertial value is the end of a usual range, or of 16 bits."""
+    """Test whether an inertial value is the end of a usual sensor range, or of 16-bit integers."""
     ranges = RANGES.get(field)
     if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
         return False
@@ -241,7 +242,7 @@ def _is_end_of_range(stream: Stream, field: str, column: Floats, end: float) -> 
 def _is_clipped(
     is_there: NDArray[np.bool_], levels: int, usual: float, others: Sequence[Floats]
 ) -> bool:
-    """Test whether an end is far more frequent than other values, while other columns change."""
+    """Test whether an extreme value is far more frequent than others, while other columns change."""
     if levels < MANY_LEVELS or is_there.sum() <= max(CLIPPED * len(is_there), MORE_OFTEN * usual):
         return False
     runs = int(is_there[0]) + int(np.sum(np.diff(is_there.astype(np.int8)) > 0))
@@ -266,7 +267,7 @@ def resolution(values: Floats) -> float:
 
 
 def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of every component, for regular topics or all measured ones."""
+    """Yield field, name and values (n,) of each component of a measured (or only of a regular) topic."""
     if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:

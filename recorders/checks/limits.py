@@ -146,7 +146,7 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _bent(stream: Stream) -> float:
-    """Return the range of courses (rad) of the legs between fixes; 0 for other topics."""
+    """Return the range of courses (rad) of the legs between fixes; 0 for topics without fixes."""
     if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
         return 0.0
     places = _places(stream)[np.linspace(0, len(stream) - 1, LEGS + 1).astype(int)]
@@ -155,7 +155,7 @@ def _bent(stream: Stream) -> float:
 
 
 def _speed(stream: Stream) -> float:
-    """Return the median speed of fixes in m/s; 0 for other topics."""
+    """Return the median speed between fixes in m/s; 0 for topics without fixes."""
     if stream.schema.full_name not in _PLACED or len(stream) < FEWEST:
         return 0.0
     moved = np.linalg.norm(np.diff(_places(stream), axis=0), axis=1)

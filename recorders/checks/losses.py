@@ -155,7 +155,7 @@ def _are_bursts(is_gap: NDArray[np.bool_]) -> bool:
 
 
 def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find clocks with another rate than that of other topics, or of the recorder (as if simulated)."""
+    """Find clocks whose rate differs from other topics', or from the recorder's (as in simulations)."""
     rates = {
         topic: rate for topic, stream in streams.items() if (rate := clock_rate(stream)) is not None
     }

@@ -1,6 +1,6 @@
 """Comparisons of a body's topics in pairs: their lags, and the factors or angles between them.
 
-Lags are found first, because a topic that is 18 s late seems to turn in the wrong direction.
+Lags are found first, because a topic with a large delay may seem to turn in the wrong direction.
 """
 
 from collections.abc import Iterator
@@ -230,7 +230,7 @@ class BodyMotion:
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
-        """Compute how far positions move for each metre of a speed or velocity."""
+        """Compute how far positions move for each metre travelled according to a speed or velocity."""
         if self.places is None or source.topic == self.places.topic:
             return None
         if (moved := clear_moves(self.places)) is None:
@@ -248,7 +248,7 @@ class BodyMotion:
         return found if _agree(found.value, usual) else found._replace(likeness=0.0, spread=np.inf)
 
     def turn(self, source: Series) -> Slope | None:
-        """Compute how much the course turns for each radian of a turn rate.
+        """Compute how much the course turns for each radian turned according to a turn rate.
 
         If the turn rate correlates with the course without a lag, no lag is used, since half a period
         of a winding road would look like a lag. If several lags fit better, some with opposite signs,
@@ -266,13 +266,13 @@ class BodyMotion:
         return ratio if is_known else None
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
-        """Compute how much a heading turns for each radian of a turn rate."""
+        """Compute how much a heading turns for each radian turned according to a turn rate."""
         angles = Series("", "", orientation.times_s, heading(orientation.values))
         windows = turned(angles, self.turn_span_s)
         return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
 
     def heading_course(self, orientation: Series) -> Slope | None:
-        """Compute how much a heading turns for each radian of the course."""
+        """Compute how much a heading turns for each radian by which the course turns."""
         if self.courses is None:
             return None
         windows = turned(self.timed(self.courses), self.turn_span_s)

@@ -32,7 +32,7 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find inertial units that are recorded raw and, by REP 145, again with an orientation."""
+    """Find inertial units that are recorded raw and, as in REP 145, again with an orientation."""
     raw = streams.get(stream.topic.replace("/data", "/data_raw"))
     is_unit = stream.schema.full_name == schemas.INERTIAL_SAMPLE.full_name
     if not is_unit or raw is None or raw is stream or raw.schema is not stream.schema:

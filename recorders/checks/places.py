@@ -33,7 +33,7 @@ _READ_AS: dict[str, Callable[[NDArray], NDArray]] = {
 
 
 def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes and longitudes beyond their range, as integers, or at 0, 0."""
+    """Find latitudes and longitudes that are out of range, scaled to integers, or both zero."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
         return
     latitude, longitude = stream["latitude_deg"], stream["longitude_deg"]
@@ -211,7 +211,7 @@ def _at(stream: Stream, times_ns: np.ndarray) -> np.ndarray:
 
 
 def _wheels(streams: Mapping[str, Stream], stream: Stream) -> Slope | None:
-    """Compute how far fixes move for each metre of the wheels of the same body."""
+    """Compute how far fixes move for each metre travelled according to the body's wheels."""
     for body in bodies({**streams, stream.topic: stream}):
         if body.speeds and body.fixes and body.fixes[0].topic == stream.topic:
             return BodyMotion(body).speed(body.speeds[0])

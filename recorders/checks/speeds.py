@@ -56,7 +56,7 @@ def leaps(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def delays(motion: BodyMotion) -> Iterator[Finding]:
-    """Find topics that are later than others of the same body, by the lags of speeds and turns."""
+    """Find topics with later stamps than others of the same body, by the lags of speeds and turns."""
     for topic, late_s in motion.delays_s.items():
         if not late_s:
             continue
@@ -84,7 +84,7 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def clocks(motion: BodyMotion) -> Iterator[Finding]:
-    """Find clocks that gain on others, by speeds that drift apart."""
+    """Find clocks that run faster or slower than others, as the lag between two speeds then grows."""
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
         yield Finding(
@@ -99,7 +99,7 @@ def clocks(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def factors(motion: BodyMotion) -> Iterator[Finding]:
-    """Find speeds in other units, by how far positions move."""
+    """Find speeds in wrong units, by comparison with how far positions move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
         ratio = motion.speed(source)
         if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:

@@ -23,7 +23,7 @@ VARIES = 1e-6  # relative variation that a motion needs to determine a time
 
 
 class Timing(NamedTuple):
-    """The fit of a source to windows in time.
+    """The lag and gain at which a source fits the motion in windows best, and how certain they are.
 
     Attributes:
         lag_s: how much later the windows are than the source.

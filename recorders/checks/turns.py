@@ -57,7 +57,7 @@ def signs(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def _by_forces(motion: BodyMotion, source: Series) -> int:
-    """Test a frame by forces: -1 if it is correct, so the rate is wrong; 1 if mirrored; else 0."""
+    """Test by forces whether a frame is mirrored (1) or correct, so that the rate is wrong (-1)."""
     for force in motion.body.forces:
         if force.topic == source.topic:
             found = motion.forces(motion.aligned(force))
@@ -150,7 +150,7 @@ def _is_degrees(ratio: Slope) -> bool:
 
 
 def headings(motion: BodyMotion) -> Iterator[Finding]:
-    """Find headings with a constant offset from the course, for bodies that move where they point."""
+    """Find headings with a constant offset from the course, if the body moves the way it points."""
     for orientation in motion.body.orientations:
         ratio = motion.heading_course(orientation)
         offsets = motion.heading_offsets(orientation)

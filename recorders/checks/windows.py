@@ -93,9 +93,9 @@ def jumps(fixes: Series) -> NDArray[np.bool_]:
 def chords(fixes: Series, span_s: float) -> Windows:
     """Compute how positions move (k, 2) in windows of a span, without windows near a jump.
 
-    A receiver that jumps back may have drifted slowly before, and may drift back after jumping away. If
-    jumps are so frequent that less than half of the windows remain, only windows with a jump are
-    removed.
+    Windows near a jump are removed because a receiver may drift slowly before it jumps back, or after it
+    jumped away. If jumps are so frequent that less than half of the windows remain, only windows with a
+    jump are removed.
     """
     first, second = pairs(fixes.times_s, span_s)
     at_s = fixes.times_s[1:][jumps(fixes)]

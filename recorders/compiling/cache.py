@@ -52,7 +52,7 @@ def is_private(folder: Path) -> bool:
 def is_own(status: os.stat_result) -> bool:
     """Test whether a file or folder belongs to this user, and other users may not write to it.
 
-    The result is True on systems without user numbers (Windows), which separate the folders of users.
+    The result is True on systems without user ids (Windows), which separate the folders of users.
     """
     return _user() is None or (status.st_uid == _user() and not status.st_mode & _OTHERS_MAY_WRITE)
 

@@ -84,15 +84,16 @@ class StreamMapping(Parameters):
         offsets: numbers added after the multiplication, by field.
         units: units of the sources (with factors and offsets), by field; by default fuselog's units.
         deviations: for a covariance the standard deviations, given as in `fields`.
-        cross_deviations: for a covariance the signed roots of the off-diagonal entries: those of 1 and
-            2, 1 and 3, 2 and 3.
+        cross_deviations: for a covariance the square roots of the off-diagonal entries (1, 2), (1, 3)
+            and (2, 3), with the signs of the entries.
         inflated: conditions under which standard deviations are larger than stated.
         where: for each source the values that a row must have to be imported.
         missing: numbers that mark a missing value.
-        each: makes one message for each of these entries from every row, with further fields.
+        each: further fields, one entry per message; every row makes one message for each entry.
         mounting_deg: roll, pitch, yaw that rotate the sensor's axes into the body's (Rz Ry Rx); vectors
             are rotated, and orientations become the body's.
-        components: components of a vector that states them, separated by commas.
+        components: names of a vector's components, separated by commas, for messages whose channels
+            state them.
         kinds: kinds of these components, separated by commas; linear by default.
         rotation_axes: axes of the rotations in the covariance of an estimate: those of the body, or of
             the world, as in ROS.
@@ -200,7 +201,7 @@ def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: s
 
 
 class _Maker(NamedTuple):
-    """Makes the columns of messages from the sources."""
+    """A maker of the columns of messages from the sources."""
 
     mapping: StreamMapping
     schema: Schema

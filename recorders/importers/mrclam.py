@@ -23,7 +23,7 @@ from fuselog.recorders.recording import Importer, Recording
 
 
 class MrclamParameters(Parameters):
-    """Settings that the data do not state: the noise of odometry and sensor, and that of the start.
+    """Settings that the data do not state: the noise of odometry and sensor, and the prior's sigmas.
 
     The values are the same for all sets and robots. The densities of the odometry are those of its
     errors over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to

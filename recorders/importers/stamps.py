@@ -25,7 +25,7 @@ def to_ns(
     Args:
         values: (n,), whole numbers or floats; NOT_A_TIME or NaN if a value is missing.
         unit_ns: length of the unit in ns.
-        since_ns: the zero of the values, NOT_A_TIME if it is unknown.
+        since_ns: stamp at which the values are zero; NOT_A_TIME if it is unknown.
         where: beginning of error messages: file and column or topic.
         remedy: end of error messages: what to do.
 

@@ -67,7 +67,7 @@ class Decoder:
         return schema
 
     def _check_fields(self) -> None:
-        """Require that a message with one of our names has our fields, except newer ones."""
+        """Require that a message named like one of fuselog's has its fields, except newer ones."""
         kinds = {entry.name: entry.kind for entry in self.schema}
         expected = SCHEMAS.get(self.schema.full_name, self.schema)
         wrong = [
@@ -87,7 +87,7 @@ class Decoder:
         return empty_stream(self._topic.name, self.schema, self._topic.metadata)
 
     def decode(self, contents: Contents, rank: int) -> list[Stream]:
-        """Decode the topic's messages in a region, the file's `rank`th, by channel.
+        """Decode the topic's messages in region number `rank` of the file, by channel.
 
         Raises BadInput if a message cannot be decoded, or its fields do not form columns.
         """

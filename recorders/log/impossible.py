@@ -132,7 +132,7 @@ class Rejections(dict[str, Counter[str]]):
     """Counts of impossible messages that are left out, by topic and by reason."""
 
     def note(self, topic: str, found: Counter[str]) -> None:
-        """Record the messages that a read of a topic or a part of it left out; reads may repeat."""
+        """Record the messages that a read left out of a topic; repeated reads are not added up."""
         self[topic] = self.get(topic, Counter()) | found
 
     def sentence(self, topic: str) -> str:

@@ -166,7 +166,7 @@ def _sort(
     counts: NDArray[np.int64],
     places: NDArray[np.int64],
 ) -> None:
-    """Sort the messages found by channel, and count those of each; `places` is working memory."""
+    """Group the found messages by channel, and count them; `places` is working memory."""
     for row in range(len(messages)):
         counts[_channel(data, found[row])] += 1
     for channel in range(len(counts)):

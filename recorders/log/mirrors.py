@@ -33,7 +33,7 @@ class Mirror(NamedTuple):
 
 
 class Numbered(NamedTuple):
-    """A Foxglove mirror with its channel, and its number there."""
+    """A Foxglove mirror with its channel, and its sequence number in that channel."""
 
     channel_id: int
     sequence: int

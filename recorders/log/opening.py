@@ -36,7 +36,7 @@ class Topic:
 
 
 def topics_of(topics: Mapping[str, Topic], schema: Schema) -> list[str]:
-    """Return the names of the topics whose messages have a schema, in the order of `topics`."""
+    """Return the names of the topics whose messages have this schema, in the order of `topics`."""
     return [name for name, topic in topics.items() if topic.schema_name == schema.full_name]
 
 

@@ -82,7 +82,8 @@ def into_tangent_plane(
 ) -> tuple[Component, Component, Component]:
     """Compute east, north and up (m) of a position relative to the origin.
 
-    Both are latitude and longitude in deg and, unless it is 0, the height above the ellipsoid in m.
+    Position and origin are latitude and longitude in deg, and optionally the height above the ellipsoid
+    in m, which is 0 by default.
     """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     x, y, z = (

@@ -99,7 +99,7 @@ def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Componen
 def strapdown(
     state: Components, force: Components, rate: Components, duration_s: Component, place: Components
 ) -> Components:
-    """Compute position, velocity and orientation (10) after a step with constant force and rate.
+    """Compute position, velocity and quaternion after a step with constant force and turn rate.
 
     Args:
         state: position (m), velocity (m/s) and quaternion before the step.

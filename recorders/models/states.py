@@ -18,7 +18,7 @@ NAVIGATION = (
 def state_metadata(components: Sequence[str]) -> dict[str, str]:
     """Return the metadata of a channel of states: components, and their kinds.
 
-    An angle is a component in rad that wraps; those of ORIENTATION are a quaternion.
+    A component in rad is an angle that wraps; the components named in ORIENTATION form a quaternion.
     """
     kinds = [
         "quaternion" if name in ORIENTATION else "angle" if name.endswith("_rad") else "linear"

@@ -1,6 +1,6 @@
 """Simulator of a car with wheels, a receiver of fixes, and a compass, all with errors.
 
-The car drives on exact arcs, one for each step of its odometry. It tests diagnosis and calibration.
+The car drives on exact arcs, one for each step of its odometry. Its logs test diagnosis and calibration.
 Begin with `drive`; `streams_of` makes a log.
 """
 
@@ -25,7 +25,7 @@ SPEED_MPS, TURN_RADPS, CIRCLE_S = 8.0, 0.4, 15.708
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Return speeds and turn rates (n,) at times (n,) of a straight drive, like the other motions."""
+    """Return the rates of a straight drive: speeds and turn rates (n,) at times (n,)."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
@@ -75,8 +75,8 @@ class CarParameters(Parameters):
         rest_s: time at rest, before 5 s of acceleration.
         begin: "of the prior" draws the first pose from the prior, whose mean is zero; "any heading"
             begins at zero in a random direction, which is the prior's mean.
-        prior_sigma_m, prior_sigma_rad: standard deviations of the prior, of a position per axis, of the
-            heading.
+        prior_sigma_m, prior_sigma_rad: standard deviations of the position, per axis, and of the heading
+            in the prior.
         odometry_step_s, fix_step_s, compass_step_s: times between messages.
         first_fix_s: time of the first fix.
         forward_noise_density: noise density of the wheels' forward speed, in m/s/sqrt(Hz).

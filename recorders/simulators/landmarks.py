@@ -1,7 +1,7 @@
 """Simulator of robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
-Each odometry message states the velocity until the next one; the true velocity is that plus white noise.
-Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
+Each odometry message states the velocity until the next message; the true velocity is the stated one
+plus white noise. Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
 """
 
 from collections.abc import Callable, Mapping
@@ -68,7 +68,7 @@ class Drive(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """The views of one sensor: stamps (n,), pairs of view and target, and the pairs' true values."""
+    """The views of one sensor: their stamps (n,), and the true values of each target seen in a view."""
 
     times_s: NDArray[np.float64]
     look: NDArray[np.int64]

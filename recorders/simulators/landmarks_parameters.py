@@ -30,8 +30,8 @@ class Sensor(Parameters):
         dropout_probability: probability that a measurement is lost.
         outages_per_minute: mean number of outages per minute.
         outage_s: length of an outage.
-        latency_s: least time from measurement to arrival at the recorder.
-        latency_jitter_s: mean of the random time beyond this (exponential).
+        latency_s: shortest delay from measurement to arrival at the recorder.
+        latency_jitter_s: mean of the additional random delay (exponential).
         clock_offset_s: offset of the sensor's clock, positive if ahead.
         stamp_offset_s: offset of the stamps of its messages, positive if ahead.
         sigma_range_m: standard deviation of a range.

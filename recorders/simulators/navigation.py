@@ -128,7 +128,7 @@ def _step(
 def _lean(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Add turns of the view, and tilt the body so that its up axis follows the thrust, in place."""
+    """Turn the body slowly, and tilt it so that its up axis follows the thrust, in place."""
     phase = rng.uniform(0.0, 2 * np.pi, 2)
     yaw = phase[0] + 1.5 * going * np.sin(0.2 * grid_s + phase[1])
     thrust = make_interp_spline(grid_s, place, k=5).derivative(2)(grid_s)
@@ -189,7 +189,7 @@ def _sensed(
     bias_sigma: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Measure a true quantity (n, 3) along three axes; also return the biases (n, 3)."""
+    """Simulate the measurement of a quantity (n, 3) along three axes; also return the biases (n, 3)."""
     step_s = 1.0 / unit.rate_hz
     walk = rng.normal(size=true.shape) * bias_density * np.sqrt(step_s)
     walk[0] = bias_sigma * rng.normal(size=3)
@@ -315,7 +315,7 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 
 
 def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
-    """Draw the prior: the truth with an error, whose rotation is a turn about up and a tilt.
+    """Draw the prior: the truth with an error; the error of the orientation is a turn and a tilt.
 
     The turn is about the up axis of the mean, so that an unknown heading does not affect the tilt.
     """

@@ -59,7 +59,7 @@ class Receiver(Parameters):
         velocity_delay_s: delay of the stamps of velocities.
         outages_s: spans without messages.
         floats_s: spans with float solutions.
-        float_factor: factor of the errors of float solutions, which their covariance states.
+        float_factor: factor by which float solutions have larger errors, and state larger sigmas.
         multipath_s: spans in which positions have the offset `multipath_m`, which their covariance does
             not state.
         multipath_m: offset of positions in these spans (east, north, up).

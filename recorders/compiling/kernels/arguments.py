@@ -38,8 +38,8 @@ _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 2
 def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
     """Append the kinds of an argument, for the kernel's key, and its words, for the call.
 
-    The sizes of the first `varies` axes of an array are not part of the kinds; a NamedTuple can override
-    their number for each field by its attribute `varies`.
+    The sizes of the first `varies` axes of an array are not part of the kinds; the attribute `varies` of
+    a NamedTuple replaces this number for each of its fields.
     """
     if isinstance(value, np.ndarray):
         shape = value.shape
@@ -60,7 +60,7 @@ def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]
 
 
 def with_types(value: Value, kinds: Iterator[Value]) -> Value:
-    """Describe an argument by its part of the key, in the form that `value_of` needs."""
+    """Convert an argument's kinds in the key to the description that `value_of` needs."""
     kind = next(kinds)
     if isinstance(value, tuple):
         return type(value), tuple(with_types(each, kinds) for each in value)

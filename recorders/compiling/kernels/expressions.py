@@ -109,7 +109,7 @@ class Expressions(Scope, ABC):
                 self._bind(each, part)
 
     def iterated(self, node: ast.expr) -> list[Value]:
-        """Return the values of a loop, which must be known."""
+        """Return the values over which a loop runs, which must be known."""
         found = self.value(node)
         parts = entries(found)
         if parts is not None:

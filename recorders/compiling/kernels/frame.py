@@ -153,7 +153,7 @@ def unsure(value: Value) -> Value:
 
 
 def common_value(one: Value, other: Value) -> Value:
-    """Return the first value, with numbers of kinds that can also represent the other's."""
+    """Return the first value, with its numbers in kinds that can represent those of both values."""
     if isinstance(one, Number) and isinstance(other, Number):
         return one._replace(kind=common_kind(one, other))
     parts, others = entries(one), entries(other)

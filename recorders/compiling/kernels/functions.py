@@ -1,4 +1,4 @@
-"""Functions of numbers from NumPy, Python and libm, and `high_word`, lowered to LLVM IR: `FUNCTIONS`."""
+"""`FUNCTIONS`: how functions of numbers from NumPy, Python and libm, and `high_word`, are lowered."""
 
 import math
 import operator

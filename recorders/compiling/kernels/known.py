@@ -63,7 +63,7 @@ def as_python(value: Value) -> Value:
 
 
 def from_python(value: Value) -> Value:
-    """Convert a Python value to its form while lowering."""
+    """Convert a Python value to the form that it has during lowering."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return Record(type(value), tuple(map(from_python, value)))
     if isinstance(value, tuple | list):

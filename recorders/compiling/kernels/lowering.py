@@ -132,7 +132,7 @@ class _Lowering(Frame):
             self.give(target, found)
 
     def give(self, target: ast.expr, value: Value) -> None:
-        """Assign to a name, names, or a part of an array."""
+        """Assign to one or several names, or to a part of an array."""
         if isinstance(target, ast.Name):
             self.assign(target.id, value)
         elif isinstance(target, ast.Tuple):
@@ -228,7 +228,7 @@ class _Lowering(Frame):
             self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
-        """Lower the statements in the body of a loop, which continues at `then`."""
+        """Lower the statements in the body of a loop; after them, the loop continues at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)

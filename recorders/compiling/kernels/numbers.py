@@ -39,7 +39,7 @@ Scalar = Number | Static
 
 
 def constant(value: Value) -> Number:
-    """Convert a known number to LLVM IR; real numbers are written bit by bit."""
+    """Convert a known number to LLVM IR; real numbers are written as their exact bits."""
     if isinstance(value, bool | np.bool_):
         return Number(TRUTH, "true" if value else "false")
     if isinstance(value, np.unsignedinteger):

@@ -147,7 +147,7 @@ class Program:
 
 
 def _unsure(value: Value) -> Value:
-    """Return a number without the assumption that it is not negative, as in other calls."""
+    """Return a number without the assumption that it is not negative, which other calls may violate."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 

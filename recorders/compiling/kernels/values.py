@@ -127,7 +127,7 @@ def signature(value: Value) -> Value:
 
 
 def at_run_time(value: Value) -> Value:
-    """Convert every known number in a value to one at run time."""
+    """Convert every known number in a value to a number at run time."""
     if is_static(value):
         return constant(value)
     if isinstance(value, Record):

@@ -1,9 +1,10 @@
 """Differences between the arrival times of a sound at microphones, by cross-correlation.
 
 Knapp and Carter, "The Generalized Correlation Method for Estimation of Time Delay", IEEE Transactions on
-Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is that of the
-delay plus that of noise and echoes; the estimated delay maximizes the sum of the cosines of the
-remaining phases. With the phase transform, all frequencies have the same weight.
+Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is the sum of a
+part due to the delay and a part due to noise and echoes. The estimated delay maximizes the sum of the
+cosines of the phases that remain without its part. With the phase transform, all frequencies have the
+same weight.
 """
 
 from itertools import combinations
@@ -59,10 +60,10 @@ def delay_between(
 ) -> Delay:
     """Measure the delay of `late` (samples,) relative to `early`, at most `longest_s` either way.
 
-    The variance is that of the root of the equation for the delay, sum w omega sin(remaining phase) = 0,
-    estimated from the remaining phases (the sandwich estimator of Huber, "The behavior of maximum
-    likelihood estimates under nonstandard conditions", 1967). It holds for noise that is independent
-    between frequencies, with any spectrum. It does not include the risk of a wrong peak.
+    The delay is the root of the equation sum w omega sin(remaining phase) = 0. Its variance is estimated
+    from the remaining phases (the sandwich estimator of Huber, "The behavior of maximum likelihood
+    estimates under nonstandard conditions", 1967). It holds for noise that is independent between
+    frequencies, with any spectrum. It does not include the risk of a wrong peak.
 
     Args:
         late: (samples,), the signal of the microphone that the sound reaches later.
@@ -116,8 +117,8 @@ def arrivals(
 ) -> Arrivals:
     """Measure arrival times of a sound at n microphones from simultaneous recordings (n, samples).
 
-    Delays of all pairs are at most `longest_s` (n, n). A microphone's variance is the sum of three: a
-    part due to noise, fitted so that the parts of two microphones add up to the variance of their delay;
+    Delays of all pairs are at most `longest_s` (n, n). A microphone's variance has three parts: a part
+    due to noise, fitted so that the parts of two microphones add up to the variance of their delay;
     a part due to echoes and neighbouring peaks, from the median closure error of the delays of three
     microphones; and a part due to a clock offset of up to half a sample. The reference is the microphone
     whose delays to all others have the smallest total variance.

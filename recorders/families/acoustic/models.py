@@ -48,7 +48,7 @@ def fired_from(
 ) -> tuple[Component, Component]:
     """Find the position of a source when it emitted the sound that a sensor hears now.
 
-    The source is at `place` now. The travel time of the sound is that from the current distance,
+    The source is at `place` now. The travel time of the sound follows from the current distance, and is
     corrected once. The remaining error is of second order in velocity over the speed of sound: 2 cm at 1
     km and 1.5 m/s.
     """

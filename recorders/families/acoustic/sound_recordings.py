@@ -3,10 +3,10 @@
 The input is a folder as for opensoundscape: WAV files, a table of the microphones' positions (CSV with
 the file first, then x, y and optionally z, in m), and tables of detections (CSV with the file first,
 start_time and end_time in s from the start of the file, and a column for each kind of sound, 1 if
-present). Tables are recognized by these columns. Every kind and time in a table is one sound. Without
-such a table, the whole recordings of an array are one sound. A file's comment may state when it began
-(`recording_start_time`, as written by opensoundscape); without such comments, all recordings begin at
-the same time.
+present). Tables are recognized by these columns. Each time span of each kind in a table of detections is
+one sound. Without such a table, the whole recordings of an array are one sound. A file's comment may
+state when it began (`recording_start_time`, as written by opensoundscape); without such comments, all
+recordings begin at the same time.
 """
 
 import re

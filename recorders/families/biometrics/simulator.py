@@ -125,7 +125,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Draw users' effects; a few have poor fingers, others better ones, so that the marginals stay."""
+    """Draw users' effects; a few have poor fingers, the others better ones to keep the marginals."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")

@@ -96,7 +96,7 @@ def sample_projected_gaussian(
 
 
 class DirectionalNoise(Parameters):
-    """A distribution of unit vectors, along the components of a complex number or quaternion.
+    """A distribution of unit complex numbers or quaternions, with one parameter per component.
 
     Attributes:
         distribution: kind of distribution; samples of a Gaussian are scaled to unit length.

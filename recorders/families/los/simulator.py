@@ -39,7 +39,8 @@ class OpticalParameters(Parameters):
         interval_s: time between sightings.
         passes: number of passes over all targets.
         all_at_once: whether all targets are seen at the same time; otherwise one after another.
-        field_of_view_deg: opening angle of the cone about the centre of the targets that a sensor sees.
+        field_of_view_deg: full opening angle of a sensor's cone of view, whose axis is the mean
+            direction to all targets.
         dropout_probability: probability that a sighting is lost.
     """
 

@@ -80,7 +80,7 @@ class IspaceParameters(Parameters):
         loss_probability: probability that a message over a link is lost.
         duplicate_probability: probability that a message over a link arrives twice.
         delay_s: shortest delay of a message over a link.
-        delay_jitter_s: mean of the random delay in addition to this (exponential).
+        delay_jitter_s: mean of the additional random delay (exponential).
         outages: time spans in which a node is out of service.
     """
 

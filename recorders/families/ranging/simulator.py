@@ -32,7 +32,7 @@ class Blocked(Parameters):
         times_per_minute: mean number of times per minute that an anchor is blocked.
         duration_s: mean duration of a blockage.
         least_m: smallest excess of a blocked range.
-        most_m: largest excess of a blocked range; excesses are uniform between both.
+        most_m: largest excess of a blocked range; excesses are uniform from `least_m` to this.
     """
 
     times_per_minute: NonNegativeFloat = 0.0

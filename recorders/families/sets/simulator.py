@@ -1,7 +1,7 @@
 """A robot at rest that measures relative bearings whose errors have a known bound.
 
-Briechle, Hanebeck (2004), section V, and random scenes. Every look measures all pairs of landmarks, or
-the given pairs.
+The scene is that of Briechle and Hanebeck (2004), section V, or random. Every look measures all pairs of
+landmarks, or the given pairs.
 """
 
 from typing import Annotated, Literal
@@ -30,7 +30,7 @@ class RelativeBearingsParameters(Parameters):
         bound_deg: bound of the error of a relative bearing; the channel states it.
         error_share: share of the bound within which errors are uniform.
         landmarks: number of landmarks of a random scene.
-        arena_m: side of the square arena about the centre that the log states.
+        arena_m: side of the square arena that the log states, centred on the origin.
         spread_m: largest distance of a random scene's landmarks from the centre in x and in y.
         robot_spread_m: largest distance of a random scene's robot from the centre in x and in y.
         looks: number of times that all pairs are measured.

@@ -2,8 +2,8 @@
 
 The columns are Time, MMSI, Latitude_degrees, Longitude_degrees, COG_degrees and SOG_knots; other columns
 are ignored. Codes for values that a transponder does not know are those of ITU-R M.1371-5, table 48.
-/reports contains positions without identities, as a radar or a listener without the decoder would have
-them; /identity has the vessel of each report, and /geodetic its position on the ellipsoid.
+/reports contains positions without identities, as a radar would report them; /identity has the vessel
+of each report, and /geodetic its position on the ellipsoid.
 """
 
 import lzma
@@ -71,9 +71,9 @@ class Reports(NamedTuple):
 def read(path: Path, parameters: AisParameters) -> Recording:
     """Read a file; the notes count dropped and doubtful rows.
 
-    Repeated rows, unavailable positions, and positions on the other half of the earth from the tangent
-    plane are dropped. Wrong positions are kept, because real sensors produce them. Raises BadInput with
-    file, row and column if the table is invalid.
+    Repeated rows, unavailable positions, and positions on the far half of the earth, as seen from the
+    origin, are dropped. Wrong positions are kept, because real sensors produce them. Raises BadInput
+    with file, row and column if the table is invalid.
     """
     notes: dict[str, str] = {}
     reports = _without_repetitions(_with_positions(_reports(path), path, notes), notes)

@@ -45,7 +45,7 @@ class Delayed(Parameters):
 
     Attributes:
         latency_s: shortest delay from measurement to arrival.
-        latency_jitter_s: mean of the random delay in addition to this (exponential).
+        latency_jitter_s: mean of the additional random delay (exponential).
     """
 
     latency_s: NonNegativeFloat = 0.0
@@ -99,7 +99,7 @@ class VehiclesParameters(Parameters):
         duration_s: length of the run.
         step_s: length of a time step with constant acceleration.
         stochastic: whether initial states are drawn from the prior and vehicles accelerate. Filters
-            assume both in any case; without them, as in the paper, their covariances are too large.
+            assume both in any case; if it is False, as in the paper, the filters are conservative.
         start: initial states (x, vx, y, vy) of the vehicles, in m and m/s.
         vehicles: number of vehicles with random initial positions in the field; 0 to use `start`.
         speed_mps: speed of vehicles with random initial positions.
@@ -165,7 +165,7 @@ class Drive(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Unordered scans: the number of detections of each, and all detections (n, 2), scan after scan."""
+    """Unordered scans: the number of detections in each, and all detections (n, 2), scan after scan."""
 
     counts: Integers
     places: Floats

@@ -1,4 +1,4 @@
-"""Choice of the topics to import from a bag, of how each is read, and of the names of its streams.
+"""Choice of the topics to import from a bag, how to read them, and how to name their streams.
 
 A stream is named by the namespace of its topic and by its kind: /odom gives /odometry, /robot1/imu gives
 /robot1/inertial. If two topics would give the same name, both include the topic: /odom/odometry,

@@ -23,7 +23,7 @@ class Clocks:
     def note(
         self, topic: str, stamp_ns: NDArray[np.int64] | None, log_time_ns: NDArray[np.int64]
     ) -> None:
-        """Add the stamps of some messages (n,); without a header, the bag's replace them."""
+        """Add the stamps of some messages (n,); if they have no header, only those of the bag."""
         if stamp_ns is not None:  # zero means no stamp
             stamp_ns, log_time_ns = stamp_ns[stamp_ns != 0], log_time_ns[stamp_ns != 0]
         if not len(log_time_ns):

@@ -245,7 +245,7 @@ class _Import:
 
 
 def _frames_of(messages: Messages, frame: str) -> Frames:
-    """Return the names of frames in messages (n,), from the field `frame` and the child's field."""
+    """Return the frames and child frames that messages (n,) name, and which messages name them."""
     stated = {
         name: messages.text(path)
         for name, path in (("frame_id", frame), ("child_frame_id", CHILD_FRAME))

@@ -80,7 +80,7 @@ class Layout:
     """The position of each field of a message, valid for equal lengths of texts and sequences.
 
     Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` has
-    the bytes, by position, that all messages of the layout share: those of the lengths.
+    the bytes of all lengths, by position, which are the same in every message of the layout.
     """
 
     numbers: dict[str, _Number] = field(default_factory=dict)
@@ -158,7 +158,7 @@ class MessageType:
         return dict(self._flat("", (Nodetype.NAME, self.name)))
 
     def read(self, raw: NDArray[np.uint8], rows: NDArray[np.int64]) -> Iterator[Messages | Undecodable]:
-        """Yield messages of one size (n, size) with their rows (n,), by layout; errors for others."""
+        """Yield messages of one size (n, size) with rows (n,), by layout; an error for each bad one."""
         while len(rows):
             try:
                 layout, same = self._next(raw)

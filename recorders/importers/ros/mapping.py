@@ -59,7 +59,7 @@ def read_mapping(path: Path) -> dict[str, MessageMapping]:
 
 
 def taken(mapping: MessageMapping, where: str) -> Taken:
-    """Make the reader of messages for a mapping; it raises BadInput if they lack a field."""
+    """Make the reader of messages for a mapping; it raises BadInput if a message lacks a field."""
     schema = schema_of(mapping, where)
 
     def parts(messages: Messages) -> Iterator[Part]:

@@ -40,7 +40,7 @@ class Part:
         kind: last part of the stream's name.
         columns: fields (k,) or (k, width) of the stream's schema.
         metadata: metadata of the channel.
-        constants: columns (k, width) whose first value becomes metadata, by their names there.
+        constants: columns (k, width) whose first row becomes metadata, by the name of the metadata.
         noise: variances (k,) of readings, by the noise density that the channel states for them.
         rows: message of each row; None if there is one row for each message.
         dropped: rows (k,) to leave out, by reason.
@@ -87,7 +87,7 @@ def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray
 
 
 def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:
-    """Read the numbers (n, d) that a field such as a Vector3 has under `names`."""
+    """Read the members `names` of a field such as a Vector3, (n, d)."""
     return np.stack([messages.numbers(f"{path}.{name}") for name in names], axis=1).astype(float)
 
 
@@ -347,7 +347,7 @@ def _detections(names: str, unit: str) -> Taken:
 
 
 def _measured(components: Mapping[str, str]) -> Taken:
-    """Read numbers whose meaning the type does not define: fields by the names of components."""
+    """Make a reader of numbers whose meaning the type does not define: `components` names the fields."""
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * len(components))}
 
     def parts(messages: Messages) -> Iterator[Part]:

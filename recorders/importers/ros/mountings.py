@@ -69,7 +69,7 @@ class Mountings:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 
     def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
-        """Write that a frame moves on the body; empty if it is connected to none of the bases."""
+        """Write that a frame moves on the body; empty if it is not connected to a base frame."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:
@@ -85,7 +85,7 @@ class Mountings:
         return ""
 
     def _pose(self, bases: list[str], stated: Mapping[str, str]) -> tuple[str, Floats, Rotation] | None:
-        """Find the position of a stream's frame on the body, from the first base that it is fixed to."""
+        """Find the pose of a stream's frame relative to the first base frame to which it is fixed."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:

@@ -36,7 +36,8 @@ class RosParameters(Parameters):
             estimates, which `fuselog evaluate` judges, and not measurements.
         mapping: a TOML file for messages of your own.
         distribution: distribution whose definitions are used for messages that the bag does not define.
-        clock_tolerance_s: headers that differ by more are rejected, as they have different clocks.
+        clock_tolerance_s: largest difference between topics in the offset of the header's clock from the
+            bag's; above it, their clocks are unrelated, and the import stops.
         origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
             plane of poses and positions, whatever their frames are called; it does not apply to
             transforms, nor to poses that odometry integrates.

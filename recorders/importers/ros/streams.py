@@ -1,4 +1,4 @@
-"""Streams of a bag: messages are collected until the end of a block, and facts are counted."""
+"""Collection of a bag's messages in streams, block by block, with counts for the notes."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -64,7 +64,7 @@ class StreamMaker:
     """A maker of streams, block by block, that counts dropped and doubtful messages.
 
     Attributes:
-        counts: counts by subject and fact.
+        counts: number of messages by subject and fact, for the notes.
         came_of: names of the streams made from each topic, in the order of their first messages.
         first_ns: first publish time of all streams.
         noise: the noise stated for a topic, or the reason why it states no noise.
@@ -98,7 +98,7 @@ class StreamMaker:
         return {topic: (each.schema.full_name, each.metadata) for topic, each in self._written.items()}
 
     def tell(self, subject: str, fact: str, count: int) -> None:
-        """Count a fact."""
+        """Add to the count of a fact, such as dropped messages, for the notes."""
         if count:
             self.counts[subject, fact] += count
 

@@ -1,9 +1,9 @@
 """Transforms between frames (TF): those sent, as poses, and named pairs that are composed from them.
 
 A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
-the part of its chain that is sent most often. The others are interpolated between the two nearest
-transforms, linearly and along the shortest rotation, as in tf2, and never extrapolated. Transforms are
-kept only until they are no longer needed, so that memory stays bounded.
+the part of its chain that is sent most often. The other parts are interpolated between the two nearest
+stamps, linearly and along the shortest rotation, as in tf2, and never extrapolated. Transforms are kept
+only until they are no longer needed, so that memory stays bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ Pair = tuple[str, str]
 class Transforms:
     """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
 
-    `rows` has the message of the topic from which each comes.
+    `rows` states from which message of the topic each pose comes.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -205,7 +205,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
         stamp_ns: (n,), stamps within those of `given`.
 
     Returns:
-        n transforms; their other stamps and rows are meaningless.
+        n transforms at these stamps; their `log_time_ns` and `rows` are meaningless.
     """
     last = len(given) - 1
     after = np.clip(np.searchsorted(given.stamp_ns, stamp_ns), 0, last)

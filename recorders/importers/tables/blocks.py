@@ -15,7 +15,7 @@ COMMENTS = (b"%", b"#")
 def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
     """Yield blocks of as many whole lines as fit; raise ValueError if a line is too long.
 
-    The last line is never a block of its own. If it lacks a newline, this is added to `doubts`.
+    The last line is never a block of its own. If it lacks a newline, `doubts` gets a note about it.
     """
     lines = rest = b""
     while block := file.read(BLOCK_BYTES):

@@ -25,8 +25,8 @@ def read_ns(
     Args:
         cells: whole numbers, floats, texts of numbers, or timestamps or durations, which have their own
             unit.
-        digits: number of digits after the point that are nanoseconds: 9 if the unit is a second.
-        since_ns: the zero of the values.
+        digits: number of decimal places of the unit down to a nanosecond, such as 9 for seconds.
+        since_ns: stamp at which the values are zero.
         where: beginning of error messages.
         remedy: end of error messages.
 
@@ -91,7 +91,7 @@ def _plain(texts: pa.Array, digits: int) -> Stamps | None:
 
 
 def _to_the_last_digit(texts: pa.Array, digits: int, rough: Stamps) -> Stamps:
-    """Convert texts (n,) to nanoseconds, which fit 64 bits; other notations keep the `rough` values."""
+    """Convert texts (n,) to exact nanoseconds; those with too many digits keep their `rough` values."""
     parts = pc.extract_regex(texts, _PARTS)
     powers = pc.replace_substring_regex(pc.struct_field(parts, "power"), r"[eE+]", "")
     power = pc.if_else(pc.equal(powers, ""), "0", powers).cast(pa.int32())

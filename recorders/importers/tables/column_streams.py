@@ -359,7 +359,7 @@ _TRUE = r"(^|_)(ground_?truth|truth|gt|mocap|vicon|optitrack)(_|$)"
 
 
 def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[GuessedColumn]:
-    """Remove the columns named as truth from the list; return them, without the word in their names.
+    """Remove the columns named as truth from the list; return them, named without the word for truth.
 
     Args:
         columns: columns of a table.

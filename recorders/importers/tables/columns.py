@@ -26,7 +26,7 @@ class GuessedColumn(NamedTuple):
         plain: name in lower case, without unit and frame.
         unit: unit that the name or a row of units states; empty if there is none.
         values: numbers (rows,).
-        unknown: text in place of a unit that is not a known unit.
+        unknown: text at the place of the unit, if it is not a known unit.
         frame: "ned" for axes north, east, down, "enu" for east, north, up; empty if unknown.
     """
 
@@ -82,7 +82,7 @@ def column_named(
 
 
 def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
-    """Remove a `column_named` by each pattern from the list; return [] unless all are there."""
+    """Take a `column_named` by each pattern from the list; take none and return [] if one is missing."""
     found = [each for pattern in patterns if (each := column_named(columns, pattern, usual))]
     if len(found) < len(patterns):
         return []
@@ -271,8 +271,8 @@ def direction_of(
 ) -> Direction:
     """Determine a heading's unit and convention from the course of positions, or from its numbers.
 
-    A heading may be unwrapped, so its largest value says little. `usual` is whether such a heading
-    usually is a compass heading; it decides if the course is not clear.
+    A heading may be unwrapped, so its largest value does not determine the unit. `usual` is whether such
+    a heading is usually a compass heading; this decides if the course is not clear.
     """
     stated = stated_unit(heading, "rad")
     units = [stated] if stated else _angle_units(largest_of([heading]))
@@ -309,7 +309,7 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
         places: east and north of the rows; empty if unknown.
 
     Returns:
-        "enu", "ned", or an empty string if the steps are not clear.
+        "enu", "ned", or an empty string if the steps fit neither clearly.
     """
     if not places:
         return ""
@@ -327,7 +327,7 @@ def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
 
 
 def _angle_units(largest: float) -> list[str]:
-    """Return the possible units of angles up to a largest one, the likeliest first."""
+    """Return the possible units of angles with this largest value, the likeliest first."""
     if largest <= 720.0:
         return ["rad", "deg"] if largest <= 2 * np.pi else ["deg", "rad"]
     scales = ("0.1 deg", "0.01 deg", "1e-3 deg", "1e-5 deg")

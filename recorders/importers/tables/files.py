@@ -216,7 +216,7 @@ def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
 
 
 def _parts_of(names: Sequence[str]) -> str:
-    """Return the expression for a cell with one number for each name."""
+    """Return the regular expression for a cell that contains one number for each name."""
     return r"[\s,;]+".join(rf"(?P<p{index}>[-+]?[\d.]+(?:[eE][-+]?\d+)?)" for index in range(len(names)))
 
 
@@ -240,7 +240,7 @@ def open_decompressed(path: Path) -> BinaryIO:
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open a text as decompressed bytes; lines that end with CR only get newlines."""
+    """Open a text as decompressed bytes; line ends that are only CR become newlines."""
     file = open_decompressed(path)
     head = file.read(_HEAD_BYTES).strip()
     file.seek(0)
@@ -443,7 +443,7 @@ def _open_parquet(path: Path) -> Table:
 
 
 def _root(name: str, columns: Sequence[str]) -> str:
-    """Return the file's column that contains a column; names may contain dots themselves."""
+    """Return the top-level column that contains a column; names may contain dots themselves."""
     return next(
         (each for each in columns if name == each or name.startswith(f"{each}.")), name.partition(".")[0]
     )

@@ -73,7 +73,7 @@ def _count(path: Path, most: int) -> int:
 
 
 def _columns(first: Path, others: Sequence[Path]) -> tuple[tuple[str, ...], set[Path]]:
-    """Find a file with the names of columns, line by line as `name: meaning`; return both."""
+    """Find a file that lists columns as lines `name: meaning`; return the names and the file."""
     width = len(stamps_in(first)[0].replace(",", " ").split())
     for path in others:
         try:

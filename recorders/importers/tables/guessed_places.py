@@ -1,6 +1,6 @@
 """Guesses of the units of latitudes, longitudes, altitudes and speeds, and of codes for missing ones.
 
-They use names, sizes, and the speed of the rows; if the unit is ambiguous, the table is rejected.
+They use names, magnitudes, and the speed from row to row; if a unit is ambiguous, the table is rejected.
 """
 
 import json
@@ -323,7 +323,7 @@ def is_ais(table: GuessedTable) -> bool:
 def path_ratio(
     table: GuessedTable, latitude_deg: NDArray, longitude_deg: NDArray, speed: NDArray
 ) -> float | None:
-    """Compute the m/s of the path per unit of a speed; None if positions or speeds do not suffice.
+    """Compute the speed along the path (m/s) per unit of `speed`; None if there are too few data.
 
     Args:
         table: the table with the times of the rows.

@@ -116,7 +116,7 @@ _ARDUPILOT, _RECEIVED = "TimeUS", "timestamp"
 
 
 class GuessedTime(NamedTuple):
-    """A table's time: TOML, the columns that it uses, and comments with facts and assumptions.
+    """A table's time: its TOML, the columns that it uses, and comments with facts and assumptions.
 
     `stamps` (n,) are the stamps of the rows, or None if no column has them; `vehicle` is the column that
     identifies the vehicle of each row.
@@ -334,7 +334,7 @@ def _passed_over(table: _Table, used: set[str]) -> list[str]:
 def _tried(
     table: _Table, mapping: TimeMapping, comments: list[str], refusals: list[BadInput]
 ) -> GuessedTime | None:
-    """Try one candidate; return None if it is not the time, and add a refusal if it might be."""
+    """Try one candidate; if it cannot be the time, return None, usually with a reason in `refusals`."""
     columns = mapping.columns
     try:
         stamps = _stamps(table, mapping)

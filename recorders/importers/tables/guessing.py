@@ -1,7 +1,7 @@
-"""Guesses of a mapping to start from: the messages in columns, by their names and numbers.
+"""Guesses of a first mapping: which messages the columns contain, by their names and numbers.
 
 The mapping gives the reason for each guess in a comment; columns that fit no message become a vector of
-plain numbers. A person reads and corrects the mapping: the text is the result, not the import.
+plain numbers. The result is text, not an import, so that a person can read and correct the mapping.
 """
 
 import json

@@ -169,7 +169,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _names_columns(head: list[str], below: Iterable[list[str]]) -> bool:
-    """Test whether a line names columns: it has no values, or words above values and small numbers."""
+    """Test whether a line names columns: words only, or words above values and 1 to 3-digit numbers."""
     is_word = [not _is_value(cell) and cell.lower() not in MISSING for cell in head]
     values = [cell for cell in head if _is_value(cell)]
     if not values:

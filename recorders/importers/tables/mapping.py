@@ -79,7 +79,7 @@ class Geodetic(Parameters):
 
 
 class Attitude(Parameters):
-    """Columns with angles of a body with axes forward, left, up, made into quaternion_w to quaternion_z.
+    """Columns with a body's angles (axes forward, left, up), converted to quaternion_w to quaternion_z.
 
     The quaternion rotates to a frame of east, north, up.
 
@@ -149,7 +149,7 @@ class TableMapping(Parameters):
         degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as in
             NMEA.
         hemispheres: for columns of latitudes and longitudes the columns that state N or S, E or W.
-        vehicle: the column that identifies the vehicle of a row; its value is {vehicle} in topics.
+        vehicle: the column that identifies the vehicle of a row; its value replaces {vehicle} in topics.
         joined: whether the files are the rows of one table, in the order of their names.
         time: when a row was measured.
         arrival: when a row reached the recorder, if the table states it.
@@ -198,7 +198,8 @@ class ConstantStream(Parameters):
         topic: name of the topic.
         becomes: name of the message.
         rows: fields of each message.
-        components: components of a vector that states them, separated by commas.
+        components: names of a vector's components, separated by commas, for messages whose channels
+            state them.
         kinds: kinds of these components, separated by commas; linear by default.
     """
 
@@ -226,7 +227,8 @@ class LogMapping(Parameters):
         projection: a projection known to pyproj, used with the origin in place of the tangent plane.
         tables: the tables of a recording.
         constants: messages that are stated in the mapping itself.
-        clock_tolerance_s: tables that begin further apart are rejected, as they have different clocks.
+        clock_tolerance_s: longest time between the beginnings of two tables; if it is exceeded, their
+            clocks differ, and the import stops.
     """
 
     summary: str = ""
@@ -395,7 +397,7 @@ def _ends_with(path: Path, name: str) -> bool:
 
 
 def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:
-    """Yield the tables that a file matches; the only file for the only table may have any name."""
+    """Yield the tables that a file matches; a single file for a single table may have any name."""
     for table in mapping.tables:
         pattern = (
             table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]

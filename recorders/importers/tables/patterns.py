@@ -1,7 +1,7 @@
 """Patterns of file names: * and ? as in a shell, and {name} for text that gets a name.
 
-The time of a match grows with both lengths, whatever the pattern is; an expression of `re` would try all
-ways to distribute a name over many stars.
+The time for a match is limited by the lengths of pattern and name; a regular expression of `re` would
+try all ways to divide a name among many stars.
 """
 
 import re

@@ -130,7 +130,7 @@ class Rows:
         return self.path.name + self._time.tag if self._time.tag else ""
 
     def _clock(self, given: TimeMapping) -> TimeMapping:
-        """Return the time mapping with the file's names of columns; read a time tag's counter."""
+        """Return the time mapping with the file's own column names; read the time tag, if any."""
         if self._stamps_path is not None and given.file is not None:
             return given.model_copy(update={"column": [_STAMP], "file": None})
         columns = [self.table.column(name) for name in given.columns]
@@ -479,7 +479,7 @@ class Rows:
         self.span_ns = min(low, int(stamps.min())), max(high, int(stamps.max()))
 
     def _made(self, batch: Batch, plane: Plane | None, missing: Sequence[float]) -> dict[str, NDArray]:
-        """Compute positions and quaternions from other columns, without numbers for missing values."""
+        """Compute positions and quaternions from other columns, without the codes in `missing`."""
         made: dict[str, NDArray] = {}
         if self.mapping.geodetic is not None:
             places = self._places(batch, missing)

@@ -1,4 +1,4 @@
-"""Stamps of tables: numbers since a zero, dates, GPS weeks, or a rate; exact to the nanosecond."""
+"""Stamps of tables: numbers that count from a zero, dates, GPS weeks, or a rate; exact to 1 ns."""
 
 import re
 import struct
@@ -140,13 +140,13 @@ class TimeMapping(Parameters):
 
     @property
     def zero_ns(self) -> int:
-        """Return the zero of the numbers, minus leap seconds and the offset from UTC."""
+        """Return the stamp at which numbers are zero, minus leap seconds and the offset from UTC."""
         since = _date_ns(_GPS_ZERO if self.counts_all_weeks else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
 
     @property
     def counts_all_weeks(self) -> bool:
-        """Test whether there are GPS weeks that count from 1980 without restarts."""
+        """Test whether there are GPS weeks, and they count from 1980 without rollovers."""
         return self.week is not None and "zero" not in self.model_fields_set
 
     @property
@@ -268,7 +268,7 @@ class Reading:
         self.is_second = False  # whether a repeated hour is there for the second time
 
     def continued_ns(self, counted: Stamps, rollover_ns: int, label: str) -> Stamps:
-        """Unwrap the numbers (n,) of a counter beyond its rollovers."""
+        """Unwrap the readings (n,) of a counter that rolls over."""
         known = counted != NOT_A_TIME
         if not known.any():
             return counted
@@ -404,7 +404,7 @@ def _dates_ns(
 
 
 def texts_of(cells: pa.Array, *, is_part: bool = False) -> pa.Array:
-    """Convert cells to texts; the midnight of a date that is only a part of a time is removed."""
+    """Convert cells to texts; if the time of day is in another column, only the dates are kept."""
     if is_part and pa.types.is_timestamp(cells.type):
         return pc.strftime(cells, format="%Y-%m-%d")
     return pc.utf8_trim_whitespace(cells.cast(pa.string()))
@@ -451,7 +451,7 @@ def _from_zone(
 ) -> Stamps:
     """Convert stamps (n,) from a zone's local time to UTC.
 
-    In an hour that occurs twice, rows belong to the second one after their times go back. Raises
+    If an hour occurs twice, rows belong to its second occurrence after their times go back. Raises
     BadInput for a time that the clocks skip.
     """
     known = np.flatnonzero(local_ns != NOT_A_TIME)
@@ -521,8 +521,9 @@ class Ticks(NamedTuple):
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Ticks:
     """Read the counter of a file from RTKLIB's time tag, named after the file with `suffix`.
 
-    From byte 64 on, a tag has a time_t and a fraction of a second, when the file was begun, and from
-    byte 76 on pairs of 4 bytes: ms since then, and the length of the file. `ticks_ns` are all readings.
+    From byte 64 on, a tag states when the file was begun, as a time_t and a fraction of a second. From
+    byte 76 on, it has pairs of numbers of 4 bytes each: the ms since then, and the length of the file at
+    that time. `ticks_ns` are all readings of the counter.
 
     Raises BadInput if the file is missing, or is not a time tag.
     """

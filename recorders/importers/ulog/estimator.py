@@ -34,10 +34,10 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """The innovations of a sensor: their fields, our names, and the factors to our sign.
+    """The innovations of a sensor: their fields, our component names, and our signs relative to PX4's.
 
-    `bits` has, for each component, the bits of the filter's status of which at least one is set if the
-    component is in use. It is empty if there are no such bits.
+    For each component, `bits` has those bits of the filter's status of which at least one is set while
+    the component is in use. It is empty if there are no such bits.
     """
 
     fields: tuple[str, ...]
@@ -47,7 +47,7 @@ class _Sensor(NamedTuple):
 
 
 def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
-    """Make a sensor of north, east, down; `fields` and `bits` are (horizontal, vertical)."""
+    """Describe a sensor along north, east and down; `fields` and `bits` are (horizontal, vertical)."""
     (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
     every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
@@ -55,7 +55,7 @@ def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -
 
 
 def _flu(name: str, unit: str, bits: tuple[int, ...], axes: str = "xyz") -> _Sensor:
-    """Make a sensor of the body's forward, right, down, or the first of these."""
+    """Describe a sensor along the body's forward, right and down axes, or only the first of them."""
     fields = tuple(f"{name}[{index}]" for index in range(len(axes)))
     names = tuple(f"{name}_{axis}_{unit}" for axis in axes)
     return _Sensor(fields, names, (-1.0, 1.0, 1.0)[: len(axes)], (bits,) * len(axes))
@@ -111,7 +111,7 @@ _FIELDS = tuple(dict.fromkeys(name for sensor in _SENSORS.values() for name in s
 
 
 class _Table(NamedTuple):
-    """Rows (n,) of numbers (n, k), their keys in us, and their stamps."""
+    """Rows (n,) of numbers (n, k), the keys (us) that join them with other topics, and their stamps."""
 
     key_us: NDArray[np.int64]
     time_us: NDArray[np.int64]

@@ -1,7 +1,7 @@
 """Reader of ULog files in blocks: definitions at the beginning, then the rows of topics.
 
-Unreadable parts are counted in `losses`, and reading goes on: after a broken message at the next
-synchronisation message or rows in sequence, and for an appended section at its offset.
+Unreadable parts are counted in `losses`. After a broken message, reading continues at the next
+synchronisation message or sequence of rows; appended sections are read from their stated offsets.
 """
 
 import struct
@@ -66,7 +66,7 @@ class Text(NamedTuple):
 
 
 class _Subscription(NamedTuple):
-    """The topic of rows with one number."""
+    """The topic, instance and layout of the rows with one message number."""
 
     topic: str
     instance: int
@@ -85,7 +85,7 @@ class UlogFile:
         texts: messages of the autopilot.
         dropouts: stamp and length in us of losses that the logger reported.
         rows: number of rows of each topic and instance so far.
-        losses: unreadable parts in words, with their numbers.
+        losses: number of unreadable parts, by description.
     """
 
     def __init__(self, path: Path) -> None:
@@ -219,14 +219,14 @@ class UlogFile:
     def _resumption(
         self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
     ) -> int:
-        """Find where messages resume: at a mark, which old firmware lacks, or at rows; -1 if nowhere."""
+        """Find where messages resume: at a sync message (old firmware has none) or at rows; else -1."""
         found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
         return min((each for each in found if each >= 0), default=-1)
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
-        """Parse a piece at `place`; return the last message's end, whether one broke, and the rows."""
+        """Parse a piece at `place`; return where the messages end, if one is broken, and the rows."""
         found = walk(data, size)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:
@@ -285,7 +285,7 @@ class UlogFile:
         return np.where(timed, stamps, last_us + np.rint(between).astype(np.int64))
 
     def _subscribe(self, body: bytes, position: int) -> None:
-        """Register the topic of a number."""
+        """Register the topic of a message number."""
         if len(body) < 4:
             self.losses["subscriptions that are too short"] += 1
             return
@@ -331,7 +331,7 @@ class UlogFile:
 
 
 def _joined(rows: list[Rows]) -> list[Rows]:
-    """Join the rows of each topic's instance, which may have several numbers, by their stamps."""
+    """Join the rows of each topic's instance, which may use several message numbers, by stamp."""
     of_key: dict[tuple[str, int], list[Rows]] = {}
     for each in rows:
         of_key.setdefault((each.topic, each.instance), []).append(each)

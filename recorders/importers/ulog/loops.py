@@ -29,7 +29,7 @@ class Walk(NamedTuple):
 
 
 class Known(NamedTuple):
-    """The topic of each number (NUMBERS,); `since` is "never" for a number without a topic.
+    """The topic of each message number (NUMBERS,); `since` is "never" for a number without a topic.
 
     A row has `least` to `most` bytes, begins in the file at byte `since` or later and before byte
     `until`, and has its stamp at byte `stamp`.
@@ -43,12 +43,12 @@ class Known(NamedTuple):
 
 
 class Sorted(NamedTuple):
-    """The rows (n,) of a piece, sorted by their number.
+    """The rows (n,) of a piece, sorted by message number.
 
-    `order` has the rows number by number, each in file order, and `counts` (NUMBERS + 1,) their numbers
-    of rows; rows without a topic come last. `stamps` are in us, 0 for rows without a topic; `is_timed`
-    marks those between two times, and `reached` is the latest of these before every row, and at the
-    end. Rows stop before one whose length does not match its format.
+    `order` has the rows grouped by message number, each group in file order, and `counts` (NUMBERS + 1,)
+    has the sizes of the groups; rows without a topic are the last group. `stamps` are in us, 0 for rows
+    without a topic; `is_timed` marks valid stamps, and `reached` is the latest valid stamp before each
+    row, and at the end. The rows end before one whose length does not match its format.
     """
 
     order: NDArray[np.int64]
@@ -94,7 +94,7 @@ def sort(
     known: Known,
     times: tuple[int, int, int],
 ) -> Sorted:
-    """Sort the rows of a piece of a file by their topic's number.
+    """Sort the rows of a piece of a file by the message numbers of their topics.
 
     Args:
         data: the piece, and at least `BEYOND_BYTES` more.
@@ -162,7 +162,7 @@ def _examine(
 
 
 def _sort(whose: NDArray[np.int64], places: NDArray[np.int64], order: NDArray[np.int64]) -> None:
-    """Fill in the rows, number by number; `places` has where each number begins."""
+    """Fill in the rows, number by number; `places` is where the rows of each number begin in `order`."""
     for row in range(len(whose)):
         order[places[whose[row]]] = row
         places[whose[row]] += 1

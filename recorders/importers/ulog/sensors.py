@@ -25,8 +25,8 @@ FARTHEST_M = 150.0
 class Part:
     """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
-    The maker of the stream leaves out rows in which a required number is not finite; `facts` counts
-    others that are left out or changed.
+    The maker of the stream leaves out rows in which a required number is not finite; `facts` counts rows
+    that are left out or changed for other reasons.
     """
 
     topic: str
@@ -101,7 +101,7 @@ class Fields(NamedTuple):
 
 
 def combined(fields: Fields) -> Iterator[Part]:
-    """Yield the inertial unit that the filter uses; for old firmware also magnetometer and barometer."""
+    """Yield the filter's inertial samples; with old firmware also its magnetometer and barometer."""
     force = to_flu(fields.vector("accelerometer_m_s2", width=3))
     rate = to_flu(fields.vector("gyro_rad", width=3))
     yield _inertial(fields, fields.named("inertial"), force, rate)
@@ -143,7 +143,7 @@ def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
 
 
 def unit(fields: Fields) -> Iterator[Part]:
-    """Yield one of several inertial units, from its increments and their time spans."""
+    """Yield the samples of one of several inertial units, from its increments and their time spans."""
     spans = {}
     for of in ("angle", "velocity"):
         span = fields.of(f"delta_{of}_dt")
@@ -156,18 +156,18 @@ def unit(fields: Fields) -> Iterator[Part]:
 
 
 def accelerometer(fields: Fields) -> Iterator[Part]:
-    """Yield one accelerometer without conversion, in its own axes."""
+    """Yield the readings of one accelerometer without conversion, in its own axes."""
     names = {f"force_{axis}_mps2": axis for axis in "xyz"}
     yield fields.values(f"accelerometer_{fields.rows.instance}", names)
 
 
 def gyro(fields: Fields) -> Iterator[Part]:
-    """Yield one gyroscope without conversion, in its own axes."""
+    """Yield the readings of one gyroscope without conversion, in its own axes."""
     yield fields.values(f"gyro_{fields.rows.instance}", {f"rate_{axis}_radps": axis for axis in "xyz"})
 
 
 def magnetometer(fields: Fields) -> Iterator[Part]:
-    """Yield the magnetometer that the filter uses, under a name that no model reads by default.
+    """Yield the field from the filter's magnetometer, under a name that no model reads by default.
 
     `--set topics.magnetic_field=/vehicle/magnetometer` selects it; the model then needs the local field.
     """
@@ -176,7 +176,7 @@ def magnetometer(fields: Fields) -> Iterator[Part]:
 
 
 def raw_magnetometer(fields: Fields) -> Iterator[Part]:
-    """Yield one magnetometer."""
+    """Yield the readings of one magnetometer."""
     field_ut = _GAUSS_UT * to_flu(fields.vector("x", "y", "z"))
     yield _magnetic(fields, f"magnetometer_{fields.rows.instance}", field_ut)
 
@@ -239,7 +239,7 @@ def gnss(fields: Fields) -> Iterator[Part]:
 
 
 def air(fields: Fields) -> Iterator[Part]:
-    """Yield the barometer that the filter uses: its height in the standard atmosphere."""
+    """Yield the height in the standard atmosphere, from the barometer that the filter uses."""
     yield fields.values(
         fields.named("barometer"),
         {"altitude_m": "baro_alt_meter", "pressure_pa": "baro_pressure_pa",
@@ -248,7 +248,7 @@ def air(fields: Fields) -> Iterator[Part]:
 
 
 def barometer(fields: Fields) -> Iterator[Part]:
-    """Yield one barometer; its pressure is in Pa, with old firmware in hPa."""
+    """Yield the readings of one barometer; the pressure is in Pa, with old firmware in hPa."""
     names = {"pressure": "pressure", "temperature_degc": "temperature"}
     yield fields.values(f"barometer_{fields.rows.instance}", names)
 
@@ -260,7 +260,7 @@ def airspeed(fields: Fields) -> Iterator[Part]:
 
 
 def flow(fields: Fields) -> Iterator[Part]:
-    """Yield the angles about the body's x and y by which a camera saw the ground move, and the time."""
+    """Yield the angles about the body's x and y by which a camera saw the ground move in a time span."""
     old = fields.has("pixel_flow_x_integral")
     x, y = (
         ("pixel_flow_x_integral", "pixel_flow_y_integral") if old else ("pixel_flow[0]", "pixel_flow[1]")

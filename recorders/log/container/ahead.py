@@ -1,7 +1,7 @@
 """A few threads that process items in advance.
 
-Chunks are packed and opened by compiled code that runs in parallel to other threads, so several cores
-are used, and the file is read or written at the same time.
+Chunks are packed and opened by compiled code, which threads run in parallel, so several cores are used
+while the file is read or written.
 """
 
 import os

@@ -75,7 +75,7 @@ def _merged(
 def _indexes(
     parts: Sequence[NDArray[np.void]], offsets: Sequence[NDArray[np.int64]], borders: NDArray[np.int64]
 ) -> list[dict[int, bytes]]:
-    """Encode the log time and the offset in its chunk of every message, by chunk and channel."""
+    """Encode every message's log time and its offset in the chunk, by chunk and channel."""
     found: list[dict[int, bytes]] = [{} for _ in borders[1:]]
     for part, each in zip(parts, offsets, strict=True):
         cuts = np.searchsorted(each, borders)

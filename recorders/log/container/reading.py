@@ -123,7 +123,7 @@ class _Index(NamedTuple):
 
 
 class NotMcap(BadInput):
-    """An error for files that are not MCAP, some of which a command may accept in another way."""
+    """An error for files that are not MCAP; a command may catch it and read another format."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
@@ -351,7 +351,7 @@ def _attachment_name(file: BinaryIO, place: _Place) -> str:
 
 
 def _declare(found: Container, declarations: Iterable[Any]) -> None:
-    """Add schemas and channels. Raises Damaged if one number has two meanings."""
+    """Add schemas and channels. Raises Damaged if one id has two meanings."""
     known: dict[type, dict] = {records.Schema: found.schemas, records.Channel: found.channels}
     for record in declarations:
         kind = type(record)

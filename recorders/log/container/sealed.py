@@ -31,12 +31,12 @@ def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def note_span(offset: int, length: int, span: Span) -> tuple[str, str]:
-    """Make the pair of `PUBLISH_SPANS` for the chunk at these bytes of the file."""
+    """Make the pair in `PUBLISH_SPANS` that notes the span of the chunk at these bytes of the file."""
     return f"{offset}+{length}", f"{span.first_ns} {span.last_ns}"
 
 
 def noted_span(pairs: Mapping[str, str], offset: int, length: int) -> Span | None:
-    """Return the span noted by `note_span`; None if another tool rewrote the file."""
+    """Return the span noted by `note_span`; None if it is missing, as in files of other tools."""
     noted = pairs.get(f"{offset}+{length}")
     return None if noted is None else Span(*map(int, noted.split()))
 

@@ -1,4 +1,4 @@
-"""Search for the files of a bag: one, or those of a folder, split and compressed as in ROS."""
+"""Search for the files of a bag: one file, or the files of a folder, split and compressed as in ROS."""
 
 import re
 from collections import Counter

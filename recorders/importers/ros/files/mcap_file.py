@@ -1,4 +1,4 @@
-"""Reader of MCAP files from ROS, based on the log's container, a chunk at a time."""
+"""Reader of MCAP files from ROS, a chunk at a time, based on `fuselog.recorders.log.container`."""
 
 from collections.abc import Callable, Iterator
 from functools import partial

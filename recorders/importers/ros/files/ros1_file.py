@@ -82,7 +82,7 @@ class Ros1File:
         self.connections = list(self._by_id.values())
 
     def _index(self, file: BinaryIO) -> None:
-        """Find the chunks, and the connections after them; if these are missing, in the chunks."""
+        """Find the chunks and connections; if the list after the chunks is missing, open all chunks."""
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadInput(
                 f"{self.path}: is not a bag of ROS 1 in format 2.0; convert an older one with rosbag fix"
