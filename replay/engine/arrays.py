@@ -38,8 +38,8 @@ def varying(axes: int, **of_fields: int) -> Callable[[Kind], Kind]:
     """Mark a NamedTuple of arrays with the number of leading axes whose sizes vary from log to log.
 
     The sizes of all other axes are compiled into a kernel that gets the arrays; see
-    `fuselog.recorders.compiling.kernels.native`. In an unmarked NamedTuple only the first axis (runs or
-    messages) varies, and no axis of a core's scratch memory does.
+    `fuselog.recorders.compiling.kernels.native`. If a NamedTuple is not marked, only its first axis
+    (runs or messages) varies; in the scratch memory of a core, no axis varies.
     """
 
     def marked(kind: Kind) -> Kind:

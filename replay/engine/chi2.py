@@ -81,8 +81,8 @@ def _by_element(loop: OverRuns, *numbers: ArrayLike) -> Numbers:
 def _log_tails(shape: float, log_gamma: float, value: float) -> tuple[float, float]:
     """Compute the logarithms of the gamma distribution's probabilities below and above a value.
 
-    The smaller one comes from a series, or from a continued fraction by Lentz's method (Press et al.,
-    Numerical Recipes, 6.2); the other one is its complement.
+    The smaller probability is computed by a series, or by a continued fraction with Lentz's method
+    (Press et al., Numerical Recipes, 6.2); the other is its complement.
     """
     front = shape * math.log(value) - value - log_gamma
     if value < shape + 1.0:
@@ -128,10 +128,10 @@ def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floa
 def _solve(
     run: int, found: Floats, below: Floats, above: Floats, shape: Floats, log_gamma: Floats
 ) -> None:
-    """Find the value with these probabilities below and above it, by Newton's method on its logarithm.
+    """Find the value with these probabilities below and above it, by Newton's method in its logarithm.
 
-    The logarithm of the smaller tail is nearly linear in the logarithm of a small value, and its
-    curvature has one sign.
+    The logarithm of the smaller tail, as a function of the logarithm of the value, is nearly linear at
+    small values, and its curvature does not change sign.
     """
     if not 0.0 < shape[run] < math.inf or not 0.0 <= below[run] <= 1.0:
         found[run] = math.nan

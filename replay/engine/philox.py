@@ -30,10 +30,10 @@ _BEYOND = 0.00025803248765390125
 def run_key(seed: int, first: Iterable[AnyArray]) -> Words:
     """Compute the key (2,) of a run from a seed and the run's first data.
 
-    Its random numbers therefore depend neither on the number of cores nor on the other runs.
+    The run's random numbers therefore depend neither on the number of cores nor on the other runs.
 
     Args:
-        seed: the parameter.
+        seed: the estimator's parameter `seed`.
         first: arrays of the run's first data.
     """
     words = [str(seed).encode(), *(part.tobytes() for part in first)]
@@ -65,7 +65,8 @@ def unit(word: np.uint64) -> float:
 def _ziggurat() -> tuple[Floats, Floats, Floats]:
     """Compute layers of equal area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
 
-    The lowest layer, number 0, includes the tail: its right end is that of a rectangle of the same area.
+    The lowest layer, number 0, includes the tail; its right end is that of a rectangle with the layer's
+    area.
     """
     area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * _BEYOND
     ends = np.zeros(_LAYERS + 1)

@@ -193,12 +193,12 @@ def align(
 ) -> tuple[Floats, Floats] | None:
     """Find the pose at the last of several fixes by aligning the antenna's path with the fixes.
 
-    The path is rotated and shifted by least squares. The error of the odometry is added to the
-    covariance: relative to its end, the mean of a random walk over a span has a third of the walk's
-    final variance.
+    The path is rotated and shifted by least squares. The covariance includes the error of the odometry,
+    which is a random walk: the variance of the difference between the walk's mean over the span and its
+    end is a third of its variance at the end.
 
     Args:
-        path: poses (k, 3) at the fixes, from the odometry only, starting at zero.
+        path: poses (k, 3) at the stamps of the fixes, from the odometry only, starting at zero.
         places, covariances: positions (k, 2) in m of the fixes, and covariances (k, 2, 2).
         span_s: time from the first to the last fix.
         parameters: parameters with the antenna's position and the odometry's noise densities.

@@ -39,7 +39,8 @@ def modelled(model: Model, method: str) -> AnyEstimator:
     Returns:
         An estimator that can be passed to `replay`.
 
-    Raises BadInput if the method or variant does not exist, or if the model lacks something it needs.
+    Raises BadInput if the method or variant does not exist, or if the model lacks something that the
+    method needs.
 
     >>> from fuselog.replay.estimators.landmarks import ROBOT
     >>> modelled(ROBOT, "particles:500").parameters().particles

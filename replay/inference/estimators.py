@@ -179,7 +179,7 @@ class _OfAnyModel(AnyEstimator):
 def registered_models() -> dict[str, Model]:
     """Return the registered models by name, without those that fail to load.
 
-    If such a model is named, its error is raised.
+    An error in such a model is raised only when the user names it.
     """
     found = {}
     for name in available("models"):
@@ -190,7 +190,7 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """Make the parameters of all models (unset), of a method, and for the name of the model.
+    """Make the parameter type that has a method's parameters, those of all models (unset), and `model`.
 
     The values are checked against a model's requirements once the model that fits the log is known.
     """
@@ -414,7 +414,7 @@ def _together(bound: Recursive, filtering: Filter, settings: Floats) -> Recursiv
 
 
 def _made_for(where: str, method: Method, parameters: CombinedParameters) -> Method:
-    """Return the variant of a method that the parameters select; prefix its BadInput with `where`.
+    """Return the variant of a method that the parameters select.
 
     Raises BadInput, with a message that begins with `where`, if there is no such variant.
     """

@@ -1,10 +1,11 @@
 """Observability of the state at the start of a window, from the measurements of the window.
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, propagated back by
-the derivatives Phi of the motion along the smoothed trajectory. After scaling to D W D with the standard
-deviations D of the prior, an eigenvalue of 1 is as much information as the prior. Along an estimated
-trajectory, unobservable directions collect a little spurious information; therefore, eigenvalues below
-10 are reported as weaker than the prior. F and H are those of the extended Kalman filter.
+the derivatives Phi of the motion along the smoothed trajectory. W is scaled to D W D with the standard
+deviations D of the prior, so that an eigenvalue of 1 means as much information as in the prior. Along an
+estimated trajectory, unobservable directions collect a little spurious information; therefore,
+eigenvalues below 10 are reported as weaker than the prior. F and H are those of the extended Kalman
+filter.
 
 Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
 """
@@ -85,7 +86,7 @@ class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
 
 
 class Gramian(NamedTuple):
-    """Propagated Phi and W (runs, t, t), and numbers of messages in W (runs,)."""
+    """Phi and W up to the current event (runs, t, t), and numbers of messages in W (runs,)."""
 
     transition: Floats
     information: Floats
@@ -101,7 +102,7 @@ class LinearizationTrajectory(NamedTuple):
 
 
 def gramian_steps(bound_model: BoundModel) -> Steps:
-    """Make the steps that accumulate the Gramian along the trajectory, which is the set of `memory`."""
+    """Make the steps that sum the Gramian along the trajectory, which `memory` gets as its only set."""
     motion = _carried_by_motion(bound_model)
     sensors = tuple(_added_by_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
 
@@ -348,5 +349,5 @@ OBSERVABILITY = of_any_model(METHOD)
 
 
 def observability_of(model: Model) -> AnyEstimator:
-    """Make the observability estimator for one model; raise BadInput if the model lacks a part."""
+    """Make the observability estimator for one model; raise BadInput if the model is unsuitable."""
     return modelled_by(model, METHOD, "observability")

@@ -112,7 +112,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
 
     Args:
         sampled: the function.
-        sets: sample sets, of which the first serves every step.
+        sets: sample sets; the first set is used for every step.
         given: arguments of the step, mean and covariance first.
     """
     what, function, variances, arguments, kinds, outputs = sampled
@@ -168,7 +168,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
 def _by_block(
     function_of: StepFunction, kinds: Kinds, first: TracedValue, second: TracedValue
 ) -> list[TracedValue]:
-    """Apply a function to each pair of numbers, angles, axes and orientations of two states."""
+    """Apply a function to two states, one linear component, angle, axis or orientation at a time."""
     found: list[TracedValue] = []
     for kind, component, _, _ in manifold_blocks(kinds):
         own = slice(component, component + WIDTHS[kind])
@@ -178,7 +178,7 @@ def _by_block(
 
 @lru_cache(maxsize=8)
 def _difference(kind: str) -> TracedFunction:
-    """Trace the difference of two values separately, because branches of several would multiply."""
+    """Trace the difference for one kind as a separate function, so that branches do not multiply."""
     width = WIDTHS[kind]
     subtract = boxminus((kind,) * width)
 
@@ -192,7 +192,7 @@ def _difference(kind: str) -> TracedFunction:
 
 @lru_cache(maxsize=8)
 def _recentred(kind: str) -> TracedFunction:
-    """Trace the change of a tangent vector with its centre; the first value is whether to repeat it."""
+    """Trace the change of a tangent vector with its centre; the first output is whether to repeat it."""
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 

@@ -1,4 +1,4 @@
-"""Tracing of the parts of a filter's steps: functions that return arrays by name become graphs.
+"""Tracing of the parts of a filter's steps: graphs are made from functions that return arrays by name.
 
 The functions are called with traced numbers; a graph contains the same operations in the same order,
 without terms that are known to be zero.

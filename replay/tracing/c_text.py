@@ -154,7 +154,7 @@ def c_lines(
         named: the nodes by name; a name that is not an identifier, such as `P[0][0]`, is assigned to.
         inputs: names of the inputs of the graph, by place.
         precision: precision of the numbers.
-        of: first letter of the names of further variables, which are assigned first.
+        of: first letter of the names of auxiliary variables, which are assigned first.
         known: names of nodes that earlier lines define.
     """
     everything = needed(named.values(), known)

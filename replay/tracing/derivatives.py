@@ -4,10 +4,10 @@ Griewank and Walther, Evaluating Derivatives, chapter 3. Only derivatives that c
 computed, so the sparsity pattern of a Jacobian is also known. If a derivative does not exist or is
 infinite at a point, its value is defined as follows:
 
-- `sqrt`, `cbrt`, `hypot`, `arctan2` and `abs` have slope 0 at arguments of 0, which is the mean of both
-sides of `abs` and avoids NaN for the length of a zero vector; - the minimum and the maximum of two equal
-numbers have the slopes of the first; - step functions (`floor`, `round`, `sign`, `//`) have slope 0
-everywhere, `a % b` that of
+- `sqrt`, `cbrt`, `hypot`, `arctan2` and `abs` have slope 0 if their arguments are 0: for `abs`, this is
+  the mean of the slopes on both sides, and for the length of a zero vector, it avoids NaN;
+- the minimum and the maximum of two equal numbers have the slopes of the first;
+- step functions (`floor`, `round`, `sign`, `//`) have slope 0 everywhere, and `a % b` has the slopes of
   `a - b floor(a / b)`;
 - a branch has the slopes of the selected side.
 
@@ -86,12 +86,12 @@ Slopes = dict[int, Node]
 
 
 def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes]) -> list[Slopes]:
-    """Compute the derivatives of outputs by the variables of the seeds; missing derivatives are zero.
+    """Compute, for each output, its derivatives by variable; derivatives that are missing are zero.
 
     Args:
         trace: trace whose graph contains the nodes; the derivatives are added to the graph.
         outputs: nodes to differentiate.
-        seeds: derivatives of the inputs by each variable.
+        seeds: by input node, its derivatives by variable; variables are numbered.
     """
     found: dict[Node, Slopes] = {}
     for node in needed(outputs):

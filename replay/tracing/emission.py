@@ -33,8 +33,8 @@ def emit(
     Args:
         emitter: destination of the instructions.
         outputs: nodes to compute.
-        inputs: numbers of the graph's inputs, by place.
-        known: numbers of nodes that are computed elsewhere.
+        inputs: values of the graph's inputs in the kernel, by position.
+        known: values of nodes that are computed elsewhere.
     """
     found = dict(known)
     for node in needed(outputs, known):

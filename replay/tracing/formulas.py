@@ -1,4 +1,4 @@
-"""Writing of graphs as readable Python formulas, which compute the same values.
+"""Writing of graphs as readable Python formulas that compute the same values.
 
 Long expressions that are used more than once, and expressions that would not fit in a line, are on
 separate lines.
@@ -70,9 +70,9 @@ def formulas_of(
 
     Args:
         function: the function.
-        inputs: names of its inputs, by place.
-        outputs: its output nodes, by name.
-        by: names of the inputs by which it is differentiated, by place.
+        inputs: names of the function's inputs, by position.
+        outputs: output nodes of the function, by name.
+        by: names of the inputs with respect to which it is differentiated, by position.
     """
     trace, names = Trace(function.graph, {}), list(by.values())
     seeds = {

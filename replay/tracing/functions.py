@@ -1,4 +1,4 @@
-"""Tracing of the functions of models, which plain-Python kernels call directly instead.
+"""Tracing of the functions of models for compiled kernels; plain Python calls the functions themselves.
 
 The arguments of a model's function are tuples of numbers, numbers, parameters (a NamedTuple of numbers),
 and sometimes arrays that it changes; the result is a tuple of numbers or one number. `Argument`
@@ -39,7 +39,7 @@ _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
-    """Array of these sizes, which the function reads and changes."""
+    """Argument that is an array of these sizes, which the function reads and changes."""
 
     sizes: tuple[int, ...]
 
@@ -68,7 +68,7 @@ class TracedFunction:
         self.__name__ = getattr(function, "__name__", "function")
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the function; for traced numbers, copy its graph into their graph."""
+        """Call the function; if arguments are traced numbers, copy its graph into their graph."""
         found = trace_of(arguments)
         if found is None or self.result.written:
             return self.function(*arguments)
@@ -118,7 +118,7 @@ class Derivative:
     Args:
         function: the function.
         seeds: (trace) -> derivatives of every input by the variables.
-        combine: (trace, returned nodes, their slopes) -> requested derivatives by place; missing ones
+        combine: (trace, returned nodes, their slopes) -> requested derivatives by index; missing ones
             are zero.
     """
 
@@ -135,7 +135,7 @@ class Derivative:
 
     @cached_property
     def entries(self) -> dict[Any, Node]:
-        """Nonzero derivatives by place."""
+        """Nonzero derivatives, by their index."""
         trace = Trace(self.function.graph, {})
         returned = self.function.result.returned
         slopes = slopes_of(trace, returned, self._seeds(trace))
@@ -144,7 +144,7 @@ class Derivative:
 
     @property
     def places(self) -> tuple[Any, ...]:
-        """Places of the numbers that follow the values."""
+        """Indices of the derivatives, which follow the values in the outputs."""
         return tuple(self.entries)
 
     @property
@@ -173,7 +173,7 @@ class Derivative:
 
     @cached_property
     def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
-        """Places of the inputs that derivatives need, and a function that computes the derivatives."""
+        """Positions of the inputs that the derivatives need, and a function that computes these."""
         nodes = list(self.entries.values())
         places = [node.value for node in needed(nodes) if node.operation == INPUT]
         names = {place: f"x{index}" for index, place in enumerate(places)}
@@ -202,10 +202,10 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """Return the output numbers of a graph, by a call of a separate function of the needed inputs.
+    """Write a call of a separate function that computes a graph's outputs from the inputs it needs.
 
-    Calls of functions that depend only on parameters are computed by another function, which the
-    compiler moves out of loops over samples or particles.
+    Nodes that call a function and depend only on parameters are computed by another function, whose call
+    the compiler moves out of loops over samples or particles.
     """
 
     def is_changing(place: Any) -> bool:
@@ -226,7 +226,7 @@ def _computed(
     arguments: Sequence[Any],
     known: dict[Node, Number],
 ) -> list[Number]:
-    """Call a function that computes a graph's outputs from its inputs and from known nodes."""
+    """Write a call of a function that computes a graph's outputs from its inputs and known nodes."""
     if not outputs:
         return []
     nodes = needed(outputs, known)
@@ -248,7 +248,7 @@ def _computed(
 
 
 def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any], place: Any) -> Number:
-    """Return the number of an argument at a place."""
+    """Return the value at a position (index of an argument, entry of it) in a kernel."""
     argument, entry = place
     value = arguments[argument]
     if isinstance(value, Array):
@@ -263,7 +263,7 @@ def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any
 
 
 def _at(arguments: Sequence[Any], place: Any) -> float:
-    """Return the number of an argument at a place, in Python."""
+    """Return the value at a position (index of an argument, entry of it) in Python."""
     argument, entry = place
     value = arguments[argument]
     if entry is None:
@@ -365,7 +365,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """Return the name of a function, with its file and line, or those of an error in its code."""
+    """Return a function's name, with its file and line, or those of an error inside its code."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())

@@ -56,7 +56,7 @@ class Node:
 
     @property
     def is_constant(self) -> bool:
-        """Whether its value is known."""
+        """Whether the node's value is known."""
         return self.operation is CONSTANT
 
     def is_number(self, value: float) -> bool:
@@ -184,7 +184,7 @@ def _power(base: float, exponent: int) -> float:
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
     """Return all nodes on which the outputs depend, including the outputs, in order of computation.
 
-    Known nodes are included, but not the nodes on which only they depend.
+    Known nodes are included, but not the nodes on which only known nodes depend.
     """
     found: set[Node] = set()
     waiting = list(outputs)
@@ -216,7 +216,7 @@ def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Nod
 
 
 def described(outputs: Iterable[Node]) -> Iterator[str]:
-    """Yield a digest of each output that depends only on its own part of the graph."""
+    """Yield for each output a digest of the part of the graph from which it is computed."""
     outputs = list(outputs)
     words: dict[Node, str] = {}
     for node in needed(outputs):

@@ -48,7 +48,7 @@ def too_many_ways() -> CannotTrace:
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
-    """Number of a graph, which grows when the number is used."""
+    """Number that is a node of a graph; operations on the number add nodes."""
 
     __slots__ = ("node", "trace")
 
@@ -108,7 +108,7 @@ class Trace:
         self.more: list[Node] = []  # newly reached conditions
 
     def decided(self, number: Traced) -> bool:
-        """Return the path at a condition; a new condition is true first, and false in a later call."""
+        """Return the path to take at a condition; a new one is true now, and false in a later call."""
         node = (
             number.node
             if number.node.is_truth
@@ -158,7 +158,7 @@ def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None)
 
 
 def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
-    """Trace `np.searchsorted` in a known table, by counting the smaller numbers."""
+    """Trace `np.searchsorted` in a known table, by counting the smaller entries."""
     count: Any = 0.0
     for each in _known("np.searchsorted", a):
         count = count + where(v > each if side == "left" else v >= each, 1.0, 0.0)

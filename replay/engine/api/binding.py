@@ -1,4 +1,4 @@
-"""Binding of estimators made from functions to the topics of a log, and their requirements in words."""
+"""Binding of estimators made from functions to a log's topics, and descriptions of the needed topics."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 

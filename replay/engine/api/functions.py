@@ -2,8 +2,8 @@
 
 `recursive` makes an estimator from a function that processes the messages of one run in order; `batch`
 makes one from a function that solves whole streams. Both look up their topics under every prefix that
-has them (one estimator per robot, for example), name the outputs, and report a failed run while the
-other runs continue.
+has them (one estimator per robot, for example), name the outputs, and report failed runs while the other
+runs continue.
 """
 
 import copy
@@ -89,8 +89,8 @@ def recursive(
         static: topics that `start` needs as a whole, such as a map or a prior. Gaussian estimates among
             them are priors with the components of the estimate; see `Given.prior`.
         find: replaces `streams` and `static` if their names depend on the log or the parameters:
-            find(name, topics, parameters) yields a `Binding` for each thing that can be estimated in the
-            log (for each robot, say), or nothing if the log does not fit. `name` is the name of the
+            find(name, topics, parameters) yields a `Binding` for each object that can be estimated in
+            the log (for each robot, say), or nothing if the log does not fit. `name` is the name of the
             estimator, for error messages.
         requirements: with `find`, a description of what the log must contain.
         variant: the parameter that is set by the second part of a name such as `shooter:bearings-only`.
@@ -112,20 +112,20 @@ def recursive(
         follow_all: replaces `follow`: follow_all(settings, messages, state, results) processes all runs
             in one call. It is not compiled: use NumPy code with an axis of runs, or a loop that is
             already compiled.
-        advance: replaces both if the output is not one Gaussian estimate: advance(settings, state,
-            block) -> the state after the block and the output streams, whose topics begin with
-            /estimates/ + `Given.name`. In that case there are no `components`; the state can be of any
-            type and must not be modified.
+        advance: replaces `follow` and `follow_all` if the output is not one Gaussian estimate:
+            advance(settings, state, block) -> the state after the block and the output streams, whose
+            topics begin with /estimates/ + `Given.name`. In that case there are no `components`; the
+            state can be of any type and must not be modified.
         out_of_sequence: with `advance`, for an estimator that reprocesses out-of-sequence messages:
             out_of_sequence(parameters, back_ns) returns the function that replaces `advance` if
             messages come in order of arrival and their stamps go back by at most `back_ns` nanoseconds.
             It raises BadInput if the parameters do not allow this.
         finish: with `advance`: finish(settings, state) -> the output streams that were still waiting
             for further messages when the log ended, such as smoothed estimates.
-        compiled: whether `follow` is compiled; plain Python is a hundred times slower.
-        allocates: whether `follow` may create arrays and call everything that numba supports; it is
-            then compiled by numba, an optional dependency. A function that creates no arrays is
-            compiled without numba in a twentieth of the time, see
+        compiled: whether `follow` is compiled; in plain Python it is about a hundred times slower.
+        allocates: whether `follow` may create arrays and call everything that numba supports; it is then
+            compiled by numba, an optional dependency. A function that creates no arrays is compiled
+            without numba, in a twentieth of the time; see
             `fuselog.recorders.compiling.compile.compile_over_runs`.
 
     Returns:
@@ -313,7 +313,7 @@ def batch(
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
         solve: solve(given) gets the streams and static topics of all runs under the requested names;
             `each_run` makes such a function from one that solves a single run. If the output is not a
-            Gaussian estimate, there are no `components`, and it returns the output streams, whose
+            Gaussian estimate, there are no `components`, and `solve` returns the output streams, whose
             topics begin with /estimates/ + `Given.name`.
 
     Returns:
@@ -375,8 +375,8 @@ def each_run(
     raised.
 
     Args:
-        solve: solve(streams, parameters) -> the estimates of a run. `streams` maps topic names to
-            streams, and has `OneRun.prior`, `stated` and a `generator` of the run.
+        solve: solve(streams, parameters) -> the estimates of a run. `streams` is a `OneRun`: it maps
+            topic names to streams, and offers `prior`, `stated` and the run's random `generator`.
 
     Returns:
         The function, for the argument `solve` of `batch`.

@@ -31,7 +31,7 @@ class Binding(NamedTuple):
     """Topics that one estimator is bound to; a log may have several bindings.
 
     Attributes:
-        streams, static: the topics by the names that the functions use for them, see `recursive`.
+        streams, static: the topics, by the names that the functions use for them; see `recursive`.
         suffix: the end of the estimator's name, such as `/robot1`.
         priors: components to read from each static topic that is a Gaussian prior, by the same names.
         setup: further data for the functions, as `Given.setup`.
@@ -46,7 +46,7 @@ class Binding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Given(Mapping[str, Ragged], Generic[ParametersType]):
-    """Input of all runs, by the topic names that the estimator's functions use.
+    """Input of all runs; topics have the names that the estimator's functions use.
 
     As a mapping, it maps topic names to streams: the topics that a recursion starts from, or all topics
     of a batch estimator. An optional topic that the log lacks is not a key.
@@ -54,7 +54,7 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     Attributes:
         parameters: the estimator's parameters.
         topics: all topics to which the estimator is bound.
-        static: the streams, see above.
+        static: the streams of the mapping, by topic name.
         runs: number of runs.
         name: the estimator's name, with the suffix of its binding.
         setup: see `Binding`.
@@ -77,8 +77,8 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
         """Return the priors on `topic`: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
-        The components are those of the estimate, in its order, regardless of the order in the log. The
-        numbers are NaN for a run without a usable prior: that run has failed and gets no messages.
+        The components are those of the estimate, in its order, regardless of the order in the log. A run
+        without a usable prior has NaN in all of them; it has failed and gets no messages.
         """
         return gaussians(self.static[topic])
 
@@ -182,7 +182,7 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: AnyParameters
 ) -> tuple[Messages, Skipped]:
-    """Extract the messages of a block as numbers, and list the messages that lack a covariance.
+    """Convert the messages of a block to arrays of numbers, and list those that lack a covariance.
 
     Args:
         block: messages of all runs.

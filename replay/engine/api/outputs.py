@@ -31,16 +31,18 @@ class Results(NamedTuple):
     """Arrays that a recursion fills, one row for every message; a row of NaN means no value.
 
     Attributes:
-        mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
-            space (see `fuselog.replay.engine.vectors.tangent`), d of them if all are linear or angles.
+        mean, covariance: (n, d), (n, t, t) the estimate after the message; t is the number of components
+            in the tangent space (see `fuselog.replay.engine.vectors.tangent`), which is d if all
+            components are linear or angles.
         innovation, innovation_covariance: (n, m), (n, m, m) the innovation of the message and its
             covariance.
         squared: (n,) the normalised innovation squared. Together with the two above it gives the
             likelihood of the message, which `tune` and `diagnose` use.
         accepted: (n,) whether a gate accepted the message; 1 unless set.
         target: (n,) identifier of the target that was measured; 0 unless set.
-        further: (n, k) the fields of the further outputs after the sensor's clock, side by side in
-            order of declaration; an output has a message if its first field is finite.
+        further: (n, k) the fields of the further outputs after the sensor's clock, side by side in order
+            of declaration; a row yields a message of an output if the first field of that output is
+            finite.
     """
 
     mean: Floats
@@ -70,7 +72,7 @@ class Solution(NamedTuple):
 
 
 class Diagnostics(NamedTuple):
-    """Additional numbers that a batch estimator returns: stamps (n,) and the columns of a schema.
+    """Messages of a further output of a batch estimator: stamps (n,) and the columns of its schema.
 
     Attributes:
         time_ns: (n,), the stamps.
@@ -144,7 +146,7 @@ class Outputs:
         return len(tangent_components(list(self.components), list(self.components.values())))
 
     def blank(self, rows: int) -> Results:
-        """Make results with `rows` rows: accepted, of target 0, and NaN otherwise."""
+        """Make results with `rows` rows: 1 in `accepted`, 0 in `target`, NaN in all other arrays."""
         d, t, m = len(self.components), self.tangent, len(self.measured)
         width = sum(len(schema.fields) - 1 for schema in self.further.values())
         return Results(
@@ -181,7 +183,7 @@ class Outputs:
         return [*made, *self._further_of_block(messages, results.further)]
 
     def of_skipped(self, skipped: Skipped) -> list[Ragged]:
-        """Make the stream of skipped messages for measurements without a covariance."""
+        """Make the stream that reports measurements skipped because they lack a covariance."""
         if not any(skipped.reasons):
             return []
         topic = f"{self.topic}/skipped"

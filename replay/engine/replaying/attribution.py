@@ -2,8 +2,8 @@
 
 Innovations do not state their topic. If messages of several topics have the same stamp, and there is one
 innovation with this stamp for each of them, the innovations belong to these messages in the order of the
-file. If the numbers differ, or if innovations have other stamps (an estimator may shift its messages by
-their delay), the topics are counted together.
+file. If the number of innovations differs from that of messages, or if innovations have other stamps (an
+estimator may shift its messages by their delay), the topics are counted together.
 """
 
 from collections import Counter

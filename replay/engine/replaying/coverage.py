@@ -45,7 +45,7 @@ class Coverage:
     def _counts(self) -> Integers:
         """Return the number of intervals in each bin and run (BINS, runs).
 
-        Most runs use one or two bins; the memory of the others is never touched.
+        Most runs use one or two bins, so most of the memory is never touched and never allocated.
         """
         return np.zeros((self.BINS, self._runs), np.int64)
 

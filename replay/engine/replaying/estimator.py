@@ -43,11 +43,11 @@ class Initialization:
     Attributes:
         topics: topics whose first messages it is given.
         find: find(first messages, static topics, clock) -> the static topics to start from, and output
-            streams; the replay stamps estimates by this clock.
+            streams; `clock` is the clock by which the replay stamps estimates.
         find_broad: find_broad(first messages, static topics, clock, a stamp for each run) -> equally
             likely starts of all runs at these stamps, so broad that the parameters do not influence
-            them. Likelihoods with other parameters, or of a log without a fault, are compared from these
-            starts. None if `find` is used instead.
+            them. Likelihoods that are to be compared, for example for different parameters or for a log
+            and an altered copy of it, are computed from these starts. None if `find` is used instead.
     """
 
     topics: tuple[str, ...]
@@ -67,21 +67,22 @@ class Reading:
 
     Attributes:
         controls: topics that drive the motion.
-        kinds: by topic, the kinds of the numbers that it reads from a message: controls or measured
-            components.
-        measured: by topic of a sensor, the names of these numbers, as used for innovations.
-        numbers: numbers(stream of one of these topics) -> these numbers (n, m); NaN if one is missing.
+        kinds: by topic, the kinds of the components that the model reads from a message: controls or
+            measurements.
+        measured: by topic of a sensor, the names of these components, as used for innovations.
+        numbers: numbers(stream of one of these topics) -> the values (n, m) of these components; NaN if
+            one is missing.
         noises: parameters that are standard deviations of noise, each with the topic of its sensor, or
             "" for the motion.
         augmentable: parameters that can be estimated together with the state, each with its kind and
             the topics of the sensors that read it ("" for the motion).
-        biases, factors: by topic and index of a number, the parameter that is added to it or multiplies
-            it; the number is a control or a measured component.
-        delays: by topic, the parameter that is the delay of its messages.
-        calibration: parameters of the mounting, scale, bias and delay of its sensors, each with a
-            useful standard deviation.
+        biases, factors: by topic and index of a component, the parameter that is added to the component,
+            or that multiplies it.
+        delays: by topic, the parameter with the delay of the topic's messages.
+        calibration: parameters of the mounting, scale, bias and delay of the model's sensors, each with
+            the largest standard deviation of a useful estimate.
         control_noise: control_noise(time in s for which a control message holds) -> by topic and index
-            of a number, the variance that the model states; empty if it states none.
+            of a component, the variance that the model states; empty if it states none.
     """
 
     controls: tuple[str, ...]
@@ -116,13 +117,13 @@ class Needed(NamedTuple):
 
 
 class Alike(NamedTuple):
-    """Description of bound estimators that differ only in numbers and can process runs together.
+    """Description of bound estimators that can process runs together if only numerical settings differ.
 
     Attributes:
         key: equal for estimators that can be combined.
-        numbers: the numbers of this estimator.
-        together: together(numbers of each run) -> an estimator in which each run has its own numbers.
-            An initialization must not depend on them.
+        numbers: the numerical settings of this estimator.
+        together: together(settings of each run) -> an estimator in which each run has its own settings.
+            The initialization must not depend on the settings.
     """
 
     key: Hashable
@@ -152,17 +153,18 @@ class Recursive:
         out_of_sequence: out_of_sequence(nanoseconds) -> the same estimator for messages in order of
             arrival whose stamps go back by at most this time; None if it cannot reprocess messages. It
             raises BadInput if the parameters do not allow this.
-        initialization: how it finds what a log does not state; None if the log states everything.
+        initialization: how it finds initial values that the log does not state; None if the log states
+            them all.
         assumed: values of the parameters that are assumed, because the log does not state them.
         is_random: whether it draws random numbers, so that its likelihood is not a smooth function of
             its parameters.
-        offers: for each topic that it does not use, the setting with which it would use the topic.
+        offers: by topic that it does not use, the setting that would make it use the topic.
         reading: what it reads; None if that is not known.
         needed: by topic, a field without which it does not fit a log.
         truth: topic against which its estimates are judged, and which it must not read.
         is_bound: whether it computes a bound instead of estimates; a bound may read the truth.
-        alike: how it processes runs together with other estimators that differ only in numbers; None if
-            it cannot.
+        alike: how it processes runs together with other estimators that differ only in numerical
+            settings; None if it cannot.
     """
 
     name: str
@@ -194,7 +196,7 @@ class Batch:
     `streams` are the measurements within the replayed span; everything else is as for `Recursive`.
 
     Attributes:
-        name: the label, followed by the name of the estimated thing.
+        name: the label, followed by the name of the estimated object.
         streams: topics of measurements.
         static: topics that are read as a whole.
         solve: solve(streams of all runs by topic) -> the output streams.
@@ -228,7 +230,7 @@ class Estimator(Generic[ParametersType]):
         summary: one-line description.
         requirements: what a log must contain, in one line.
         parameters: type of its parameters.
-        bind: bind(name, topics, parameters) -> one bound estimator for everything that it can estimate
+        bind: bind(name, topics, parameters) -> one bound estimator for each object that it can estimate
             in a log with these topics (for each robot, say); empty if the log does not fit.
         variant: the parameter that is set by the second part of a name such as `lrkf:s2kf-50`.
         label: label of the estimator if the user gives none.
@@ -245,7 +247,7 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Setting]) -> "AnyEstimator":  # noqa: ARG002
-        """Return the estimator that `settings` of `label` select: another one for a foreign filter."""
+        """Return the estimator for `label` and `settings`, which is another one for a foreign filter."""
         return self
 
     # an estimator of any model overrides these two: `_OfAnyModel`

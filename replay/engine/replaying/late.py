@@ -169,7 +169,7 @@ class _Arrivals(NamedTuple):
 
     Attributes:
         streams: the topics.
-        run, topic, row: (n,) the run, the index of the topic, and the row in it.
+        run, topic, row: (n,) the run, the index of the topic, and the row in that topic.
         stamp_ns, moment_ns: (n,) when they were measured, and when they are processed.
         position: (n,) position in the file.
     """
@@ -212,7 +212,7 @@ def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragg
 
 
 def _reached(streams: dict[str, Ragged]) -> Integers:
-    """Return when the last message of every run (runs,) arrived; zero if it has none."""
+    """Return the arrival time (runs,) of the last message of every run; zero if a run has no message."""
     reached = []
     for ragged in streams.values():
         last = np.maximum(ragged.offsets[1:], 1) - 1
@@ -225,9 +225,10 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
 def _find_behind(
     arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
 ) -> tuple[Integers, Integers]:
-    """Find the newest stamps (runs,) after the ready messages, and the lag (n,) of each message.
+    """Find the newest stamps (runs,) up to the last ready message, and the lag (n,) of each message.
 
-    The lag is zero if a message is not older than its predecessors, or is not ready.
+    The lag is the time by which a message is older than the newest one before it; it is zero if the
+    message is not older, or is not ready.
     """
     newest_ns = np.zeros(arrivals.runs, np.int64) if before_ns is None else before_ns.copy()
     behind_ns, rows = np.zeros(len(ready), np.int64), np.flatnonzero(ready)

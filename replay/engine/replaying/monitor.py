@@ -102,9 +102,9 @@ class RunMonitor:
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
         """Pass the next streams of the runs that have not failed to `work`, and return its result.
 
-        If `work` raises BadInput, it is called again from the same state without the runs that cause
-        it. The exception is raised if every run causes it and the ensemble has no other runs, or if no
-        run does.
+        If `work` raises BadInput, it is called again from the same state without the runs that cause it.
+        The exception is raised if every run of the whole ensemble causes it, or if it is not due to
+        single runs.
         """
         self._note_span(streams)
         if self.usage is not None:

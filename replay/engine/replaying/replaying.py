@@ -48,7 +48,7 @@ class Report:
     Attributes:
         seconds: computing time of each estimator in s by label, without one-time work such as compiling.
         coverage: for each case, the share of every run that has estimates (`schemas.COVERAGE`).
-        refused: by estimator, the error that no run of a part can be replayed.
+        refused: by estimator, the error if no run of this part can be replayed.
         usages: by estimator, how its measurements were used.
     """
 
@@ -73,13 +73,13 @@ def replay(
     Args:
         sources: the runs, with the same topics; their time spans may differ.
         estimators: bound estimators with different names.
-        order: the clock to go by: publish time, or log time (order of arrival).
+        order: the clock that defines the order: publish time, or log time (order of arrival).
         late: in order of log time, the policy for messages whose publish times go back; without it, log
             time is used as the time of measurement.
         block_messages: approximate number of messages of a run in memory at a time.
         report: filled after the last block.
-        is_part: whether there are more runs than these. It is then not an error if an estimator can
-            process none of them: they fail, and the report says so.
+        is_part: whether `sources` are only a part of all runs. It is then not an error if an estimator
+            can process none of them: they fail, and the report contains the error.
 
     A run that an estimator cannot process fails on its own, see
     `fuselog.replay.engine.replaying.monitor`; the failures come last.
@@ -297,7 +297,7 @@ def _finish(
 def _refuse_old_priors(
     bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged], order: Clock
 ) -> None:
-    """Raise BadInput if an estimator would start a span from the state at an earlier time."""
+    """Raise BadInput if an estimator would start a span from a prior that is older than the span."""
     for topic in (bound.priors.keys() & static.keys()) - bound.given.keys():
         for run, start_ns in ensemble.starts_ns.items():
             times_ns = static[topic].of_run(run).times(order)[:1]

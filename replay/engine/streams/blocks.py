@@ -76,9 +76,9 @@ class Ragged:
 class Events(NamedTuple):
     """Messages of several topics in time order; events offsets[r]:offsets[r + 1] belong to run r.
 
-    Event e is a message of the topic with index `topic[e]`, and message number `source[e]` of all topics
-    end to end. `is_last[e]` is true if no later event of the run has the same stamp: only then is there
-    an estimate.
+    Event e is a message of the topic with index `topic[e]`; `source[e]` is its index among the messages
+    of all topics, end to end. `is_last[e]` is true if no later event of the run has the same stamp;
+    estimates are made only at these events.
     """
 
     offsets: NDArray[np.int64]
@@ -113,7 +113,7 @@ class Block(NamedTuple):
         return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> AnyArray:
-        """Return one field of every event: the first of `names` that its topic has, or `missing`."""
+        """Return a column over all events: the first of `names` that its topic has, or `missing`."""
         parts = []
         for ragged in self.streams.values():
             found = [name for name in names if name in ragged.stream.columns]
@@ -182,7 +182,7 @@ def filled_rows(
         end: (runs,), end of its filled rows.
 
     Returns:
-        The filled rows (n,), or a slice of all, and their offsets (runs + 1,).
+        The filled rows (n,), or a slice if all rows are filled, and their offsets (runs + 1,).
     """
     if (end == offsets[1:]).all():
         return slice(None), offsets

@@ -75,8 +75,8 @@ class Ensemble(list[SourceType]):
     ) -> Iterator[dict[str, Ragged]]:
         """Yield the next block of every run, until all runs have ended.
 
-        The runs need not be at the same time, because each has its own state. A recording in memory is a
-        single block.
+        The blocks of different runs need not cover the same time, because each run has its own state. A
+        recording in memory is a single block.
         """
         if not topics:
             return
@@ -100,7 +100,8 @@ class Ensemble(list[SourceType]):
         Args:
             streams: by topic.
             order: the clock.
-            latest: has the last merged block of a replay, for several estimators of the same topics.
+            latest: cache of the last merged block, which estimators of the same topics share in a
+                replay.
         """
 
         def merged(findings: Findings | None = None) -> Block:
@@ -132,7 +133,7 @@ class Ensemble(list[SourceType]):
         return bool(self._recordings) and all(run.is_whole for run in self._recordings)
 
     def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
-        """Return topics of recordings, each run in the order of a clock."""
+        """Return topics of recordings, with each run sorted by a clock."""
         for topic in topics:
             if (topic, order) not in self._kept:
                 together = gather([source.stream_of(topic) for source in self._recordings])

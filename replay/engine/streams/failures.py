@@ -1,7 +1,7 @@
 """Failures of runs that an estimator could not process to the end, with time and reason.
 
-A failure is a message with a number, an index in a list of sentences; the channel's metadata has this
-list as JSON. When streams are joined, their lists are merged.
+A failure is a message whose only field is an index in a list of sentences; the channel's metadata
+contains this list as JSON. When streams are joined, their lists are merged.
 """
 
 import json

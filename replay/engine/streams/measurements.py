@@ -39,7 +39,7 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Return why messages of `topic` were not used; "" if no covariance can be missing."""
+        """Return a sentence on messages of `topic` that lack a covariance; "" if none can lack one."""
         remedy = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{remedy}" if self.covariance else ""
 
@@ -59,8 +59,9 @@ class MeasuredVectors(NamedTuple):
 def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
     """Read the wanted components (n, d) of a vector field, in the wanted order.
 
-    The channel's metadata names the components; positions of two or three numbers need no names. Raises
-    BadInput if a component is missing, or if the vectors have another width than the channel states.
+    The channel's metadata names the components; positions with two or three components need no names.
+    Raises BadInput if a component is missing, or if the vectors have another width than the channel
+    states.
 
     Args:
         stream: the messages.
@@ -116,7 +117,7 @@ def unknown(covariance: Floats) -> NDArray[np.bool_]:
 
 
 def matrices(stream: Stream, field: str, covariance: str) -> Floats:
-    """Read the covariances (n, d, d) of a vector field of d numbers, stored in full or as diagonals.
+    """Read the covariances (n, d, d) of a vector field of d components, stored in full or as diagonals.
 
     Raises BadInput if they have another width.
 

@@ -84,7 +84,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
 
 class _Layout(NamedTuple):
-    """Number of components that a channel states, in both spaces, and indices of the wanted ones."""
+    """Number of components that a channel states, and the wanted indices, in state and tangent space."""
 
     stated: int
     tangent: int
@@ -132,8 +132,8 @@ def start_of_runs(
         priors: the components to read from each topic that is a prior.
 
     In the returned topics, a prior has one message for every run, with the wanted components in their
-    order; it is NaN if the run cannot start. The reasons are by run; there may be one for every run.
-    Raises BadInput if a prior does not have these components, see `priors_of`.
+    order; it is NaN if the run cannot start. The reasons are by run; all runs may have one. Raises
+    BadInput if a prior does not have these components, see `priors_of`.
     """
     found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
@@ -154,7 +154,7 @@ def _start_of(topic: str, prior: Ragged, components: Components) -> tuple[Ragged
 def gaussians(
     prior: Ragged,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return copies of the numbers in a prior that `start_of_runs` made.
+    """Return copies of the arrays in a prior that `start_of_runs` made.
 
     Stamps (runs,), means (runs, d) and covariances (runs, t, t).
     """

@@ -1,10 +1,10 @@
 """Comparison and interpolation of angles, axes and orientations in their tangent space.
 
 Every component of a state has a kind. The two components of an axis and the four of a quaternion are
-adjacent; an axis or a quaternion equals its negative. Its error is the rotation from truth to estimate
-in the body's frame, an angle or a rotation vector, and the covariances of estimates are those of this
-error. Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3
-and 7.
+adjacent; an axis or a quaternion equals its negative. The error of an axis or a quaternion is the
+rotation from truth to estimate in the body's frame, as an angle or a rotation vector; the covariances of
+estimates are those of this error. Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter",
+JAIF 9(2), 2014, sections 5.3 and 7.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,7 +80,7 @@ def _tangent_components(
 
 
 def _common(names: Sequence[str]) -> str:
-    """Return the common prefix of a vector's component names, or `rotation` if it is too short."""
+    """Return the common prefix of component names of a vector; `rotation` if this is too short."""
     stem = names[0]
     while not all(name.startswith(stem) for name in names):
         stem = stem[:-1]

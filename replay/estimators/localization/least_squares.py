@@ -1,10 +1,10 @@
-"""Iterated least squares over many runs together, and the corresponding bound.
+"""Iterated least squares over many runs together, and the Cramer-Rao lower bound of the estimates.
 
 For parameters (runs, n), a model returns the residuals of the measurements, the derivatives of the
 predictions, and the covariance of the measurements. The module computes the step of the search, the
 Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the unobservable directions from
-them. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with scaled columns
-and a line search that halves steps; the weights are computed at the latest estimate.
+them. The search uses the Gauss-Newton method (ILS in Bar-Shalom, Li and Kirubarajan, 2001), with scaled
+columns and a line search that halves steps; the weights are computed at the latest estimate.
 """
 
 from collections.abc import Callable, Sequence
@@ -222,8 +222,8 @@ def information_root(at: Linearization) -> Floats:
     """Compute rows (runs, k, n) whose outer products sum to the Fisher information.
 
     The first rows are the whitened Jacobian. If the covariance depends on the parameters, one row
-    follows for each of its entries: the trace term is half the scalar product of the whitened
-    derivatives (Osborne et al. 2014, eq. (48)).
+    follows for each of its entries, because the trace term is half the scalar product of the
+    covariance's whitened derivatives (Osborne et al. 2014, eq. (48)).
     """
     whitener = _whitener(at.covariance)
     root = _apply(whitener, at.jacobian)
@@ -239,7 +239,7 @@ def information_root(at: Linearization) -> Floats:
 
 
 def cramer_rao_bound(at: Linearization) -> Bound:
-    """Invert the Fisher information by means of its root, because squaring would lose digits.
+    """Compute the inverse Fisher information from its root, because squaring the root would lose digits.
 
     If the triangular factor proves full rank, it is inverted, which is fast; otherwise singular values
     determine the rank. A run whose model is not finite has rank 0.
@@ -281,7 +281,7 @@ def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
 
 
 def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
-    """Compute roots of the inverse information, and test whether the rank is certainly full.
+    """Compute roots of the inverse information, and whether they prove that the rank is full.
 
     With F the inverse of the triangular factor, no singular value is below 1 / |F| or above sqrt(n).
     """

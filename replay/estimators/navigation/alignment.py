@@ -67,7 +67,7 @@ class AlignmentParameters(ModelParameters):
         velocity_delay_s: delay of velocities: time from the measurement to the stamp.
         inertial_delay_s: delay of inertial samples: time from the measurement to the stamp.
         level_s: duration of the first samples, from which the tilt is computed.
-        still_mps: lowest speed of a moving body.
+        still_mps: speed above which the body counts as moving.
         rest_margin_s: margin before the first motion, until which the body is assumed to be at rest.
         course_mps: speed above which the course determines the heading.
         course_s: duration over which courses are compared with the turn of the gyro to estimate the
@@ -130,8 +130,8 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
             optionally `velocity`, velocities in that plane.
         parameters: `AlignmentParameters`.
 
-    Raises BadInput if there is no such fix, if the unit does not measure gravity, or if numbers seem to
-    have another unit.
+    Raises BadInput if there is no such fix, if the inertial unit does not measure gravity, or if values
+    seem to be in another physical unit.
     """
     samples, topic = read_samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
@@ -194,16 +194,16 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """Return the covariance (3, 3) of a start at a message; wide, because the message is used again."""
+    """Return the wide covariance (3, 3) of a start at a message, which is also used as a measurement."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
 
 def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
-    """Return the covariance (6, 6) of tilt and accelerometer bias in body axes; `up` points up.
+    """Return the covariance (6, 6) of tilt and accelerometer bias in body axes; `up` is vertical.
 
-    If the tilt's standard deviation is not given, both are correlated: levelling compensates for a bias,
-    so the body tilts by the ratio of the bias to gravity.
+    If the tilt's standard deviation is not given, both are correlated: levelling mistakes a bias for a
+    tilt; the error of the tilt is the ratio of the bias to gravity.
     """
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
@@ -244,7 +244,7 @@ def _first_place(
 def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, float]:
     """Compute roll and pitch, in rad, for which the mean of the first specific forces points up.
 
-    Raises BadInput if it is not gravity in m/s2, or points down.
+    Raises BadInput if the mean does not have the magnitude of gravity in m/s2, or points down.
     """
     until_ns = samples.time_ns[0] + round(parameters.level_s / NS)
     x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
@@ -268,10 +268,10 @@ def _bias(
 ) -> tuple[Floats, float]:
     """Return the mean turn rate (3,) at rest, or zeros if there is no rest, and its standard deviation.
 
-    The standard deviation is computed from the rotation of the earth and from the means of intervals of
-    `level_s`, which differ because of noise and motion.
+    The standard deviation is computed from the rotation of the earth and from the means over intervals
+    of `level_s`, which differ because of noise and motion.
 
-    Raises BadInput if the rate exceeds the error of any gyro.
+    Raises BadInput if the mean rate is larger than the bias of any gyro.
     """
     moved = motion.first_above(row, parameters.still_mps)
     end_ns = samples.time_ns[-1] if moved is None else motion.time_ns[moved]
@@ -319,7 +319,7 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
 def _turned(
     samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the times (n,) of later samples since the start, in s, and the turn about the vertical."""
+    """Return the times (n,) in s from the start to later samples, and the turn about the vertical."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
@@ -367,7 +367,7 @@ def _mounting(
 ) -> str:
     """Report if the measured acceleration and the change of the velocity have different directions.
 
-    Both are compared over the intervals between the velocities, in the plane and as complex numbers.
+    The horizontal components are compared, as complex numbers, over the intervals between velocities.
     """
     since_s, turned = turning
     fast = motion.first_above(0, parameters.course_mps)

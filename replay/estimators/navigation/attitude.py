@@ -1,9 +1,9 @@
 """Orientation of a body that is carried around, from gyro, accelerometer and magnetometer.
 
 The state is the rotation, the gyro's bias, the velocity, and the local magnetic field. The accelerometer
-drives the velocity, which stays small because the body is carried around. Gravity is therefore separated
-from motion by duration, similar to the averaging over seconds in Laidig and Seel, "VQF", Information
-Fusion 91, 2023, but with a known uncertainty. The gate rejects disturbed fields.
+drives the velocity, which stays small because the body is carried around. Over seconds, motion therefore
+averages out and gravity remains, as in Laidig and Seel, "VQF", Information Fusion 91, 2023, but here
+with a known uncertainty. The gate rejects disturbed fields.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 class AttitudeParameters(ModelParameters):
     """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
-    The filter assumes once a second that the velocity is near zero and the field nearly constant,
-    because the errors of these assumptions last about a second.
+    The filter assumes that the velocity is near zero and the field nearly constant. It uses these
+    assumptions only once a second, because their errors persist for about that long.
 
     Attributes:
         gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it includes scale errors
@@ -164,7 +164,7 @@ def read_own_field(stream: Stream) -> Floats:
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Find orientation and field from the means at rest: the force points up, the field north.
 
-    Raises BadInput if there is no magnetometer, or if both point in the same direction.
+    Raises BadInput if there is no magnetometer, or if force and field are parallel.
     """
     stream = streams["inertial"]
     begin_ns = int(stream.publish_time_ns[0])

@@ -89,7 +89,7 @@ PLUMB_SIGMA_RAD = 1e-4  # deflection of the plumb line from the ellipsoid's norm
 def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
     """Compute the standard deviation, in m/s2, of the mean specific force of the first samples.
 
-    It includes the differences between the samples and the change of the velocity during this time.
+    It includes the spread of the samples and the change of the velocity during this time.
     """
     begin_ns = samples.time_ns[0]
     until_ns = begin_ns + round(parameters.level_s / NS)

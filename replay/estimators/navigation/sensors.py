@@ -40,7 +40,7 @@ def be_high(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def roll_along(state: Components, samples: Components, parameters: Any) -> Components:
-    """Return the wheels' velocity (forward, left, up); they neither slip sideways nor lift off."""
+    """Return the velocity (forward, left, up) of wheels that neither slip sideways nor lift off."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     wx, wy, wz = turn_rate(samples, (gx, gy, gz), parameters)
     axle = parameters.axle_x_m, parameters.axle_y_m, parameters.axle_z_m
@@ -87,7 +87,7 @@ def height_noise(parameters: Any) -> Components:
 
 
 def wheel_noise(parameters: Any) -> Components:
-    """Return the variances of the wheels' speed and of their slip sideways and up."""
+    """Return the variances of the wheels' forward speed and of their sideways and upward slip."""
     slip = parameters.sigma_slip_mps**2
     return parameters.sigma_wheel_mps**2, slip, slip
 
@@ -99,7 +99,7 @@ def standing_noise(parameters: Any) -> Components:
 
 
 def slip_noise(parameters: Any) -> Components:
-    """Return the variances of the wheels' slip sideways and up."""
+    """Return the variances of the wheels' sideways and upward slip."""
     variance = parameters.sigma_slip_mps**2
     return variance, variance
 
@@ -137,13 +137,13 @@ def read_wheels(stream: Stream) -> Floats:
 
 
 def read_standing(stream: Stream) -> Floats:
-    """Return zero velocities (n, 3) where the value is not zero, otherwise NaN: the body may move."""
+    """Return zero velocities (n, 3) for nonzero values; NaN for zero, because the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
 
 
 def read_rolling(stream: Stream) -> Floats:
-    """Return zero velocities (n, 2) to the side and up where the value is not zero, otherwise NaN."""
+    """Return zero velocities (n, 2) to the left and up for nonzero values; NaN for zero."""
     return read_standing(stream)[:, :2]
 
 

@@ -65,7 +65,7 @@ WITH_HEADING = Correction(heading, move, step_to, move_back)
 
 
 def _moved(state: Components, step: Components, slope: Components, of_body: float) -> Components:
-    """Return the state after a step with a residual in the axes of the body (1) or of the plane (0)."""
+    """Return the state after a step whose residual is in axes of the body (1) or of the plane (0)."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
@@ -86,7 +86,7 @@ def _moved(state: Components, step: Components, slope: Components, of_body: floa
 def _forth(
     step: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """Return the change of a vector: a move along its circle, plus the rotated rest of its step."""
+    """Return the change of a vector: a move along its circle, plus the rotated remainder of its step."""
     rest = _less(step, _times(turn, slope))
     return _plus(_arc(slope, axis, turn), _rotated(rest, axis, swing))
 

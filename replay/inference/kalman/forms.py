@@ -1,7 +1,8 @@
-"""Steps of extended and sampling filters, composed of parts for one storage form of covariances.
+"""Steps of extended and sampling filters, built from parts for one representation of covariances.
 
-A filter stores a mean and its covariance in some form; see `Form`. Plain filters store the covariance
-itself; the parts for square-root filters are in `fuselog.replay.inference.kalman.square_root`.
+A filter stores a mean and a representation of its covariance; see `Form`. Plain filters store the
+covariance itself; the parts for square-root filters are in
+`fuselog.replay.inference.kalman.square_root`.
 """
 
 from collections.abc import Callable
@@ -25,10 +26,10 @@ from fuselog.replay.inference.model.bound_model import BoundModel
 
 
 class Parts(NamedTuple):
-    """Parts of the filters of one storage form; each part makes a function for a bound model.
+    """Functions that make a filter's parts for a bound model, for one representation of covariances.
 
     Attributes:
-        form: the form in which covariances are stored.
+        form: the representation of covariances.
         linear_motion, sampled_motion: (bound_model), (bound_model, samples) -> `predict`; see
             `gaussian_filter`.
         linear_update, sampled_update: (bound_model, number), (bound_model, number, samples) -> update by

@@ -39,8 +39,8 @@ def iterated_update(bound_model: BoundModel, number: int) -> Update:
     """Make the update that relinearises at every iterate (Gauss-Newton on the posterior).
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds, the Jacobian is H at x (+) d times the right
-    Jacobian at d. The gate and the weight of the measurement are computed at the prediction, innovation
-    and likelihood at the last iterate.
+    Jacobian at d. The gate and the weight of the measurement are computed at the prediction; the
+    innovation and the likelihood are computed at the last iterate.
 
     Args:
         bound_model: the bound model, with the sensors of the log.

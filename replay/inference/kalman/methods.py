@@ -63,10 +63,11 @@ class MethodParameters(Parameters):  # type: ignore[explicit-any]
         estimate: names of parameters to add to the state; each starts from its value.
         estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
         estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
-        estimate_time_s: time constant of its return to its value (Gauss-Markov process), in s, by name.
+        estimate_time_s: time constant with which such a parameter returns to its value (Gauss-Markov
+            process), in s, by name.
         topics: topics to use instead of those that the model names, such as {pose = "/amcl_pose/pose"}.
-            An empty name leaves a sensor out; of several names, separated by commas or in a list, all
-            are used.
+            An empty name leaves a sensor out; several names, separated by commas or in a list, are all
+            used.
         of_topics: by topic, parameters that replace the general ones for this topic, as set by --set
             /gps2/fix.lever_x_m=0.4.
     """
@@ -210,9 +211,9 @@ def _exact_sensor(bound_model: BoundModel, number: int) -> Innovate:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """Name a sensor whose linearised components, including noise, are dependent at every state.
+    """Name a sensor whose components, linearised and including noise, are always linearly dependent.
 
-    The innovation covariance is then singular, as for a coordinate and its square.
+    The covariance of their innovation is then singular, as for a coordinate and its square.
     """
     parameters = trial_parameters(model)
     for sensor in model.sensors:

@@ -83,7 +83,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Linear
     Returns:
         `linearise(state, control, duration_s, parameters, work)`. It fills `work.state` (n,),
         `transition` (t, t) if F is requested, `gain` (t, controls) if the control is noisy, and
-        `noise_gain` (t, noises) if noise enters other than by addition.
+        `noise_gain` (t, noises) if the noise is not additive.
     """
     if motion.jacobians is not None:
         move, jacobians, fill = motion.move, motion.jacobians, filling(model.size)

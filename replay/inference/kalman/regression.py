@@ -65,8 +65,8 @@ class SampleMemory(NamedTuple):
     Attributes:
         points, weights, first, stride: see `fuselog.replay.inference.sampling.sets.SampleSets`.
         axes: (L,) index of the only entry of each point that may differ from zero, as in the unscented
-            transform; empty if points have several.
-        unsuspected: largest standard deviation of angles that need no special treatment; see
+            transform; empty if points have several such entries.
+        unsuspected: largest standard deviation up to which angles need no special treatment; see
             `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) tangent vectors from the mean to the samples.
@@ -386,7 +386,7 @@ def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
 
 
 def kept_components(motion: Motion, kinds: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the tangent components of linear numbers that a motion does not change, such as biases."""
+    """Return the tangent components of linear components that a motion keeps, such as biases."""
     assert isinstance(motion.move, TracedFunction)
     returned = motion.move.result.returned
     return tuple(

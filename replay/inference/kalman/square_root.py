@@ -120,7 +120,7 @@ def _sampled(sample: Sample, variances_of: VariancesOf, mean_of: str, size: int,
 
 
 def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> bool:
-    """Fill N from a noise covariance (overwritten), and compute the factor; return False on failure."""
+    """Fill N from a noise covariance (overwritten), and factorise; return False if this fails."""
     first = len(weights) - len(noise)
     weights[first:] = 1.0
     return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)

@@ -1,8 +1,9 @@
-"""Steps of a recursive filter for one model, which methods make, and their working memory.
+"""Steps of a recursive filter for one model, as made by methods, and their working memory.
 
 A method propagates a Gaussian through motion and sensors by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`fuselog.replay.inference.kalman.regression`), or by exact moments that the
-model provides. All use one workspace, followed by the same Kalman update (`update.kalman_update`).
+model provides. All methods fill the same workspace, from which the same Kalman update
+(`update.kalman_update`) follows.
 """
 
 from collections.abc import Callable
@@ -71,7 +72,7 @@ class Measurement(NamedTuple):
     """Inputs of an update in addition to the belief.
 
     Attributes:
-        data: numbers of the message; see `update.message_layout`.
+        data: contents of the message; see `update.message_layout`.
         parameters: parameters of the sensor.
         gate: (m + 1,) bounds of the NIS by number of components.
         event: index of the event; see `Interval`.
@@ -88,7 +89,7 @@ MakeMemory = Callable[[tuple[Samples, ...]], CoreMemory]
 
 
 class PredictRun(Protocol):
-    """Function that predicts the belief of a run over an interval, in place; it returns the success."""
+    """Function that predicts a run's belief over an interval, in place; it returns False on failure."""
 
     def __call__(self, run: int, belief: Belief, interval: Interval, memory: CoreMemory, /) -> bool: ...
 
@@ -142,7 +143,7 @@ class Innovate(Protocol):
 
 
 class Update(Protocol):
-    """Function that updates a mean (n,) and covariance (t, t) in place; results as of `UpdateRun`."""
+    """Function that updates a mean (n,) and covariance (t, t) in place; see `UpdateRun` for results."""
 
     def __call__(
         self,

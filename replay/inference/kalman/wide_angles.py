@@ -6,23 +6,23 @@ r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measureme
 0.63 rad. Two rules prevent this:
 
 - **A smaller spread.** A function f is regressed at the samples m + c (x - m) of N(m, c^2 P), with the
-largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for changes by f.
+  largest c <= 1 that keeps all angles within a quarter of a turn, which leaves room for changes by f.
   With y = f(m + c (x - m)) - f(m) the regression (Steinbring and Hanebeck 2014, (19)-(24)) gives
 
       E[(x - m) y'] / c = P A',     E[(y - E y)(y - E y)'] / c^2 = A P A' + V / c^2,
 
   where A is the slope of f within the quarter turn, and V the covariance of the residuals of the linear
   fit. Therefore the differences of the values are divided by c. For an affine f this is exact for every
-  c: a prediction keeps the variance of an angle that it only adds to. The effect of nonlinearity is
+  c: a prediction that only adds to an angle keeps its variance. The effect of nonlinearity is
   overestimated, never underestimated. This is the scaled unscented transformation (Julier, "The scaled
-  unscented transformation", ACC 2002) with a scale that the angles determine, except that the mean is
-  that of the narrowed samples: on a circle it is bounded, unlike the second-order term of the scaled
-  transformation.
+  unscented transformation", ACC 2002) with a scale that the angles determine. Only the mean differs: it
+  is that of the narrowed samples, which is bounded on a circle, unlike the second-order term of the
+  scaled transformation.
 
 - **No wider than uniform.** A completely unknown angle has the standard deviation pi / 3^1/2 = 1.81 rad
-(Mardia and Jupp, Directional Statistics, 2000, section 3.5); no distribution of an angle should be
-wider. A motion limits wider angles, and each axis of a rotation, to this value by scaling the rows of
-the covariance's factor.
+  (Mardia and Jupp, Directional Statistics, 2000, section 3.5); no distribution of an angle should be
+  wider. A motion limits wider angles, and each axis of a rotation, to this value by scaling the rows of
+  the covariance's factor.
 
 A Gaussian is a poor description of an angle beyond 1 rad: at 1 rad, 0.2 % of its probability is beyond
 half a turn, and at 1.81 rad, where its mean is meaningless, 8 %. Samples are bit-identical to the
@@ -87,12 +87,13 @@ class Regressed(Protocol):
 def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
     """Make `narrow(factor, points, unsuspected)`, which returns c and scales the factor (N, N) by it.
 
-    See the module docstring. With `bounded`, angles wider than uniform are first limited to uniform.
+    See the module docstring. With `bounded`, the standard deviation of each angle is first limited to
+    that of a uniform angle.
 
     Args:
         kinds: kinds of the state's components.
         size: size N of the factor.
-        bounded: whether wider angles are limited to uniform ones, as for motions.
+        bounded: whether angles are limited in this way, as for motions.
     """
     turns = turning(kinds)
 

@@ -1,4 +1,4 @@
-"""Forms in which a filter can store covariances; methods access beliefs by these forms.
+"""Representations in which a filter can store covariances, and the operations on them.
 
 A belief is a mean (n,) and a matrix (t, t) that represents its covariance P: P itself (`COVARIANCES`),
 or its lower Cholesky factor (`fuselog.replay.inference.linear_algebra.factors.FACTORS`). The steps of a
@@ -69,8 +69,9 @@ class Form(NamedTuple):
         propagate: (matrix, transition, product) replaces P by F P F'; product (t, t) is working memory.
         turn: (turning, vector, matrix) transforms P by `turning`, from `manifold.by_right_jacobian`,
             along a vector.
-        mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of matrices (M, t, t)
-            with the means `away` (M, t) and the mean `shift` (t,) of the mixture.
+        mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of M Gaussians with
+            these weights, from their means `away` (M, t), their matrices `carried` (M, t, t) and the
+            mean `shift` (t,) of the mixture.
         retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. From the
             matrices before and after a prediction and its values in the workspace, it fills `turned`
             with G', and `before` with P - G D'; see `fuselog.replay.inference.smoothing.backward_pass`.

@@ -14,11 +14,11 @@ def inflation(squared: float, size: int, parameters: Settings) -> float:
     `fuselog.replay.inference.model.parameters.ModelParameters`. Options that are not given are NaN;
     without any option, the factor is 1:
 
-    - `inflate_nis` = b: NIS / b if the NIS exceeds b, which reduces the NIS to b; - `student_freedom` =
-    f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
+    - `inflate_nis` = b: NIS / b if the NIS exceeds b, which reduces the NIS to b;
+    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
       Gustafsson, ICASSP 2013. It is at least 1, so a small innovation does not reduce the noise;
     - `switch_nis` = b: ((b + NIS) / 2 b)^2 if the NIS exceeds b; Agarwal et al., ICRA 2013, (15) with
-    s^-2.
+      s^-2.
 
     Args:
         squared: the NIS.

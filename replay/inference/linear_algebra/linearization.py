@@ -116,7 +116,7 @@ def derivative(
 
 
 def known_entries(linearise: Linearise, into: str) -> dict[tuple[int, int], float | None] | None:
-    """Return the entries of a Jacobian that may be nonzero, by row and column, and constant values.
+    """Return the entries of a Jacobian that may be nonzero, by index: the value if constant, else None.
 
     The result is None if the entries are unknown, as for a Jacobian that is written by hand.
     """

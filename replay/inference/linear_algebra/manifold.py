@@ -54,7 +54,7 @@ def tangent_size(kinds: Sequence[str]) -> int:
 
 
 def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
-    """List kind, first component, first tangent component and size of every number, axis and so on."""
+    """List kind, first component, first tangent component and size of each angle, axis and so on."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
         kind = kinds[component]
@@ -78,7 +78,7 @@ def is_flat(kinds: Sequence[str]) -> bool:
 def boxplus(kinds: tuple[str, ...], *, is_curved: bool = False) -> Boxplus:
     """Make `add(x, d)`, which moves the state x (n,) in place to x boxplus d, with d (t,).
 
-    With `is_curved`, numbers that are linear stay as they are.
+    With `is_curved`, linear components are not changed.
     """
     parts = curved_blocks(kinds) if is_curved else tuple(manifold_blocks(kinds))
 
@@ -175,8 +175,8 @@ def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
 def recentring(kinds: tuple[str, ...]) -> Recentre:
     """Make `recentre(values, shift)`, which changes the centre of tangent vectors (L, t) by a shift.
 
-    Numbers that are linear stay as they are. It returns whether the weighted sum of the values may still
-    differ from zero, because an angle was wrapped or rotations have not converged.
+    Linear components are not changed. The function returns whether the weighted sum of the values may
+    still differ from zero, because an angle was wrapped or rotations have not converged.
     """
     parts = curved_blocks(kinds)
 

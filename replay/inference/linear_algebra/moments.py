@@ -1,8 +1,8 @@
 """Weighted samples from the factor of a covariance, and their means and covariances.
 
-All sums are kept in registers, because a compiler must assume that arrays overlap. If a tuple changes, a
-kernel reads all of it at every mention of its name; such tuples are therefore iterated over, not
-indexed.
+All sums are kept in registers, because a compiler must assume that arrays overlap. Whenever a kernel
+names a tuple that changes, it reads the whole tuple; loops therefore iterate over such tuples instead of
+indexing them.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Propagation of covariances through matrices whose zeros and ones are known in advance.
 
 For each row of a matrix, a `Pattern` lists the entries that may be nonzero: the column, and the value if
-it is constant. Only products with zero are left out, so sums keep their order.
+it is constant. Only products with zero are left out, so the order of summation does not change.
 """
 
 from collections.abc import Mapping

@@ -168,7 +168,7 @@ def augmented_model(bound_model: BoundModel, added: Added) -> BoundModel:
 
 
 def with_gauss_markov(settings: Floats, added: Added) -> Floats:
-    """Append the numbers of the added processes to the settings of motion and sensors.
+    """Append the parameters of the added processes to the settings of motion and sensors.
 
     Args:
         settings: (1 + sensors, fields).

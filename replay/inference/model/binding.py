@@ -234,7 +234,7 @@ def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
 
 
 def _common(spaces: Collection[str]) -> str:
-    """Return the longest common namespace of these namespaces."""
+    """Return the longest namespace that contains all of these namespaces."""
     parts = zip(*(space.split("/") for space in spaces), strict=False)
     alike = takewhile(lambda each: len(set(each)) == 1, parts)
     return "/".join(each[0] for each in alike)
@@ -305,7 +305,8 @@ def _suffices(
     """Test whether a model can start from the prior or these sensors, and continue.
 
     A log without a prior fits a model that can start without one, if a sensor measures the state itself.
-    A log without sensors fits if it also lacks all parts of sensors, such as sightings without a map.
+    A log without usable sensors fits only if it also has none of their topics; sightings without a map,
+    for example, would remain unused.
     """
     if not has_prior and (model.start is None or here.has(model.prior)):
         return False

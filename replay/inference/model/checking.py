@@ -1,4 +1,4 @@
-"""Checks of a model against its declarations, by calls of its functions, for the author's tests.
+"""Checks that a model's functions match its declarations, for the tests of the model's author.
 
 `check_model` calls the functions at random states; a failure is one sentence with file and line.
 """
@@ -467,7 +467,7 @@ def _not_additive(
 ) -> list[str]:
     """Describe components whose added variance differs between one step and two half steps.
 
-    Components that get a share of their variance from others during the step are left out, because their
+    Components to which other components pass on variance during the step are left out, because their
     noise may be an approximation of limited order.
     """
     whole, half = (

@@ -1,4 +1,4 @@
-"""Types of the functions of a model, by arguments and results.
+"""Types of a model's functions, with their arguments and results.
 
 Arguments and results are tuples of numbers: states (n,), the control, and the point to which a message
 refers. Parameters are a NamedTuple of numbers. All arguments are positional.

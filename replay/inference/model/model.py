@@ -1,8 +1,8 @@
 """Models of a state: its motion, and the sensors that measure it.
 
-A model is written once, as plain component-first functions: arguments and results are tuples of
-components, which may be arrays. Every method (see `fuselog.replay.inference.kalman.methods`) can
-estimate the state of every model that provides what the method needs.
+A model is written once, as plain component-first functions: their arguments and results are tuples of
+components, and a component may be an array. Every method (see `fuselog.replay.inference.kalman.methods`)
+can estimate the state of every model that provides what the method needs.
 """
 
 from collections.abc import Callable, Mapping
@@ -72,12 +72,13 @@ class Control:
         components: names of its components, which are fields of the messages unless `read` is given.
         read: stream -> (n, components).
         interpolated: whether the control is linear between two messages, so that the motion uses the
-            mean of both ends of a step; if not, a message applies until the next one.
+            mean of its values at both ends of a step; otherwise, a message applies until the next one.
         initial: control before the first message; zeros by default.
         gap: parameter with the longest time, in s, without messages of an interpolated control. In a
             longer gap the estimate ends, or is unknown until messages resume; see `Motion.gap_noise`.
-        delay: parameter with the time, in s, by which a message is stamped after its measurement.
-        estimates: whether estimates are made at its stamps, and not only at those of sensors.
+        delay: parameter with the time, in s, from a measurement to the stamp of its message.
+        estimates: whether estimates are made at the stamps of the control, and not only at those of
+            sensors.
         fallbacks: other topics that replace the components of the same names if the log has them, such
             as the turn rate of a gyro in place of that of the wheels.
         noise: for a fallback, the names under which its channel may state the noise of the control, by
@@ -106,7 +107,8 @@ class Motion:
         move: (state, control, duration_s, parameters) -> state; with `noises`, (state, control, noise,
             duration_s, parameters) -> state.
         noise: (state, duration_s, parameters) -> variances of the additive noise in the tangent space,
-            or the rows of the lower triangle of its covariance; with `noises`, the variances of these.
+            or the rows of the lower triangle of its covariance; with `noises`, the variances of the
+            noise components.
         noises: number of noise components that are arguments of `move` instead of being added.
         noise_block: number of components in the lower triangle, if variances of the other components
             follow it; zero for all components.
@@ -167,24 +169,25 @@ class Sensor:
             parameters). `reference` is the point of the map, or empty. A component that is undefined at
             this state, or has no derivative, is NaN, as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of these. With `covariance`, it applies to messages without a
-            covariance; a message with neither is skipped and counted.
+            with `noises`, the variances of the noise components. With `covariance`, it applies to
+            messages without a covariance; a message with neither is skipped and counted.
         vector: field with the measured components as a vector. The channel's metadata name its entries
-            in `components`, in any order; those of a position need no names. By default, every component
-            is a separate field.
+            in `components`, in any order; the components of a position need no names. By default, every
+            component is a separate field.
         noises: number of noise components that are arguments of `measure` instead of being added.
         covariance: field with the covariance of the vector; with `read`, stream -> (n, m, m), NaN if
             unknown.
-        reference: map whose points the messages refer to, or several maps with one point each.
-        fields: numbers that a message contains in addition to the measurement, such as the pose of a
+        reference: map whose points the messages refer to; or several maps, with a point of each in every
+            message.
+        fields: values that a message contains in addition to the measurement, such as the pose of a
             moving sensor: fields of the schema, with their numbers of components. They follow the points
             and the control in `reference`.
-        is_numbered: whether `reference` ends with the numbers of these points.
+        is_numbered: whether `reference` ends with the numbers of the points.
         control: the model's control, if the measurement depends on it; `reference` then contains its
             components at the stamp, after the points. It must be `interpolated`.
-        read: stream -> (n, measured), NaN if a component is missing, for values that are computed from a
-            message, such as a pseudo-measurement.
-        delay: parameter with the time, in s, by which a message is stamped after its measurement.
+        read: stream -> (n, measured), for values that are computed from a message, such as a
+            pseudo-measurement; NaN for missing components.
+        delay: parameter with the time, in s, from a measurement to the stamp of its message.
         linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
             moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
             the measurement (m,), its covariance (m, m) including noise, and its covariance with the
@@ -268,8 +271,8 @@ class Correction:
     If the state is very uncertain in one direction of its error, such as the heading, its distribution
     is not an ellipsoid: as a function of the error in this direction, the mean of the other components
     follows a curve. `slope` (t,) is the tangent of the curve, P d / d' P d with the covariance P and the
-    direction d. Small steps move every component separately: at zero, the derivative of the moved state
-    is the identity matrix.
+    direction d. At a step of zero, the derivative of the moved state by the step must be the identity
+    matrix, so that small steps move every component separately.
 
     Attributes:
         along: state -> d (t,).
@@ -310,8 +313,9 @@ class Model:
         augmentable: parameters that can be added to the state, with their kinds (linear or angle): those
             that motion and sensors read, except noise. See
             `fuselog.replay.inference.model.augmentation`.
-        calibration: parameters of the mounting, scale, bias and delay of sensors, each with a useful
-            standard deviation; an estimate with a larger standard deviation counts as undetermined.
+        calibration: parameters of the mounting, scale, bias and delay of sensors, each with the largest
+            standard deviation of a useful estimate; an estimate with a larger one counts as
+            undetermined.
         owned: parameters that belong to single topics, by name: the topic, and the general name of the
             parameter. See `fuselog.replay.inference.model.own_parameters`.
 

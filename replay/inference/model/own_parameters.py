@@ -109,7 +109,7 @@ def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
 def _transformed(
     model: Model, sensors: tuple[Sensor, ...], own: tuple[tuple[int, str], ...]
 ) -> tuple[Model, tuple[Sensor, ...]]:
-    """Replace the parameters of the sensors with these numbers by those of their topics.
+    """Make the sensors at these indices read the parameters of their topics.
 
     Raises BadInput if the names of two topics differ only in punctuation.
     """
@@ -194,9 +194,9 @@ class _Own:
 
 
 def _reading(function: OfModel, place: int, fields: Mapping[str, str]) -> OfModel:
-    """Make a function whose parameters, the argument at an index, are replaced by those of the topic.
+    """Wrap a function so that its argument `place`, the parameters, is replaced by a topic's parameters.
 
-    The function counts as unchanged if the given function is unchanged; see
+    The wrapper counts as unchanged as long as the wrapped function is unchanged; see
     `fuselog.replay.tracing.reads`.
     """
     pairs = tuple(fields.items())

@@ -1,4 +1,4 @@
-"""Options of every model, and the numbers that its functions read."""
+"""Options of every model, and the numerical parameters that its functions read."""
 
 from collections import namedtuple
 from collections.abc import Mapping

@@ -1,10 +1,10 @@
 """Augmentation of a state by persistent measurement errors for each point of a map.
 
-They model measurement noise that is not white: for example, ranges to one anchor, or between an anchor
-and a tag, have the same error for seconds. This is a transformation of models: each point or pair of
-points gets a component of the state, which is added to its measurements. The component is a random walk
-or a first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 2001, section 8.2.
+The errors model measurement noise that is not white: for example, the error of ranges to one anchor, or
+between an anchor and a tag, may stay the same for seconds. This is a transformation of models: each
+point or pair of points gets a component of the state, which is added to its measurements. The component
+is a random walk or a first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 2001, section 8.2.
 """
 
 import re
@@ -90,7 +90,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
 
 @lru_cache(maxsize=256)
 def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
-    """Return the motion with these errors, which move independently."""
+    """Return the motion with these errors, which change independently."""
     n, t = model.size, model.tangent
     noises, names, inner, noise_of = motion.noises, _names(errors), motion.move, motion.noise
     given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()

@@ -1,4 +1,4 @@
-"""Numbers that the functions of a model read, from parameters or from channels of a log."""
+"""Settings: the numbers that a model's functions read, from parameters or from channels of a log."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
@@ -144,9 +144,9 @@ def _stated(
 
 
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
-    """List the numbers of the tangent plane's origin that are neither given nor stated by channels.
+    """List the coordinates of the tangent plane's origin that are neither given nor stated by channels.
 
-    They are taken from the origin of the tangent plane into which fixes are projected, so that, for
+    The origin of the tangent plane into which fixes are projected then provides them, so that, for
     example, gravity matches the position.
     """
     stating = _stating(found)
@@ -161,7 +161,7 @@ def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, .
 
 
 def _of_origin(bound_model: BoundModel, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """Return the numbers of the tangent plane's origin, or typical values until the first fix."""
+    """Return the coordinates that `origin_parameters` lists; typical values until the first fix."""
     start = bound_model.model.start
     usual = start.parameters if start is not None else {}
     return {
@@ -200,7 +200,7 @@ def placed_settings(
 
 
 def _stating(found: Found) -> list[Topic]:
-    """List the topics whose channels may state numbers, in the order of precedence."""
+    """List the topics whose channels may state parameters, in order of precedence."""
     control = [] if found.control is None else [found.control]
     fallbacks, sensors = ([topic for _, topic in each] for each in (found.fallbacks, found.sensors))
     return [*fallbacks, *control, found.prior, *sensors]

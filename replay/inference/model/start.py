@@ -20,7 +20,7 @@ class Align(Protocol):
 @renamed(suspect="check_prior")
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Assumptions about the start in a log without a prior, that is, not recorded for the model.
+    """Assumptions about the start in a log without a prior, such as a log recorded for other purposes.
 
     The estimate starts at the first message that measures components of the state by name, with their
     covariance, such as a fix or a pose. Other components are zero, with the uncertainty given here.
@@ -33,14 +33,14 @@ class Start:
         align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state at the
             last of k fixes, or None if they do not determine the state yet. The path (k, n) starts at
             zero and follows from the control only; the fixes (k, 2) have covariances (k, 2, 2) and span
-            `span_s`. The estimate starts just after the last fix, so that no fix is used twice. It is
-            needed for a state that a single position does not determine.
-        find: (streams, parameters) -> `Started`, used instead of the above for a state that is found
-            from several messages. The streams are the first messages of a run and the maps, by the names
-            of their topics in the model. It raises BadInput if they do not determine the state. Such a
-            model needs a sensor.
-        check_prior: (streams, parameters) -> sentences on contradictions between the prior and these
-            messages, if the log has a prior. They are reported but are not errors.
+            `span_s`. The estimate starts just after the last fix, so that no fix is used twice. `align`
+            is needed for a state that a single position does not determine.
+        find: (streams, parameters) -> `Started`, used instead of a start at one message or by `align`,
+            for a state that is found from several messages. The streams are the first messages of a run
+            and the maps, by the names of their topics in the model. It raises BadInput if these messages
+            do not determine the state. A model with `find` needs a sensor.
+        check_prior: (streams, parameters) -> sentences on contradictions between the prior and the first
+            messages, if the log has a prior. The sentences are reported, but do not end the replay.
     """
 
     sigmas: Mapping[str, float]

@@ -77,7 +77,7 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 class GaussianSumBelief(NamedTuple):
-    """Gaussians of all runs (the first axis); the remaining members, of M, come first.
+    """Gaussians of all runs (the first axis); of the M members, the remaining ones come first.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).

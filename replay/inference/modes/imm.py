@@ -71,7 +71,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
     """Filter of every mode, and additional outputs.
 
     Attributes:
-        filter: the filter of every mode: ekf, iekf, ukf, lrkf, analytic or sqrt.
+        filter: the filter that every mode uses: ekf, iekf, ukf, lrkf, analytic or sqrt.
         smoothed_modes: whether to output, at the end of the run and on a separate topic, also the
             probabilities of the modes given all data; the state is not smoothed.
     """

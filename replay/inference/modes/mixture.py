@@ -87,11 +87,11 @@ class UpdateMixture(Protocol):
 
 
 def predicting(filters: Sequence[Steps]) -> PredictModes:
-    """Make `predict(belief, ...)`, which predicts the Gaussians of all modes and returns the success.
+    """Make `predict(belief, ...)`, which predicts the Gaussians of all modes; False means failure.
 
-    The arguments of steps are the number of a run, and Gaussians whose first axis is the run. Here and
-    in `mixture_update`, all Gaussians belong to one run, and the number of the mode replaces that of the
-    run.
+    Steps of a filter are called with the number of a run, and with Gaussians whose first axis is the
+    run. Here and in `mixture_update`, the first axis is the mode of one run, and the number of the mode
+    replaces that of the run.
     """
     predictions = tuple(each.predict for each in filters)
 

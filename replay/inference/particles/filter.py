@@ -174,7 +174,7 @@ class ParticleFilter(Filter):
         return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
-        """Report parameters of newly started runs that cannot change, on the topic `started`."""
+        """Report, on the topic `started`, estimated parameters that cannot change in new runs."""
         options = self.parameters
         moving = {*(options.estimate_time_s or ())}
         moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}

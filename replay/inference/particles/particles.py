@@ -2,7 +2,7 @@
 
 All noise is sampled: additive noise, noise of the control, and noise within the motion. A measurement
 weights the particles by its likelihood; they are resampled before a prediction if few of them are
-effective. Mean and covariance are those of the weighted particles, in the tangent space.
+effective. The estimate is the mean and covariance of the weighted particles, in the tangent space.
 
 Gordon, Salmond and Smith, IEE Proceedings F 140(2), 1993; systematic resampling: Kitagawa 1996.
 """

@@ -1,10 +1,10 @@
 """Progressive particle updates, which process a measurement in parts and spread resampled particles.
 
 If a measurement is much more accurate than the cloud, only a few particles keep weight; without noise of
-the motion, all later particles are copies of these. Therefore, the likelihood is first raised to a power
-for which enough particles stay effective, the particles are resampled, and the rest of the likelihood is
-applied. Resampled particles are spread by a Gaussian kernel and shrunk towards their mean, which
-preserves mean and covariance.
+the motion, all later particles are copies of these. Therefore, the particles are first weighted by a
+power of the likelihood for which enough of them stay effective; after they have been resampled, the rest
+of the likelihood is applied in the same way. Resampled particles are spread by a Gaussian kernel and
+shrunk towards their mean, which preserves mean and covariance.
 
 Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised particle filters", 2001, in
 Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
@@ -103,7 +103,7 @@ class Look(Protocol):
 
 
 class Likelihood(Protocol):
-    """Function that returns log p at particle i of states (N, n); NaN if it predicts no measurement."""
+    """Function that returns log p at particle i of states (N, n); NaN if p is undefined there."""
 
     def __call__(
         self, states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int, /

@@ -1,4 +1,4 @@
-"""Processing of messages by one model and one method, from events to reprocessing.
+"""Processing of messages by one model and one method: events, recursion, start and reprocessing.
 
 Begin with `recursion`.
 """

@@ -1,7 +1,8 @@
 """Starts that hardly depend on parameters, so that likelihoods can be compared.
 
-A start may depend on the parameters: if it is aligned with the first fixes, it uses more messages if
-their stated noise is larger; likelihoods would then be those of different messages.
+A start may depend on the parameters. For example, an alignment with the first fixes uses more fixes if
+the noise parameters are larger; likelihoods for different parameters would then cover different
+messages.
 """
 
 from collections.abc import Collection, Iterable, Sequence

@@ -115,7 +115,8 @@ def filter_events(
         settings: (1 + sensors, fields); see `settings_of`.
 
     Returns:
-        The events, and whether each message (n,) of the block is skipped because it lacks a covariance.
+        The events, and whether each message (n,) of the block is skipped because it lacks a covariance
+        or a finite control.
     """
     merged, control = block.events, bound_model.model.control
     width, start = data_columns(bound_model)
@@ -158,7 +159,7 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """Messages of one topic: data (n, width), source, reference, and marks of missing covariances."""
+    """Messages of one topic: data (n, width), source, target, and whether each is skipped."""
 
     data: Floats
     source: Integers
@@ -192,7 +193,7 @@ def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
-    """Read a control into the columns of its components; NaN for components of fallbacks."""
+    """Read a control into the columns of its components; NaN for components that fallbacks replace."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
     read = control_numbers(control, ragged)
@@ -217,7 +218,7 @@ def sensor_table(
 ) -> Table:
     """Read the messages of a sensor: measurement, reference and covariance; see `update.message_layout`.
 
-    Messages without a covariance, or with only NaN, are marked as not used.
+    Messages that lack a covariance, or have no finite component, are marked as not used.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -361,14 +362,14 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 def passed_over(
     name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
-    """Report messages that were skipped because they lack a covariance; [] if none can lack one.
+    """Report skipped messages, which lack a covariance or a finite control; [] if none can be skipped.
 
     Args:
         name: name of the filter.
         bound_model: the bound model, with the sensors of the log.
         found: its topics.
         block: messages of these topics.
-        without_covariance: whether each message (n,) lacks its covariance.
+        without_covariance: whether each message (n,) is skipped; see `filter_events`.
     """
     control = bound_model.model.control
     drops = control is not None and control.interpolated

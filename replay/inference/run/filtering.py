@@ -186,7 +186,7 @@ class Filter:
 
     @cached_property
     def steps(self) -> Steps:
-        """Steps of its loop."""
+        """Steps that the loop over the runs calls."""
         return _steps(self.bound_model, self.method)
 
     @property
@@ -285,7 +285,7 @@ class Filter:
 
     @cached_property
     def beside_settings(self) -> Hashable:
-        """Definition of the filter, except settings that only the loop over the runs reads."""
+        """Key of the filter's definition, except settings that only the loop over the runs reads."""
         names = {*number_fields(self.bound_model.model.parameters)} - {"gate_probability"} | {
             "of_topics"
         }

@@ -26,7 +26,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """Sentence to report, its stamps (runs,), and the runs to which it applies (runs,)."""
+    """Sentence to report, its stamp in each run (runs,), and whether it applies to the run (runs,)."""
 
     text: str
     time_ns: Integers
@@ -99,7 +99,7 @@ def first_of_runs(
 
 
 def heads_of_runs(ragged: Ragged, count: int) -> Ragged:
-    """Return the first messages of every run, at most `count`."""
+    """Return the first messages of every run, at most `count` per run."""
     is_early = np.arange(len(ragged)) < (ragged.offsets[:-1] + count)[run_of_rows(ragged.offsets)]
     return Ragged(ragged.stream.take(is_early), ragged_rows(is_early, ragged.offsets))
 

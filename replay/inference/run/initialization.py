@@ -102,7 +102,7 @@ class Initializer:
 
     @property
     def _aligns(self) -> bool:
-        """Whether several fixes must determine the whole state, and are able to."""
+        """Whether the whole state must be determined from several fixes, and can be."""
         model = self.bound_model.model
         kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
         can_align = bool(model.start and model.start.align)
@@ -212,7 +212,7 @@ class Initializer:
         return of_runs(stream, has_begun), facts
 
     def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
-        """Report the components that fixes did not determine, for runs that start without alignment."""
+        """Report the components that fixes do not determine, for runs that start without alignment."""
         _, sensor, _ = self._measuring[0]
         measured = sensor.measured
         names = ", ".join(name for name in self.bound_model.model.state if name not in measured)

@@ -1,7 +1,7 @@
 """Loops over the events of a run, shared by filters, trackers and networks.
 
-Events may be messages, scans of detections or activities of nodes. All have `offsets` (runs + 1,) and
-`time_ns` (n,); they are the field `events` in the inputs of a recursion.
+Events may be messages, scans of detections, or measurements and transmissions of a network's nodes. All
+have `offsets` (runs + 1,) and `time_ns` (n,); they are the field `events` in the inputs of a recursion.
 """
 
 from typing import Protocol

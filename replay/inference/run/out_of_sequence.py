@@ -152,7 +152,7 @@ def reprocessing(
             innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: KeptMessages) -> int:
-        """Return the last row of the newest stamp that has estimates."""
+        """Return the row of the last message at the newest stamp that has an estimate."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
             row -= 1
@@ -311,7 +311,7 @@ def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
     """Set the log times of estimates to the arrival times of the events that requested them.
 
-    Each run has one estimate for each of these events after its prior, or for only the first ones.
+    Each run has one estimate for each of these events after its prior, or only for the first of them.
 
     Args:
         estimates: estimates of the filter.

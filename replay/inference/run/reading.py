@@ -1,4 +1,4 @@
-"""Descriptions of the inputs of an estimator: numbers of topics, and parameters with their roles."""
+"""Descriptions of an estimator's inputs: components of topics, and parameters with their roles."""
 
 from functools import partial
 
@@ -126,7 +126,7 @@ def _augmentable(bound_model: BoundModel, found: Found) -> dict[str, tuple[str, 
 
 
 def _calibration(bound_model: BoundModel, found: Found) -> dict[str, float]:
-    """Return the calibration parameters that are used, with their useful standard deviations."""
+    """Return the calibration parameters in use, with the largest useful standard deviation of each."""
     used = set().union(*(read for _, read in _readers(bound_model, found)))
     used |= {sensor.delay for sensor, _ in found.sensors}
     return {name: sigma for name, sigma in bound_model.model.calibration.items() if name in used}

@@ -51,7 +51,7 @@ class FilterEvents(NamedTuple):
         offsets: (runs + 1,).
         time_ns: (n,) stamps.
         source: (n,) number of the sensor, CONTROL or NOTHING.
-        data: (n, width) numbers of the message, see `update.message_layout`; with an interpolated
+        data: (n, width) contents of the message, see `update.message_layout`; with an interpolated
             control, the last columns are the control.
         wants_estimate: (n,) whether the event requests an estimate.
         target_id: (n,) number of the target of the message, or 0.
@@ -163,8 +163,8 @@ def no_results(
 ) -> tuple[EstimateRows, InnovationRows]:
     """Allocate results; the rows of run r begin at due[r] and recorded[r].
 
-    All columns share one array: with many arrays, the operating system would map every page separately,
-    which takes half as long as running a small filter.
+    All columns share one array. With many arrays, the operating system would map the pages of each array
+    separately, which takes half as long as running a small filter.
 
     Args:
         due: (runs + 1,) offsets of the estimates.

@@ -15,7 +15,7 @@ EARLY = 1000  # intervals of output: a prior that is older than this does not st
 
 
 def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
-    """Test whether each event (n,) requests an estimate; events of only the control may not."""
+    """Test whether each event (n,) requests an estimate; at stamps of only the control, it may not."""
     control = bound_model.model.control
     if control is None or control.estimates or not bound_model.sensors:
         return events.wants_estimate
@@ -133,9 +133,9 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Replace control samples with the same stamp by their mean, so that all of them count.
+    """Replace control samples that have the same stamp by their mean, so that none is lost.
 
-    A recorder may give two samples the same stamp; one of them would otherwise have no effect.
+    A recorder may give two samples the same stamp; otherwise, one of them would have no effect.
 
     Args:
         events: events in the order of their stamps.

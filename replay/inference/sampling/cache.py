@@ -48,8 +48,8 @@ def cached_set(name: SetName, report: Report = silent) -> Array:
 
     Args:
         name: the set.
-        report: function that is called with messages about the computation of the set, and if it cannot
-            be stored.
+        report: function that is called with messages about the computation of the set, and with a
+            message if the set cannot be stored.
 
     Raises:
         BadInput: no such set exists, see `check_count`.

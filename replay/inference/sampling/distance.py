@@ -9,7 +9,8 @@ D is a small difference of large terms. With weights w_i and d = |s_i - s_j|^2, 
     D3 = B^2 / 2 sum_ij w_i w_j E2(d / 4B^2),
     D2 = sum_i w_i integral_0^B b (2b^2 / (1 + 2b^2))^(N/2) exp(-|s_i|^2 / (2 + 4b^2)) db.
 
-Terms that do not depend on the samples are summed once; E2 - 1 and exp - 1 are summed over the samples.
+To keep digits, 1 is subtracted from E2 and exp before they are summed over the samples; the terms that
+do not depend on the samples are computed once.
 """
 
 from functools import lru_cache

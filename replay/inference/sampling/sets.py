@@ -22,7 +22,7 @@ _UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
-    """Points (sets, L, N) and weights (sets, L); use number u reads the set (u - first) * stride."""
+    """Points (sets, L, N) and weights (sets, L); event number e uses the set (e - first) * stride."""
 
     points: Array
     weights: Array
@@ -38,7 +38,7 @@ def sets_by_runs(
     Args:
         sampler: sampler that draws the sets.
         generators: generators of the runs; a randomised sampling needs and advances all of them.
-        offsets: (runs + 1,); run r has the uses offsets[r]:offsets[r + 1].
+        offsets: (runs + 1,); run r has the events offsets[r]:offsets[r + 1], each of which uses one set.
     """
     runs = len(offsets) - 1
     if not sampler.redrawn:

@@ -78,12 +78,12 @@ class Trajectory(NamedTuple):
 
     Attributes:
         mean: (nodes, n) states.
-        noises: noises of the steps to all nodes, from the previous pass; that pass had the smallest
-            cost, or this pass uses the same states again.
+        noises: noise covariances of the steps to all nodes, from the previous pass. If the costs of the
+            two passes are compared, the previous pass was at the states `kept`.
         kept: (nodes, n) states with the smallest cost so far.
         node: (events,) node of each event's stamp.
-        scale: (nodes, t) variances of the start; divided by the damping, they are the variances of the
-            pseudo-measurements by which damping keeps the current states.
+        scale: (nodes, t) variances of the start; damping adds pseudo-measurements of the current states,
+            whose variances are these, divided by the damping.
         loss: (2,) index in LOSSES, and scale of the loss.
         damping: (1,) damping of this pass.
         cost, held: (1,) costs of the trajectory with its own noise, and with the noise at `kept`.
@@ -107,7 +107,7 @@ class Trajectory(NamedTuple):
 
 
 def affine_steps(bound_model: BoundModel) -> Steps:
-    """Make the steps of the affine filter about a `Trajectory`, which is the only set of `memory`."""
+    """Make the steps of the affine filter about a `Trajectory`, which `memory` gets as its only set."""
     sensors = tuple(affine_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
     steps = gaussian_filter(
         bound_model, affine_motion(bound_model), sensors, partial(workspace, bound_model)
@@ -187,7 +187,7 @@ class Carry(Protocol):
 
 
 class Reach(Protocol):
-    """Function that computes the offset of a node from its origin (n,); returns if it is defined."""
+    """Function that computes the offset of a node from its origin (n,), and whether it is defined."""
 
     def __call__(self, trajectory: "Trajectory", node: int, origin: Floats, /) -> bool: ...
 

@@ -185,7 +185,7 @@ def compose(
 
 
 class Later(NamedTuple):
-    """Node after a piece: whether each run has one, and the smoothed nodes, one row per run."""
+    """Node after a piece: whether each run has such a node, and the smoothed nodes, one row per run."""
 
     is_there: Integers
     nodes: Nodes

@@ -93,7 +93,7 @@ class Ended(NamedTuple):
 
 @lru_cache(maxsize=64)
 def searching(bound_model: BoundModel) -> tuple[OverRuns, Steps]:
-    """Make the search, which is compiled when first called, and the steps, which allocate its memory."""
+    """Make the search, which is compiled when first called, and the steps, whose memory it uses."""
     steps = affine_steps(bound_model)
     settings_of = reading_settings(number_fields(bound_model.model.parameters))
     title = title_of(bound_model.model, "iterated smoother")

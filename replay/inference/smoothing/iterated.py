@@ -52,8 +52,8 @@ class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
     Attributes:
         start: start of the search: smoother (result of the extended smoother), motion (the prior's mean,
             propagated by the motion) or prior (the prior's mean at all stamps).
-        damping: damping of the first step, in units of the information at the start; with 0, damping is
-            used only if the cost would rise.
+        damping: damping of the first step, in units of the information at the start; with 0, damping
+            begins only when a step would raise the cost.
         loss: loss function of residuals; huber and cauchy down-weight large residuals.
         loss_scale: length of a whitened residual above which huber and cauchy down-weight it.
         iterations: maximum number of iterations.
