@@ -133,7 +133,7 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Replace control samples that have the same stamp by their mean, so that none is lost.
+    """Replace control samples that have the same stamp by their mean, so that each has an effect.
 
     A recorder may give two samples the same stamp; otherwise, one of them would have no effect.
 
