@@ -299,7 +299,7 @@ class RunMonitor:
         return output if kept.all() else _kept(output, kept)
 
     def _find_silence(self, failed: set[int]) -> None:
-        """Record a failure for each run that has messages but no estimates, or none at its end.
+        """Record a failure for each run that has messages but no estimates, or no estimates at its end.
 
         Runs that have already failed are excluded.
         """

@@ -418,7 +418,7 @@ class Model:
 
     @cached_property
     def tangent(self) -> int:
-        """Number of components of its tangent space: three for an orientation, which has four."""
+        """Number of components of the tangent space: an orientation has three, but four in the state."""
         return tangent_size(self.kinds)
 
     @property

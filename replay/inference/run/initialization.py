@@ -254,7 +254,7 @@ class Initializer:
         origins: Floats | None,
         begun: "Begun",
     ) -> list["Fact"]:
-        """Start all runs at the states that the model finds; raise BadInput if it finds none."""
+        """Start all runs at the states that the model finds; raise BadInput if it finds no state."""
         model = self.bound_model.model
         assert model.start is not None
         assert model.start.find is not None

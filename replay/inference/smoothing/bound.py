@@ -231,7 +231,7 @@ class BoundFilter(Filter):
         """Make the steps to the priors of runs that reach their first node.
 
         The noise of such a step is the prior's covariance. If the first node has the stamp of the prior,
-        its step is replaced by this step.
+        the step to the prior replaces the step to that node.
         """
         first, is_new = offsets[:-1], ~kept.has_begun & (np.diff(offsets) > 0)
         is_there = is_new.copy()
