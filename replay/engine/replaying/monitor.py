@@ -289,7 +289,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """Remove the rows of each run from its first invalid row, or from the end of the run."""
+        """Remove the rows of each run from its first invalid row on, or after the run has ended."""
         if first_bad is None and not self._has_ends:
             return output
         run = run_of_rows(output.offsets)

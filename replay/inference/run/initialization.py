@@ -54,7 +54,7 @@ class Initializer:
         name: part of the names of its output topics after `/estimates/`.
         found: its topics.
         bound_model: the bound model, with the sensors of the log.
-        settings: (1 + sensors, fields), numbers of motion and sensors.
+        settings: (1 + sensors, fields), parameters of motion and sensors.
         assumed: parameters of motion and sensors that the log does not state.
     """
 

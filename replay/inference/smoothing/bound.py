@@ -176,7 +176,7 @@ class BoundFilter(Filter):
         generators: tuple[Samples, ...],
         events: FilterEvents,  # noqa: ARG002
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Yield all runs, with the function that makes the working memory of a core with the truths."""
+        """Yield all runs, and the function that makes a core's working memory, including the truths."""
         yield None, partial(self.steps.memory, generators)
 
     def no_results(
