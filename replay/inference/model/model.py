@@ -135,7 +135,7 @@ class Motion:
     moments: MotionMoments | None = None
 
     def triangle(self, tangent: int) -> int:
-        """Return the length of `noise` if it is a triangle, for a state of tangent size `tangent`."""
+        """Return the number of entries of `noise` if it is a triangle; `tangent` is the tangent size."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
