@@ -25,7 +25,7 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def over_columns(ufunc: np.ufunc, matrix: AnyArray) -> AnyArray:
-    """Reduce each row of a matrix column by column, 30 times as fast as along its last axis.
+    """Reduce each row of a matrix by combining whole columns, which is 30 times as fast as row by row.
 
     Args:
         ufunc: the reduction, such as np.logical_and for `all`.

@@ -1,9 +1,9 @@
 """Random numbers inside kernels by the generator Philox, with a counter and a key for each run.
 
-A kernel that creates no arrays cannot use a NumPy generator; the state of this one is a few words per
-run. It generates the same words as `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random
-numbers: as easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method
-for generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
+A kernel that creates no arrays cannot use a NumPy generator; the state of Philox is a few words per run.
+This generator produces the same words as `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel
+random numbers: as easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat
+method for generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
 """
 
 from collections.abc import Iterable
@@ -66,7 +66,7 @@ def _ziggurat() -> tuple[Floats, Floats, Floats]:
     """Compute layers of equal area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
 
     The lowest layer, number 0, includes the tail; its right end is that of a rectangle with the layer's
-    area.
+    area. The inner share of a layer is the part of its width that is entirely below the curve.
     """
     area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * _BEYOND
     ends = np.zeros(_LAYERS + 1)

@@ -151,8 +151,9 @@ def c_lines(
     """Yield lines that assign the named nodes, such as `const double name = ...;`, in order.
 
     Args:
-        named: the nodes by name; a name that is not an identifier, such as `P[0][0]`, is assigned to.
-        inputs: names of the inputs of the graph, by place.
+        named: the nodes by name; a name that is not an identifier, such as `P[0][0]`, is assigned to
+            without a declaration.
+        inputs: names of the inputs of the graph, by position.
         precision: precision of the numbers.
         of: first letter of the names of auxiliary variables, which are assigned first.
         known: names of nodes that earlier lines define.

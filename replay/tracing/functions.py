@@ -291,7 +291,8 @@ def _given(trace: Trace, argument: int, kind: Argument) -> Any:
 def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argument]) -> Result:
     """Call a function with traced numbers, on every path through its conditions.
 
-    Raises BadInput, with the line and advice, if it does something that a graph cannot represent.
+    Raises BadInput, with the line and advice, if the function does something that a graph cannot
+    represent.
     """
     ways = 0
 

@@ -201,7 +201,7 @@ def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Nod
 
     Args:
         outputs: outputs of the loop.
-        varies: (place) -> whether this input changes between iterations.
+        varies: (position of an input) -> whether this input changes between iterations.
     """
     varying, costly, wanted = set[Node](), set[Node](), set(outputs)
     nodes = needed(outputs)

@@ -147,7 +147,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
-    """Trace `np.interp` over a known table, by the line segment after the last knot before x."""
+    """Trace `np.interp` over a known table, on the segment that begins at the last knot before x."""
     known_x, known_y = (_known("np.interp", each) for each in (xp, fp))
     found = where(np.isnan(x), x, known_y[0] if left is None else left)
     for k in range(len(known_x) - 1):

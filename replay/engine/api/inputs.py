@@ -111,7 +111,7 @@ class OneRun(Mapping[str, Stream]):
     run: int
 
     def stated(self, topic: str, name: str) -> float:
-        """Return the parameter `name`, or what the channel of `topic` states; see `Given.stated`."""
+        """Return the parameter `name`, or the number that channel `topic` states; see `Given.stated`."""
         return self.given.stated(topic, name)
 
     def prior(self, topic: str) -> tuple[int, Floats, Floats]:

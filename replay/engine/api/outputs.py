@@ -161,7 +161,7 @@ class Outputs:
         )
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
-        """Make the output streams of one block; of several estimates with one stamp, keep the last."""
+        """Make the output streams of one block; only the last estimate of a stamp is kept."""
         # invalid covariances are found and reported by the replay
         is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
         rows = np.flatnonzero(is_estimate)

@@ -247,7 +247,7 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Setting]) -> "AnyEstimator":  # noqa: ARG002
-        """Return the estimator for `label` and `settings`, which is another one for a foreign filter."""
+        """Return the estimator for `label` and `settings`: itself, except for a foreign filter."""
         return self
 
     # an estimator of any model overrides these two: `_OfAnyModel`
@@ -260,7 +260,7 @@ class Estimator(Generic[ParametersType]):
         name: str,  # noqa: ARG002
         variant: Mapping[str, Setting],  # noqa: ARG002
     ) -> dict[str, type[Parameters]]:
-        """Return the parameters of `name` with `variant` by model; empty if no model is involved."""
+        """Return the parameters of `name` with `variant`, by model; empty if it uses no models."""
         return {}
 
 

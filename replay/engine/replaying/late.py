@@ -5,8 +5,8 @@ In order of arrival (log time), measurement stamps (publish time) go back whenev
 policies:
 
     drop            skip a message that is older than the newest one processed
-    wait:SECONDS    hold back every message until this time after its stamp; then as drop
-    rewind:SECONDS  reprocess the messages after it, by at most this time; skip older messages
+    wait:SECONDS    hold back every message until this time after its stamp; then do the same as drop
+    rewind:SECONDS  go back by at most this time, and reprocess all later messages; skip older messages
 
 Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Messages for
 which newer messages waited are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator

@@ -289,7 +289,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """Remove the rows of each run from its first invalid row, or from the end of the run."""
+        """Remove the rows of each run from its first invalid row on, or after the run has ended."""
         if first_bad is None and not self._has_ends:
             return output
         run = run_of_rows(output.offsets)
@@ -299,7 +299,7 @@ class RunMonitor:
         return output if kept.all() else _kept(output, kept)
 
     def _find_silence(self, failed: set[int]) -> None:
-        """Record a failure for each run that has messages but no estimates, or none at its end.
+        """Record a failure for each run that has messages but no estimates, or no estimates at its end.
 
         Runs that have already failed are excluded.
         """

@@ -46,7 +46,7 @@ def refuse_named_truths(
         label: label of the estimator.
         renamed: topics by role.
         topics: topics of the log.
-        own: the roles of truths.
+        own: the roles that are truths, for which a truth may be selected.
     """
     truths = truths_among(topics)
     for role, name in renamed.items():

@@ -179,7 +179,7 @@ def filled_rows(
 
     Args:
         offsets: (runs + 1,), first row of each run.
-        end: (runs,), end of its filled rows.
+        end: (runs,), end of the filled rows of each run.
 
     Returns:
         The filled rows (n,), or a slice if all rows are filled, and their offsets (runs + 1,).

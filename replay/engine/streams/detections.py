@@ -1,6 +1,6 @@
 """Positions of detections in the local tangent plane, from their scans and the sensor's position.
 
-The metadata of a moving sensor's scans names the topic of the sensor's position, as ORIGIN.
+The metadata of a moving sensor's scans names the topic of the sensor's position, under the key ORIGIN.
 """
 
 import numpy as np

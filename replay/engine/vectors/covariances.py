@@ -92,7 +92,7 @@ def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
 
 
 def _factors(covariance: Array) -> Array:
-    """Compute lower Cholesky factors (..., n, n); NaN from the first pivot that is not positive on.
+    """Compute lower Cholesky factors (..., n, n), which are NaN from the first nonpositive pivot on.
 
     A component of infinite variance is treated as independent of all others.
     """

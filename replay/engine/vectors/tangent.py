@@ -250,7 +250,7 @@ _bracket = compiled(bracket)
 def rotation_vector(x: Floats) -> Floats:
     """Convert unit complex numbers (n, 2) to angles, or unit quaternions (n, 4) to rotation vectors.
 
-    In rad. x and -x are the same rotation, so the angle of an axis is in [-pi/2, pi/2].
+    The results are in rad. x and -x are the same rotation, so the angle of an axis is in [-pi/2, pi/2].
     """
     folded = x * np.where(x[:, :1] < 0.0, -1.0, 1.0)
     length = np.linalg.norm(folded[:, 1:], axis=1, keepdims=True)

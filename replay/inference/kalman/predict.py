@@ -76,7 +76,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Linear
     """Make the function that moves a state and computes the requested derivatives.
 
     Args:
-        model: model, which has the kinds of state and control.
+        model: the model, for the kinds of state and control.
         motion: motion whose `move` is differentiated.
         by_state: whether F, the derivative by the state, is requested.
 
@@ -108,7 +108,7 @@ def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
     """Make the function that adds the noise of a motion, of any kind, to a covariance.
 
     Args:
-        model: model, which has the sizes of tangent space and control.
+        model: the model, for the sizes of tangent space and control.
         motion: the motion.
 
     Returns:

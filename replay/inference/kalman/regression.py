@@ -72,8 +72,8 @@ class SampleMemory(NamedTuple):
         offsets: (L, N) tangent vectors from the mean to the samples.
         point, noise: (n,) one sample, and (noises,) the variances of the noise.
         values: (L, v) values of the function, as tangent vectors from a centre.
-        centre, shift: (n of the values,) and (v,): the mean of the values, and the weighted mean of
-        their tangent vectors.
+        centre, shift: mean of the values, in the space of the values, and weighted mean (v,) of their
+            tangent vectors.
         joint: (N, v) covariance of points and values, if points are on axes.
     """
 

@@ -145,7 +145,7 @@ def sensor_derivative(model: Model, sensor: Sensor) -> LineariseSensor:
     It fills `predicted` (m,), `rows` (m, t) and `noise_gain` in the workspace.
 
     Args:
-        model: model, which has the kinds of the state.
+        model: the model, for the kinds of the state.
         sensor: the sensor, with m measured components.
     """
     if sensor.jacobian is not None:

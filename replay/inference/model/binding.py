@@ -247,7 +247,7 @@ def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[s
     name in the model.
 
     Returns:
-        The option with which a topic is used, by topic.
+        By topic, the option that makes the model use it.
     """
     kinds = {sensor.topic: sensor.schema for sensor in model.all_sensors}
     if model.control is not None:

@@ -172,7 +172,7 @@ class Checked(tuple[str, ...]):
 def _checked(
     model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
 ) -> Checked:
-    """Describe, for every function, the checks that were made and those without a declaration."""
+    """Describe the checks that were made of each function, and list what is not checked."""
     sentences = [f"{model.summary}: {len(calls)} functions at {states} states"]
     for call, part in zip(calls, parts, strict=True):
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
@@ -245,7 +245,7 @@ def _derivatives_of(call: _Call) -> Derivatives:
 def _check_derivatives(
     call: _Call, exact: Derivatives, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
-    """Compare derivatives with central differences and handwritten ones; return that by the state."""
+    """Compare derivatives with central differences and handwritten ones; return those by the state."""
     jacobians = exact(state, others)
     for index, (name, jacobian) in enumerate(jacobians.items()):
         for column, slopes in enumerate(_slopes(call, [state, *others], index).T):

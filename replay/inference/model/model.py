@@ -135,7 +135,7 @@ class Motion:
     moments: MotionMoments | None = None
 
     def triangle(self, tangent: int) -> int:
-        """Return the length of `noise` if it is a triangle, for a state of tangent size `tangent`."""
+        """Return the number of entries of `noise` if it is a triangle; `tangent` is the tangent size."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
@@ -418,7 +418,7 @@ class Model:
 
     @cached_property
     def tangent(self) -> int:
-        """Number of components of its tangent space: three for an orientation, which has four."""
+        """Number of components of the tangent space: an orientation has three, but four in the state."""
         return tangent_size(self.kinds)
 
     @property

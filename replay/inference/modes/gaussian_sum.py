@@ -310,7 +310,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _gaussian_sum(name: str, variant: str, members: int) -> Method:
-    """Make the method that uses up to `members` filters of this name."""
+    """Make the method that uses the filter of this name for up to `members` members."""
     inner = filter_with(name, variant)
 
     def steps(bound_model: BoundModel) -> Steps:

@@ -66,7 +66,7 @@ class InteractingMemory(NamedTuple):
         filters: memory of every mode's filter.
         rates, transition: (M (M - 1),), and Pi (M, M).
         weights: (M, M) row j has the weights of all modes in the mixture of mode j.
-        predicted: (M,) logarithms of c.
+        predicted: (M,) logarithms of c, the predicted probabilities.
         mixture: memory for the modes' Gaussians.
     """
 

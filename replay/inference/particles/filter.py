@@ -1,4 +1,4 @@
-"""Particle filter as an estimator, seeded by the first measurement of a run, and as a method."""
+"""Particle filter: its method, and the filter that seeds each run by its first measurement."""
 
 from collections.abc import Mapping
 from functools import lru_cache

@@ -103,7 +103,7 @@ class Look(Protocol):
 
 
 class Likelihood(Protocol):
-    """Function that returns log p at particle i of states (N, n); NaN if p is undefined there."""
+    """Function that returns log p for particle i of states (N, n); NaN if p is undefined for it."""
 
     def __call__(
         self, states: Floats, i: int, data: Floats, parameters: Settings, own: SensorMemory, size: int, /

@@ -261,8 +261,8 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 def _likelihood(bound_model: BoundModel, number: int) -> Likelihood:
     """Make `likelihood(states, i, data, parameters, own, size)`, the log-likelihood at particle i.
 
-    It uses the likelihood function of the model, or else Gaussian noise; it returns NaN if the particle
-    cannot predict the measurement.
+    It uses the likelihood function of the model, otherwise Gaussian noise. The result is NaN if the
+    particle cannot predict the measurement.
     """
     sensor = bound_model.sensors[number]
     if sensor.log_likelihood is None:

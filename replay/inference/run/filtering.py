@@ -164,7 +164,7 @@ class Filter:
         return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """Make the initial state of every run from its prior; a run without a valid one cannot start."""
+        """Make the initial state of every run from its prior; runs that lack a valid prior fail."""
         model = self.bound_model.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))

@@ -54,7 +54,7 @@ class Initializer:
         name: part of the names of its output topics after `/estimates/`.
         found: its topics.
         bound_model: the bound model, with the sensors of the log.
-        settings: (1 + sensors, fields), numbers of motion and sensors.
+        settings: (1 + sensors, fields), parameters of motion and sensors.
         assumed: parameters of motion and sensors that the log does not state.
     """
 
@@ -254,7 +254,7 @@ class Initializer:
         origins: Floats | None,
         begun: "Begun",
     ) -> list["Fact"]:
-        """Start all runs at the states that the model finds; raise BadInput if it finds none."""
+        """Start all runs at the states that the model finds; raise BadInput if it finds no state."""
         model = self.bound_model.model
         assert model.start is not None
         assert model.start.find is not None

@@ -290,7 +290,7 @@ class OutOfSequenceFilter:
 
 
 def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
-    """Report the out-of-sequence messages, with the number of updates that each caused to repeat.
+    """Report the out-of-sequence messages, and how many updates were repeated because of each.
 
     Args:
         name: name of the estimator.

@@ -27,7 +27,7 @@ def reading_of(bound_model: BoundModel, found: Found, settings: Floats) -> Readi
     Args:
         bound_model: the bound model before tracing, with the sensors of the log.
         found: its topics.
-        settings: (1 + sensors, fields), numbers of motion and sensors.
+        settings: (1 + sensors, fields), parameters of motion and sensors.
     """
     model = bound_model.model
     drives: dict[str, Control] = {}

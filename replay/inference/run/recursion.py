@@ -169,7 +169,7 @@ def no_results(
     Args:
         due: (runs + 1,) offsets of the estimates.
         recorded: (runs + 1,) offsets of the innovations.
-        model: model, which has the sizes of state and tangent space.
+        model: the model, for the sizes of state and tangent space.
         innovation_size: number of components that all sensors measure.
     """
     places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)

@@ -32,7 +32,7 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Generators, ...], offsets: Integers
 ) -> Iterator[tuple[RowSlice, tuple[SampleSets, ...]]]:
-    """Yield slices of runs with their samples; the largest sampled function limits their size.
+    """Yield slices of runs with their samples; the largest sampled function limits the slices.
 
     Args:
         samplers: one for each sampled function.

@@ -87,7 +87,7 @@ def last_of_stamps(events: FilterEvents) -> Booleans:
 def output_times(
     offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
 ) -> FilterEvents:
-    """Make events that are only times; events offsets[r]:offsets[r + 1] belong to run r.
+    """Make events that consist only of a time; events offsets[r]:offsets[r + 1] belong to run r.
 
     Args:
         offsets: (runs + 1,).
@@ -133,7 +133,7 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 
 
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
-    """Replace control samples that have the same stamp by their mean, so that each has an effect.
+    """Replace control samples that have the same stamp by their mean, so that no sample is lost.
 
     A recorder may give two samples the same stamp; otherwise, one of them would have no effect.
 

@@ -33,7 +33,7 @@ class SampleSets(NamedTuple):
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
 ) -> Iterator[tuple[RowSlice, SampleSets]]:
-    """Yield the sets of all runs, for several runs together, limited by memory.
+    """Yield slices of runs with their sample sets; available memory limits the size of a slice.
 
     Args:
         sampler: sampler that draws the sets.

@@ -242,7 +242,7 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> GoBack:
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)
 
     def go_back(mean: Floats, covariance: Floats, nodes: Nodes, node: int, work: BackMemory) -> None:
-        """Move the Gaussian of `work` from a node to the previous one, given its filtered Gaussian."""
+        """Move the Gaussian of `work` back to the previous node, given the filtered Gaussian there."""
         gain, rest, step, change = nodes.gain[node], nodes.rest[node], work.step, work.change[0]
         work.slope[:] = nodes.slope[node]
         compare(nodes.predicted[node], work.mean, work.covariance, work)

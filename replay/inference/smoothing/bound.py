@@ -176,7 +176,7 @@ class BoundFilter(Filter):
         generators: tuple[Samples, ...],
         events: FilterEvents,  # noqa: ARG002
     ) -> Iterator[tuple["RowSlice | None", Callable[[], CoreMemory]]]:
-        """Yield all runs, with the function that makes the working memory of a core with the truths."""
+        """Yield all runs, and the function that makes a core's working memory, including the truths."""
         yield None, partial(self.steps.memory, generators)
 
     def no_results(
@@ -231,7 +231,7 @@ class BoundFilter(Filter):
         """Make the steps to the priors of runs that reach their first node.
 
         The noise of such a step is the prior's covariance. If the first node has the stamp of the prior,
-        its step is replaced by this step.
+        the step to the prior replaces the step to that node.
         """
         first, is_new = offsets[:-1], ~kept.has_begun & (np.diff(offsets) > 0)
         is_there = is_new.copy()
