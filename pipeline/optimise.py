@@ -47,9 +47,9 @@ def minimum(
     """Minimise a cost from a start, by L-BFGS-B, or by the Nelder-Mead simplex if the cost is rough.
 
     Args:
-        cost: of points (n, k).
-        start: (k,).
-        bounds: lower (k,) and upper (k,).
+        cost: function that computes the costs (n,) of points (n, k).
+        start: (k,) the point at which the search starts.
+        bounds: lower bounds (k,) and upper bounds (k,).
         is_smooth: whether the cost has a usable gradient.
         tolerance: the relative decrease of a smooth cost below which the search stops.
 
@@ -128,10 +128,10 @@ def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floa
     """Evaluate a cost at a point and at steps on both sides of it.
 
     Args:
-        cost: of points (n, k).
+        cost: function that computes the costs (n,) of points (n, k).
         point: (k,).
         places: indices of m of the k coordinates.
-        steps: the step along each of these, one for all of them or (m,).
+        steps: one step for all these coordinates, or (m,) a step for each.
     """
     return _differences(cost, point, list(places), steps, [])[0]
 
@@ -142,13 +142,14 @@ def curvature(
     """Compute the second derivatives of a cost at a point with respect to m of its coordinates.
 
     Args:
-        cost: of points (n, k).
+        cost: function that computes the costs (n,) of points (n, k).
         point: (k,).
         places: indices of m of the k coordinates.
-        steps: steps of the finite differences, one for all coordinates or (m,).
+        steps: one step of the finite differences for all these coordinates, or (m,) a step for each.
 
     Returns:
-        The costs around the point, and the derivatives (m, m); not finite if a cost is not finite.
+        The costs around the point, and the derivatives (m, m); a derivative is not finite if a cost from
+        which it is computed is not.
     """
     rows = list(places)
     pairs = list(combinations(range(len(rows)), 2))
@@ -168,7 +169,7 @@ def _differences(
     steps: float | Floats,
     pairs: Sequence[tuple[int, int]],
 ) -> tuple[Beside, Floats]:
-    """Compute the costs along coordinates and at the four corners of each pair, in one call."""
+    """Compute the costs along coordinates and at the four corners of pairs of them, in one call."""
     m, h = len(places), np.broadcast_to(steps, len(places))
     along = h[:, None] * np.eye(len(point))[places]
     corners = [
@@ -190,14 +191,14 @@ def profile_ends(
     within: float = END,
     doublings: int = DOUBLINGS,
 ) -> tuple[Floats, Floats]:
-    """Find the ends of each number's 95 % interval; the curvature determines the other numbers there.
+    """Find the ends of the 95 % interval of each coordinate; the curvature gives the others there.
 
     Args:
         cost: function that computes minus the log-likelihoods of points (n, k).
         point: (k,) the minimum.
         curvature: (k, k) the second derivatives at the minimum.
-        corrections: the number of Newton steps that re-optimise the other numbers at each value, for
-            costs that the curvature alone does not describe.
+        corrections: the number of Newton steps that optimise the other coordinates again at each value,
+            for costs that the curvature alone does not describe.
         within: the relative accuracy of an end.
         doublings: the most doublings of the step while an end is bracketed.
 

@@ -1,7 +1,7 @@
 """Alterations that plant or correct faults in streams; each is a function of streams and a number.
 
-Except for lost data, the opposite number corrects a fault. Therefore the same functions define the
-faults that a diagnosis assumes and those that the experiment plants in logs.
+Most faults are corrected by the same function with the opposite number. Therefore these functions define
+both the faults that a diagnosis assumes and those that the experiment plants in logs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +32,7 @@ def _with(stream: Stream, **columns: NDArray) -> Stream:
 
 
 def shifted(field: str, entry: int | None = None) -> Alteration:
-    """Add a bias to a field, or to one entry of a vector."""
+    """Make an alteration that adds a bias to a field, or to one entry of a vector."""
     return partial(added, field, entry)
 
 
@@ -57,7 +57,7 @@ def added(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.
 
 
 def scaled(field: str, entry: int | None = None) -> Alteration:
-    """Multiply a field, or one entry of a vector."""
+    """Make an alteration that multiplies a field, or one entry of a vector, by a factor."""
     return partial(_scaled, field, entry)
 
 
@@ -84,7 +84,7 @@ def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]
 
 
 def spread(field: str) -> Alteration:
-    """Multiply a covariance by e^(2 value), so that standard deviations change by the factor e^value."""
+    """Make an alteration that multiplies standard deviations by e^value; `field` is the covariance."""
     return partial(_spread, field)
 
 
@@ -93,7 +93,7 @@ def _spread(field: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def turned(field: str) -> Alteration:
-    """Rotate a vector, and its covariance, about the vertical by an angle in rad."""
+    """Make an alteration that rotates a vector, and its covariance, about the vertical (in rad)."""
     return partial(_turned, field)
 
 
@@ -115,7 +115,7 @@ def delayed(stream: Stream, by_s: float) -> Stream:
 
 
 def drifted(first_ns: int) -> Alteration:
-    """Let the clock of the stamps gain `rate` seconds per second from the start of the run."""
+    """Make an alteration by which the clock of the stamps gains `rate` s per s from `first_ns` on."""
     return partial(_drifted, first_ns)
 
 
@@ -134,12 +134,12 @@ def pace(rate: float) -> float:
 
 
 def multiplied(field: str, entry: int | None = None) -> Alteration:
-    """Multiply a field, or one entry of it, by e^value."""
+    """Make an alteration that multiplies a field, or one entry of it, by e^value."""
     return lambda stream, logarithm: _scaled(field, entry, stream, float(np.exp(logarithm)))
 
 
 def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
-    """Add a bias that grows linearly from the start of the run."""
+    """Make an alteration that adds a bias which is zero at `first_ns` and grows linearly."""
     return partial(_ramped, first_ns, field, entry)
 
 
@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Reorder the entries of a vector and of its covariance; this alteration needs no number."""
+    """Make an alteration that reorders a vector's entries and covariance, whatever the number."""
     return partial(_permuted, field, tuple(order))
 
 
@@ -213,12 +213,12 @@ def _spread_stated(name: str, stream: Stream, logarithm: float) -> Stream:
 
 
 def spread_variances(stated: str, factor: float) -> str:
-    """Multiply the variances in a channel's text by a factor."""
+    """Multiply comma-separated variances, as a channel's metadata states them, by a factor."""
     return ",".join(repr(float(each) * factor) for each in stated.split(","))
 
 
 def renumbered(field: str, first: int, second: int) -> Alteration:
-    """Swap two numbers of an identifier field."""
+    """Make an alteration that swaps two identifiers in a field."""
     return partial(_renumbered, field, first, second)
 
 

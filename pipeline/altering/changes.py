@@ -57,7 +57,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """A setting of a topic, with its text and its parts."""
+    """A setting of a topic, with its full key, the key's last part, the value and an empty stream."""
 
     key: str
     what: str
@@ -99,9 +99,9 @@ class Change:
         topic: its name.
         stored: the topic of the log from which the topic is read; it differs if topics are swapped.
         first_ns: the start of the run, at which the drift of a clock begins.
-        columns: alterations of its columns, in their order.
-        metadata: metadata in addition to those in the log.
-        gain, delay_ns: the gain of the clock since `first_ns`, and the delay; both are subtracted.
+        columns: alterations of its columns, in the order in which they are applied.
+        metadata: metadata to add to those in the log.
+        gain, delay_ns: the gain of the clock since `first_ns` and the delay to remove from the stamps.
     """
 
     topic: str
@@ -114,11 +114,11 @@ class Change:
 
     @property
     def is_moving(self) -> bool:
-        """Test whether the change affects its stamps."""
+        """Test whether the change affects the stamps."""
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Correct stamps (n,) in ns for clock and delay, as `alterations.drifted` and `delayed` do."""
+        """Remove the clock's gain and the delay from stamps (n,) in ns."""
         since_ns = (stamps_ns - self.first_ns) * alter.pace(-self.gain) - self.delay_ns
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
@@ -128,7 +128,7 @@ class Change:
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
-        """Return the altered topic for a stored topic."""
+        """Return a stored topic with the name and metadata of the altered one."""
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
@@ -163,7 +163,7 @@ def is_parameter(key: str) -> bool:
 
 
 def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Move the parameters of topics to tables: `/TOPIC.NAME` to the table `/TOPIC`."""
+    """Move each parameter `/TOPIC.NAME` to a table: to the entry NAME of the table `/TOPIC`."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         found = merge(found, nested(key, value) if is_parameter(key) else {key: value})
@@ -237,7 +237,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield settings by topic; repeat a setting of all topics for each topic that it concerns."""
+    """Yield settings, with `/*.plane` replaced by a setting of each topic that states no plane."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:

@@ -10,7 +10,7 @@ from fuselog.pipeline.altering.changes import AXES, names_in
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Reading
 
-PROBED = 64  # number of messages with which they are determined
+PROBED = 64  # number of messages that are altered to find out which entries an estimator uses
 
 
 class Entry(NamedTuple):
@@ -20,8 +20,8 @@ class Entry(NamedTuple):
         field, place: the field, and the index in it; a heading belongs to the field `quaternion`.
         name: the name in a setting, with the unit.
         is_angle: whether the number is a measured angle.
-        number: the index of the measured number that it changes; None if it changes several.
-        varies: standard deviation over the log.
+        number: the index of the measured component that depends on it; None if several do.
+        varies: the number's standard deviation over the log.
     """
 
     field: str
@@ -38,9 +38,9 @@ class Entry(NamedTuple):
 
 
 def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
-    """List the numbers of a topic that an estimator uses, because they change its readings.
+    """List the numbers in a topic's messages that change what an estimator reads.
 
-    If the reading is unknown, all numbers are listed, with the entries of positions and velocities.
+    If `reading` is None, list all scalar fields, and the entries of positions and velocities.
     """
     some = stream.take(slice(0, PROBED))
     found = []
@@ -70,7 +70,7 @@ def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
 
 
 def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
-    """Yield the numbers of a topic except covariances and orientations."""
+    """Yield the scalar fields and vector entries of a topic, except covariances and orientations."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or entry.name.startswith(("covariance", "quaternion")):
@@ -83,7 +83,7 @@ def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
 
 
 def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
-    """List the readings that change."""
+    """List the indices of the read components that differ between two streams."""
     same = np.isclose(
         reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
     )

@@ -16,7 +16,8 @@ def in_one_plane(
 ) -> dict[str, Change]:
     """Extend the changes of topics so that all positions are in one local tangent plane.
 
-    It is the plane of the truth, in which errors are computed, or without truth that of the first topic.
+    This is the plane of the truth, in which errors are computed. Without truth, it is the plane of the
+    first topic.
 
     Args:
         name: the run's name.

@@ -98,18 +98,18 @@ def alterations_of(source: Source) -> dict[str, Any]:
 
 
 def note_of(source: Source) -> dict[str, str]:
-    """Return the alterations for the metadata of an estimates log; {} without any."""
+    """Return a run's alterations as metadata of an estimates log; {} if the run is not altered."""
     return {name: json.dumps(applied) for name, applied in setting_of(source).items()}
 
 
 def setting_of(source: Source) -> dict[str, dict[str, Any]]:
-    """Return the alterations for the settings of a result; {} without any."""
+    """Return a run's alterations as a setting of a result; {} if the run is not altered."""
     applied = alterations_of(source)
     return {NOTE: applied} if applied else {}
 
 
 def stated_alterations(estimates: Source) -> dict[str, Any]:
-    """Return the alterations of an estimates log's run; raise BadInput if they cannot be read."""
+    """Read from an estimates log how its run was altered; raise BadInput if this is unreadable."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get(NOTE, "{}"))
@@ -123,7 +123,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split settings into alterations of topics, and parameters, which may belong to one topic.
+    """Split settings into alterations of topics and parameters, some of which belong to a topic.
 
     >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1, "/fix.lever_x_m": 0.4})
     ({'/fix.delay_s': 0.3}, {'gate_probability': 1, '/fix': {'lever_x_m': 0.4}})
@@ -219,7 +219,7 @@ class AlteredLog(LogSource):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield blocks of the source's span, by the altered stamps."""
+        """Yield blocks of the source's span, which refers to the altered stamps."""
         moving = [
             topic
             for topic in dict.fromkeys(topics)

@@ -131,7 +131,7 @@ class ResultFolder(Showing):
 
     @property
     def claims(self) -> pd.DataFrame:
-        """Return a table with a row per claim: statement, our measurement, verdict and reason."""
+        """Return a table with a row per claim: statement, measured value, verdict and reason."""
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property

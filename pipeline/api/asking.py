@@ -66,7 +66,7 @@ def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> d
 
 
 def _of_topic(name: str) -> Iterator[list[object]]:
-    """Yield table rows on one setting of a topic, or on all of them."""
+    """Yield table rows that describe one setting of a topic, or all settings."""
     topic, _, asked = name.rpartition(".")
     ending = asked.rpartition("_")[2]
     whole = [what for what in WHATS if what == asked]
@@ -75,9 +75,9 @@ def _of_topic(name: str) -> Iterator[list[object]]:
 
 
 def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
-    """List the table rows of one name; identical rows of several entries are merged.
+    """List the table rows that describe one parameter; identical rows of several entries are merged.
 
-    The first group of entries with that name is used.
+    The rows are those of the first group of entries that has the parameter.
     """
     for entries in takers:
         alike: dict[str, tuple[list[object], list[str]]] = {}
@@ -92,7 +92,7 @@ def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
 
 
 def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
-    """Name the owners of a parameter, without their models if it is the same for all of them."""
+    """Name the owners of a parameter, without their models if the parameter is the same for all."""
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
@@ -134,7 +134,7 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
 def _by_label(
     estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
 ) -> Iterator[Entries]:
-    """Yield estimators by label, first for settings with a label as prefix, then for all."""
+    """Yield the parameters of each estimator with its label as prefix, then of all without prefix."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
         yield [replace(entry, prefix=f"{label}.") for entry in entries]

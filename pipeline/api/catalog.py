@@ -93,7 +93,7 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print the details of one entry, or the whole list as JSON with errors of entries that fail.
+    """Print the details of one entry, or all entries as JSON, with errors of those that fail to load.
 
     Raises BadInput if the entry is unknown or cannot be loaded.
     """
@@ -129,7 +129,7 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
 
 
 def _methods_of(model: Model) -> dict[str, str]:
-    """Return "yes" for a method that can estimate the model, otherwise what the model lacks for it."""
+    """Return for each method "yes" if it can estimate the model, otherwise what the model lacks."""
     lacking = {name: method.lacks(model) for name, method in METHODS.items()}
     return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 

@@ -37,8 +37,8 @@ class JudgedLogs:
     Attributes:
         sources: the estimates logs, then the logs with the truth.
         estimators: settings by label, from the first estimates log.
-        judge: of all runs.
-        compared: the estimates as trajectories, if they are compared.
+        judge: the metrics of all runs.
+        compared: the estimates compared as trajectories, if this was requested.
         coverage: how many messages of every topic were used.
     """
 
@@ -68,7 +68,7 @@ def judge_estimates(
         comparison: entries of a `Comparison`. If given, positions are also compared as trajectories, and
             estimates are judged after alignment with the truth.
         out: a result folder to write.
-        metrics: their names; all if empty.
+        metrics: names of the metrics to compute; all if empty.
         errors: whether the folder keeps all individual errors.
         recover: read the intact part of truncated or damaged logs.
         gap_limit_s: the longest gap over which the truth is interpolated.

@@ -46,7 +46,7 @@ FAMILIES = {
 
 
 def show_list(kind: str) -> None:
-    """Print the names of a kind, such as "scenarios", with a line on each, grouped by family."""
+    """Print the names of a kind, such as "scenarios", with a one-line description, by family."""
     in_families = kind in ("scenarios", "models", "estimators")
     rows = by_family(kind) if in_families else listed(kind).items()
     print_table([kind.removesuffix("s"), "what"], [*rows])
@@ -87,7 +87,8 @@ def listed(kind: str) -> dict[str, Any]:
 def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
     """Import all entries, and collect their descriptions.
 
-    The description of an entry that cannot be loaded is its error; with `all_load`, BadInput is raised.
+    The description of an entry that cannot be loaded is the error; if `all_load` is set, BadInput is
+    raised instead.
     """
     from fuselog.pipeline.api import catalog
 

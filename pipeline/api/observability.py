@@ -36,17 +36,17 @@ def observability(
     """Measure how well a log's measurements determine a model's state, relative to the prior.
 
     Args:
-        logs: paths, opened logs, or recordings: one, or several with the same topics.
+        logs: one or several logs with the same topics: paths, opened logs, or recordings.
         model: a registered name, or a model of your own; by default the registered one that fits.
         window_s: length of the windows in seconds; by default each run is one window.
         scales: unit of each component, instead of the prior's standard deviation.
-        end_s: end of the runs, in seconds since each one's epoch.
-        parameters: of the model.
+        end_s: end of the evaluated span, in seconds since each run's epoch.
+        parameters: parameters of the model.
 
     Returns:
-        A row per run, case and window: its span, the number of measurements, the rank and the
+        A row per run, case and window: the window's span, the number of measurements, the rank and the
         eigenvalues of the local Gramian in ascending order, the unit direction of the smallest one in
-        state units, and its meaning in words.
+        state units, and a description of what the measurements determine least.
 
     Raises BadInput if no model fits, or if the sensors of the model have no measurements.
 

@@ -46,7 +46,7 @@ class Plan:
         order: the clock that orders the messages.
         late: how out-of-sequence messages are handled.
         gap_limit_s: the longest gap over which the truth is interpolated.
-        metrics: their names; all if empty.
+        metrics: names of the metrics to compute; all if empty.
     """
 
     sources: Sequence[LogSource | MemorySource]

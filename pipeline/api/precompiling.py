@@ -30,13 +30,13 @@ Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """The result for a model and a method: the scenario and its run time, or the reason for a failure.
+    """The result for a model and a method: the scenario and the run time, or the reason for a failure.
 
     Attributes:
-        model, method: their registered names.
+        model, method: registered names.
         scenario: the scenario that was recorded and replayed.
         took_s: duration of the replay in s, including everything that it compiled.
-        why_not: the reason why the model was not replayed by this method; otherwise empty.
+        why_not: the reason why the model was not replayed by this method; empty if it was.
     """
 
     model: str
@@ -67,7 +67,8 @@ def precompile(
             __name__ == "__main__":`, because the processes import it.
 
     Returns:
-        A row for every model, method and scenario; of scenarios with the same sensors, only the first.
+        A row for every model, method and scenario. Scenarios with the same sensors have one row, for the
+        first of them.
 
     Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache that cannot
     store kernels.

@@ -62,7 +62,7 @@ def replay(
     """Replay estimators over logs, and judge the estimates if there is truth.
 
     Args:
-        logs: paths, opened logs, or recordings: one, or several with the same topics.
+        logs: one or several logs with the same topics: paths, opened logs, or recordings.
         estimators: registered names; an `Estimator` made by `recursive`, `batch` or `modelled`; or
             labels of your own, mapped to an `Estimator` or to settings whose `kind` is a name or an
             `Estimator`: `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
@@ -78,7 +78,7 @@ def replay(
             "rewind:0.5"; by default, they are treated as if measured on arrival.
         set: parameters of all estimators that have them, and changes of topics before the replay:
             `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
-        metrics: their names; all by default.
+        metrics: names of the metrics to compute; all by default.
 
     Returns:
         The estimates of every run, with tables of metrics, errors and innovations.
@@ -134,7 +134,7 @@ class Replay(Showing):
         logs: the runs.
         estimates: for each run a log of its estimates, by topic.
         settings: the estimators by label, as given.
-        done: the pass over the logs, with its judge, all parameters, and the run time of each estimator.
+        done: the result of the pass over the logs: the judge, all parameters, and each estimator's time.
         gap_limit_s: the longest gap over which the truth is interpolated.
         arrival_order, late: as given.
     """
@@ -165,7 +165,8 @@ class Replay(Showing):
     def metrics(self) -> pd.DataFrame:
         """Return a table with a row per metric: estimator, quantity, case, value, low, high.
 
-        Consistent estimators have 95 % of their values between `low` and `high`; NaN if unknown.
+        A metric of a consistent estimator is between `low` and `high` with a probability of 95 %; both
+        are NaN if the interval is unknown.
         """
         metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
         intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
@@ -220,7 +221,7 @@ class Replay(Showing):
 
     @cached_property
     def alarms(self) -> list[Finding]:
-        """Return the warnings about the numbers, the worst first."""
+        """Return the warnings about the metrics and the replay, the worst first."""
         return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property

@@ -49,7 +49,7 @@ class Evaluation:
 
     Attributes:
         estimate, truth: the trajectories, as given.
-        comparison: how they were compared.
+        comparison: the options of the comparison.
         compared: the comparison by pose, with the aligned estimate.
     """
 
@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Return notes on corrections, doubts, and a time offset that could not be found."""
+        """Return notes on both trajectories, on doubtful results, and on a time offset not found."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         notes = [in_vain] if sought and not self.compared.time_offset_s else []

@@ -1,4 +1,4 @@
-"""The simulated car whose calibration is estimated, with its sensor errors and their names in a model.
+"""The simulated car whose calibration is estimated: errors of its sensors, and their names in a model.
 
 Scales and the bias of `TRUTH` describe readings relative to the motion. Those of `OURS` describe the
 motion relative to readings, as in the model.
@@ -39,7 +39,7 @@ def drive(seed: int | None, errors: Floats = TRUTH, **changed: Any) -> Car:
         seed: the seed of the noise and of the first pose. Without a seed, there is no noise, and the
             car starts at zero.
         errors: (7,), the sensors' errors, in the order of `TRUTH`.
-        changed: parameters of the car.
+        changed: parameters of the car that differ from their defaults.
 
     Returns:
         The measurements with their stamps.

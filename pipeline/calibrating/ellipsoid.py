@@ -69,13 +69,13 @@ class Ellipsoid:
 
     @property
     def left_open(self) -> list[str]:
-        """List the undetermined numbers: all, if the orientations are too few for an ellipsoid."""
+        """List undetermined parameters; all, if there are too few orientations to fit an ellipsoid."""
         places = self.fitted.lacking.places
         return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a table with a row per number, with value and 95 % interval; NaN if not determined."""
+        """Return a table with each parameter's value and 95 % interval; NaN if not determined."""
         factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
         values = self.fitted.numbers * factors
         reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
@@ -86,7 +86,7 @@ class Ellipsoid:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Return settings that correct a log's readings; {} if something is not determined."""
+        """Return settings that correct a log's readings; {} if a parameter is not determined."""
         if self.left_open:
             return {}
         stem, _, unit = self.field.rpartition("_")
@@ -105,7 +105,7 @@ class Ellipsoid:
 
     @property
     def notes(self) -> list[str]:
-        """Return sentences on undetermined numbers, the quality of the fit, and how to apply it."""
+        """Return sentences on undetermined parameters, the fit's quality, and how to correct a log."""
         unit, fitted = unit_of(self.field), self.fitted
         before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
         sentences = []

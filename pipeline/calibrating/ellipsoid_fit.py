@@ -2,7 +2,7 @@
 
 A sensor reads m = A^-1 u + b + n for a vector u of known length, with isotropic noise n. The length
 determines b and the symmetric A by maximum likelihood, but not a rotation of the sensor's axes.
-Vasconcelos et al., IEEE T-AES 2011, describe sets of readings that do not determine everything.
+Vasconcelos et al., IEEE T-AES 2011, describe sets of readings that do not determine all parameters.
 """
 
 from typing import NamedTuple
@@ -32,16 +32,16 @@ _FLAT = 0.1
 
 
 class Fit(NamedTuple):
-    """The ellipsoid of readings, in units of the vector's length, relative to their middle.
+    """The ellipsoid of readings, in units of the vector's length, relative to the readings' middle.
 
     Attributes:
-        numbers: (9,) in the order of `NAMES`.
-        covariance: (9, 9) of the numbers that are determined; meaningless for others.
-        lacking: the numbers that the readings do not determine.
+        numbers: (9,) the parameters, in the order of `NAMES`.
+        covariance: (9, 9) covariance of the determined parameters; meaningless for the others.
+        lacking: the parameters that the readings do not determine.
         turned_about: the coordinate axis closest to the only axis of rotation; empty if there were
             several.
         sigma: the standard deviation of the noise.
-        correlation: correlation of the noise of successive readings.
+        correlation: correlation of the noise between successive readings.
     """
 
     numbers: Floats
@@ -53,7 +53,7 @@ class Fit(NamedTuple):
 
 
 def matrix_of(values: Floats) -> Floats:
-    """Make the symmetric matrix A (3, 3) from values (9,)."""
+    """Make the symmetric matrix A (3, 3) from the parameters (9,)."""
     matrix = np.diag(values[3:6])
     for (row, column), value in zip(PAIRS, values[6:], strict=True):
         matrix[row, column] = matrix[column, row] = value
@@ -67,7 +67,7 @@ def middle(readings: Floats) -> tuple[Floats, float]:
 
 
 def fit(readings: Floats) -> Fit:
-    """Fit the ellipsoid of readings (n, 3), in units of their vector's length.
+    """Fit an ellipsoid to readings (n, 3), in units of the length of the measured vector.
 
     >>> rng = np.random.default_rng(1)
     >>> directions = rng.standard_normal((500, 3))
@@ -115,7 +115,7 @@ def _distances(values: Floats, readings: Floats) -> Floats:
 
 
 def _derivatives(values: Floats, readings: Floats) -> Floats:
-    """Compute the derivatives (n, 9) of the distances by the values."""
+    """Compute the derivatives (n, 9) of the distances with respect to the parameters."""
     steps = _STEP * np.eye(len(START))
     ways = [_distances(values + step, readings) - _distances(values - step, readings) for step in steps]
     return np.stack(ways, axis=1) / (2.0 * _STEP)
@@ -124,7 +124,8 @@ def _derivatives(values: Floats, readings: Floats) -> Floats:
 def _search(start: Floats, directions: Floats, readings: Floats, sigma: float) -> tuple[float, Floats]:
     """Minimise the cost from a start (9,) along directions (m, 9), under a wide prior.
 
-    Noise along the curved surface moves readings outwards by its variance.
+    The surface is curved, so noise along it moves readings outwards on average, by the noise's variance
+    `sigma`^2, which is subtracted from the distances.
     """
 
     def residuals(along: Floats) -> Floats:

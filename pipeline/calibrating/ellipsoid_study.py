@@ -38,7 +38,7 @@ class EllipsoidOptions(Parameters):
     """Options of the study: the units to calibrate.
 
     Attributes:
-        seeds: the first seed of each block of the experiment's runs.
+        seeds: the first seed of each block; every block has as many units as the experiment has runs.
     """
 
     seeds: tuple[NonNegativeInt, ...] = ()
@@ -103,7 +103,7 @@ def recorded(unit: str, seed: int) -> MemorySource:
 
 
 def turned(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Simulate the field (n, 3) in a unit that is rotated steadily for a minute, and the noise."""
+    """Simulate the field (n, 3) in the axes of a unit that is rotated for a minute, and its noise."""
     time_s = STEP_S * np.arange(3000)
     across, up = 1.1 * time_s, 1.5 * np.sin(0.13 * time_s)
     across, up = across + 6.0 * rng.random(), up + 0.05 * rng.random()

@@ -2,7 +2,8 @@
 
 Manoeuvres of a wheeled robot are simulated without noise, with the sensors, steps and noise of the log
 and the estimated values, to compute their information. The best manoeuvre depends on the criterion: the
-determinant considers all parameters together, the widest interval only the least accurate one.
+determinant considers all parameters together, the widest interval only the least accurate one. A
+parameter's useful unit is the standard error that a calibration should reach.
 """
 
 from collections.abc import Mapping
@@ -56,7 +57,7 @@ def gain(known: Floats, added: Floats) -> Gain:
 
     Args:
         known: (m, m), in useful units.
-        added: (m, m), in useful units; both together are positive definite.
+        added: (m, m), in useful units; its sum with `known` is positive definite.
 
     Returns:
         The information gained, and the remaining standard deviations (m,).
@@ -73,7 +74,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
     """Tabulate manoeuvres of 20 s, in ascending order of the widest interval that would remain.
 
     The columns are the manoeuvre, the nats that it adds, and the standard deviation of each parameter
-    with it, in the parameter's unit. The row "none" is the information of the logs.
+    with it, in the parameter's unit. The row "none" describes the logs without another manoeuvre.
 
     Raises BadInput if the logs are not those of a robot with wheels.
     """
@@ -146,7 +147,7 @@ def _simulated(found: Tuning, log: Source, motion: str) -> Run:
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
-    """Find the first topic of a schema that is part of the run itself."""
+    """Read the first topic of a schema, except estimates; None if there is none."""
     for name in topics_of(log.topics, schema):
         if not name.startswith("/estimates/"):
             return log.read([name])[name]
@@ -154,7 +155,7 @@ def _first_of(log: Source, schema: Schema) -> Stream | None:
 
 
 def _of_kinds(log: Source) -> dict[str, Stream]:
-    """Return the log's streams that are simulated, by the simulation's topic."""
+    """Return the log's streams that the simulation imitates, by the simulation's topics."""
     streams = {topic: _first_of(log, schema) for topic, schema in SIMULATED.items()}
     found = {topic: stream for topic, stream in streams.items() if stream is not None}
     if "/car/odometry" not in found or "/car/fix" not in found:

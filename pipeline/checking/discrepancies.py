@@ -1,4 +1,4 @@
-"""Functions that find the differences between a replay and its golden: what, how much and since when."""
+"""Functions that find what differs between a replay and its golden, by how much and since when."""
 
 import base64
 import math
@@ -35,7 +35,7 @@ class Discrepancy(NamedTuple):
         apart: difference relative to the size of the column; infinite if the part is missing on one
             side.
         allowed: largest allowed difference, relative to the size of the column.
-        row: first kept row whose difference exceeds `allowed`; None if there is no such row.
+        row: first row in the golden whose difference exceeds `allowed`; None if there is no such row.
         component: component of the column.
         before, after: values of the golden and of the replay in this row.
         stamp_ns: stamp of the row, if the replayed stream is available.
@@ -221,7 +221,7 @@ def _relative(difference: Floats, size: ArrayLike) -> Floats:
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """Describe the earliest discrepancy, the first time at which bits differ, and the innovation."""
+    """Describe the earliest discrepancy, the stamp from which its bits differ, and the innovation."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     sentences = [first.sentence]

@@ -128,7 +128,7 @@ def input_hash(source: LogSource | MemorySource) -> str:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Test whether an output belongs in a golden, unlike coverage and empty streams of reasons."""
+    """Test whether an output belongs in a golden, unlike coverage and empty streams of failures."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 

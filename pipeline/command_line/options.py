@@ -12,7 +12,7 @@ from fuselog.replay.foreign.naming import allow_programs_of_files
 
 
 class Output(click.Path):
-    """A path that a command writes; a test of all outputs finds options by this type.
+    """A path that a command writes; the tests find all such options by this type.
 
     Attributes:
         suffix: suffix of the file; empty for a path that is always a folder.

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     FUSELOG_TRACEBACK=1 shows the traceback of an error, for authors of estimators.
 
     Args:
-        arguments: of the command. The default is the arguments of this process; the function then
+        arguments: arguments of the command; by default those of this process. In this case, the function
             collects garbage less often, and ends the process.
     """
     if arguments is None:
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _end(code: int) -> NoReturn:
-    """End the process as Python does, but without freeing objects, which takes 20 % of a short command.
+    """End the process as Python does, but do not free objects, which takes 20 % of a short command.
 
     Threads are left running: Python up to 3.13 terminates them, which aborts the process if a thread
     is in NumPy's C++ code or holds the lock of standard error.

@@ -403,7 +403,7 @@ def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFra
 
 
 def _span_s(tables: Iterable[pd.DataFrame]) -> float:
-    """Choose a span length that is a multiple of each table's, for at most `SPANS` spans."""
+    """Choose a multiple of the span lengths in all tables that gives at most `SPANS` spans."""
     ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
     width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
     longest = max(int(each.max()) for each in ends_ms)
@@ -413,7 +413,7 @@ def _span_s(tables: Iterable[pd.DataFrame]) -> float:
 
 
 def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
-    """Compute NEES and RMSE in each span, of position and orientation or else the first component."""
+    """Compute in each span the NEES and the RMSE of position and orientation, or of what comes first."""
     columns = [column for column in times if "rmse" in str(column)]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
     parts = []

@@ -20,7 +20,7 @@ class Paired(NamedTuple):
         quantity: name of the metric.
         case: case of the estimates; `all` is the mean over the cases of each run.
         target: best value of the metric.
-        found: difference over the runs.
+        found: difference over the runs, with its interval.
         where: start and end of the time span that contributes most to the difference, in s since the
             run's epoch; None if there is no such span.
         stressed: largest change of either candidate's metric under changes that should not matter.

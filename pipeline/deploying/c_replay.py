@@ -101,9 +101,9 @@ def _description(made: CFilter, reading: Reading) -> str:
 
 
 def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
-    """List the parameters by name, with their places in C and their values.
+    """List the names of the parameters, the C variables that hold each, and the values.
 
-    A parameter whose value differs between parts is listed once per part.
+    A parameter whose value differs between the motion and sensors is listed separately for each.
     """
     places: dict[str, dict[str, float]] = {}
     for part, values in made.values.items():

@@ -37,8 +37,8 @@ class Single(NamedTuple):
 
     Attributes:
         estimates: number of estimates compared with those in double precision.
-        furthest: largest difference of means and covariances, relative to the number itself or to one,
-            whichever is larger.
+        furthest: largest difference of an entry of means and covariances, relative to the entry or to
+            one, whichever is larger.
         lost_event, lost_s: the event, and its time after the start, at which the covariance stops being
             positive definite in single precision but not in double; None if there is no such event.
     """

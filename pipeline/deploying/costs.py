@@ -43,7 +43,7 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """The largest cost of a step, which counts both branches of every condition and every iteration.
+    """An upper bound of a step's cost: both branches of every condition, and the most iterations.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
@@ -111,7 +111,7 @@ def _traced(function: Any, *arguments: Argument) -> Cost:
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
-    """Count the loops of the motion (0) or of a sensor over samples, noise, and their factor."""
+    """Count the cost of loops in the motion (0) or a sensor: over samples, for noise and for factors."""
     step = made.steps.predict if part == 0 else made.steps.innovate[part - 1]
     sampled, t = made.steps.sampled[part], made.tangent
     costs = [_entering(step, size)]
@@ -126,7 +126,7 @@ def _loops(made: CFilter, part: int, size: int) -> Cost:
 
 
 def _entering(step: Step, size: int) -> Cost:
-    """Count the cost of noise that is multiplied by a gain."""
+    """Count the cost of adding noise that is multiplied by gains."""
     gains = sum(name == "u" for name, _ in step.outputs)
     if not gains:
         return NOTHING
@@ -164,7 +164,7 @@ def _narrowing(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """Count the cost of a step at every sample, but operations that all samples share only once."""
+    """Count the cost of a step at every sample; operations that all samples share count once."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     inside = [node for node in needed(outputs, same) if node not in same]
@@ -172,7 +172,7 @@ def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:
-    """Count the operations that turn the values into covariances, or into the rows of a factor."""
+    """Count the operations that form covariances, or rows to factorise, from values at samples."""
     count, v = len(sampled.points), sampled.size
     if is_root:
         return Cost(count * v)
@@ -212,7 +212,7 @@ def _algebra(m: int, t: int, is_robust: bool) -> Cost:
 
 
 def _factored_algebra(m: int, t: int) -> Cost:
-    """Count the cost of updating a factor: S, the whitened innovation, the step, and the factor of P."""
+    """Count the cost of updating a factored covariance: S, whitening, the step, and the new factor."""
     square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
     return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
 

@@ -15,7 +15,7 @@ class Advice(NamedTuple):
         value: its new value.
         free: the parameter that can be tuned instead.
         otherwise: what else can be done, in words.
-        more: further settings that are needed with it, by key.
+        more: further settings that are needed together with `key`.
         is_moved: whether the value is a shift in metres along several axes, which is added to one
             already set.
     """

@@ -1,4 +1,7 @@
-"""Search for the most likely causes of an inconsistent filter, the faults with the largest gains."""
+"""Search for the most likely causes of an inconsistent filter, the faults with the largest gains.
+
+Faults that a log does not distinguish are called names of one cause.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -57,7 +60,7 @@ class Cause(NamedTuple):
         hypothesis: the assumed fault.
         value: its size.
         ends: the ends of the 95 % interval of the size.
-        gain: the gain in log-likelihood after all causes before it.
+        gain: the gain in log-likelihood after all causes before it are corrected.
         others: causes that explain the log equally well, or nearly so.
         of_halves: the gain over each half of the measurements, with all other causes corrected.
     """
@@ -117,7 +120,7 @@ class Tried(NamedTuple):
 
     @property
     def row(self) -> tuple[str, str, str, str, float]:
-        """Return its kind, topic, part, the values with the largest gain, and that gain."""
+        """Return kind, topic and part of the fault, its values with the largest gain, and the gain."""
         of, at = self.hypothesis, self.at.value
         values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
@@ -133,8 +136,8 @@ def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
 def least_gain(count: int, size: int = 1) -> float:
     """Compute the gain that the best of `count` hypotheses exceeds by chance in FALSE_ALARMS of logs.
 
-    Twice the gain is chi-square distributed with one degree of freedom per number (Wilks); the
-    probability is divided by `count` (Bonferroni).
+    Twice the gain is chi-square distributed with `size` degrees of freedom, one for each estimated value
+    (Wilks); the probability is divided by `count` (Bonferroni).
     """
     return float(chi2.isf(FALSE_ALARMS / max(count, 1), size)) / 2.0
 
@@ -154,7 +157,7 @@ class Found(NamedTuple):
 
     @property
     def supposed(self) -> Supposed:
-        """Return the most likely name."""
+        """Return the fault that is corrected, the first of the names, with its value."""
         at, of = self.names[0]
         return Supposed(of, at.value)
 
@@ -323,7 +326,7 @@ class _Search:
         return found._replace(contenders=[*found.contenders, *alike])
 
     def _score(self, found: Sequence[Found]) -> float:
-        """Compute the log-likelihood of the corrected log minus the cost of the numbers."""
+        """Compute the log-likelihood of the corrected log minus the cost of all estimated values."""
         [explained] = self.likelihood([self.without(found)])
         return explained - NUMBER_COST * sum(len(each.supposed.numbers) for each in found)
 
@@ -341,7 +344,7 @@ class _Search:
     def _without_noise(self, look: Look, noises: Sequence[Named]) -> list[Found]:
         """Find causes that explain as much as a noise or outliers; an empty list if there are none.
 
-        Errors of a model look like noise that is stated too small, and large errors look like
+        Errors of a model look like a noise that is larger than stated, and large errors look like
         outliers.
         """
         if not noises:
@@ -496,9 +499,9 @@ def _faults(names: Names) -> list[Hypothesis]:
 
 
 def _alike(ranked: Sequence[Named]) -> Names:
-    """Select the most likely name and those that the log does not distinguish, usual names first.
+    """Select the likeliest fault and those that the log does not distinguish from it; sort by name.
 
-    A delay setting that is too large comes before all others.
+    A delay setting that is too large comes first, and unusual names (see `_is_early`) come last.
     """
     least = ranked[0][0].score(ranked[0][1]) - RIVAL
     near = [
@@ -553,7 +556,7 @@ def _likeliest(
 
 
 def _takes_all(at: Peak, of: Hypothesis) -> bool:
-    """Test whether a fault explains a part of any other one: noise stated too small, or outliers."""
+    """Test whether a fault is one that explains part of any other: noise stated small, or outliers."""
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
@@ -587,7 +590,7 @@ def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | 
 
 
 def _is_other_name(pair: Named, first: Named) -> bool:
-    """Test whether a delay equals the opposite delay of another topic in the likeliest cause.
+    """Test whether a delay is opposite to the likeliest cause, which is a delay of another topic.
 
     Except at the ends of the log, both are the same fault.
     """
@@ -598,14 +601,14 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 
 
 def _is_early(pair: Named) -> bool:
-    """Test for the unusual name of a fault, by which all other topics are early instead of one late."""
+    """Test whether a fault makes a topic early or its clock slow; usually another one is late."""
     at, of = pair
     is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
     return is_of_stamps and of.already + at.value < 0.0
 
 
 def _takes_back(pair: Named) -> bool:
-    """Test whether a fault reduces a delay that is set, so that the setting is too large."""
+    """Test whether a fault means that a delay in the settings is too large."""
     at, of = pair
     return of.already > 0.0 > at.value and not _is_early(pair)
 
@@ -642,7 +645,7 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
 
 
 def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
-    """Return the value of a delay or angle, and a rival value if chance explains the difference.
+    """Return the value of a delay or angle, and a rival value whose gain may be less by chance.
 
     The likelier value comes first.
     """

@@ -135,8 +135,8 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
     """Yield findings on each sensor's innovations, for an estimator that cannot be replayed.
 
     Autocorrelated innovations point to the motion or a delay, others to the noise of the sensor. If a
-    channel states which parameter of its estimator is that noise, the parameter is named. Components
-    with the same finding share one sentence.
+    channel states which parameter of its estimator sets this noise, the finding names the parameter.
+    Components with the same finding share one sentence.
     """
     for topic, stream in innovations.items():
         case, alike = split_topic(topic)[1], dict[tuple[bool, str], list[_Seen]]()

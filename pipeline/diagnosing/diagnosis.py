@@ -86,7 +86,8 @@ class Diagnosis:
             topic, part, value, gain.
         least_gain: the gain that a fault needs to be named.
         notes: remarks on the diagnosis.
-        log_likelihood: of all measurements used in the search for causes, with an open gate; or NaN.
+        log_likelihood: log-likelihood of all measurements used in the search for causes, with an open
+            gate; NaN if it is unknown.
     """
 
     label: str
@@ -366,7 +367,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """A log that an estimator can follow, its replay, and the corrections made before it."""
+    """A log that an estimator can replay, the replay, and the findings corrected before it."""
 
     source: LogSource | MemorySource
     done: Replay
@@ -377,9 +378,9 @@ class _Followed(NamedTuple):
 def _followed(
     source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], gap_limit_s: float
 ) -> _Followed:
-    """Replay a log, with corrections that the log itself suggests if the estimator needs them.
+    """Replay a log; if this fails, correct the faults that a check of the log finds, and try again.
 
-    Raises BadInput if the corrected log cannot be followed either, with the reason for the original log.
+    Raises BadInput with the reason for the original log if the corrected log cannot be replayed either.
     """
 
     def replayed(source: LogSource | MemorySource) -> _Followed:

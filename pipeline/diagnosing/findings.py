@@ -78,8 +78,8 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
     """Compute a table with a row per measured component.
 
     The columns describe the normalised innovations: their number, mean with its 95 % interval, mean
-    square, the share beyond 3 standard deviations (0.27 % of a Gaussian), excess kurtosis, correlation
-    with the next one, and the probability of a larger Ljung-Box Q if they are white.
+    square, the share beyond 3 standard deviations (0.27 % of a Gaussian), excess kurtosis, the
+    correlation of successive ones, and the probability that white ones have a larger Ljung-Box Q.
     """
     rows = []
     for topic, stream in innovations.items():
@@ -164,7 +164,7 @@ def of_innovations(
 
 
 def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterator[Finding]:
-    """Yield the stamp at which a filter diverges, and the measurement before it."""
+    """Yield a finding with the stamp at which a filter diverges, and the measurement before it."""
     found = find_divergence(stream)
     if found is None:
         return
@@ -191,7 +191,7 @@ def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
 
 
 def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Yield variances that have a lower limit."""
+    """Yield findings on variances that many estimates have and that never become smaller."""
     for topic, stream in estimates.items():
         if len(stream) < FEWEST or not stream.components:
             continue

@@ -1,7 +1,7 @@
 """A joint fit of the sizes of several faults, with the search that `tune` and `calibrate` use.
 
-Faults hide parts of each other: if their sizes are estimated one after the other, the sizes and
-intervals are those of a log in which the other faults are still present.
+Each fault hides parts of the others. If the sizes were estimated one after the other, each size and
+interval would be that of a log in which other faults are still present.
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ class Supposed(NamedTuple):
         return list(self.value) if self.of.size > 1 else [self.value]
 
     def number(self, numbers: Sequence[float]) -> Number:
-        """Convert values to the fault's form, or return its value if there is nothing to search for."""
+        """Convert a vector's entries to a value of the fault; a fault without values keeps its own."""
         if not self.of.tried:
             return self.value
         return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
@@ -137,8 +137,8 @@ def fit(
 def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, Hypothesis]]) -> float:
     """Estimate, from the curvature, the gain of the last of several faults if all are fitted again.
 
-    It is the fault's gain in addition to the others, plus WIDE times the gain of the next step of a
-    search, a generous bound. It is infinite if the log-likelihood is not concave.
+    The estimate is a generous upper bound: the fault's gain in addition to the others, plus WIDE times
+    the gain of the next step of a search. It is infinite if the log-likelihood is not concave.
     """
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])

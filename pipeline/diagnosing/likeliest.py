@@ -64,7 +64,7 @@ def _cause(label: str, found: Finding, mended: str) -> Cause:
 
 
 def _mended(logs: list[Path], label: str, own: dict[str, Any], first: Finding, main: str) -> str:
-    """Describe the metrics of the same runs with the correction; "" if no parameter corrects them."""
+    """Describe the effect of a correction on the same runs; "" if no parameter corrects the fault."""
     if not first.setting or first.setting.startswith("/"):
         return ""
     remedy = merge(own, parse_settings([first.setting]))

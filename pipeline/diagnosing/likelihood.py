@@ -1,8 +1,9 @@
 """The log-likelihood of replays, from which the gains of corrected settings and logs are computed.
 
-All trials have the same measurements, and start by the same rule. Some measurements are not scored in a
-trial, for example a fix that a delay moves beyond the odometry's span. They have the likelihood of a
-broad model, in which successive messages are as far apart as is usual for their topic.
+A trial is a log with an estimator's settings, in which faults may be corrected. All trials have the same
+measurements, and start by the same rule. In some trials, the filter cannot score some measurements, for
+example a fix that a delay moves beyond the odometry's span. A broad model scores these, in which
+successive messages differ by as much as is usual for their topic.
 
 A measurement that the gate rejects is an outlier, uniform in the volume that the innovations span, with
 the observed share of outliers. Without a gate there are no outliers, and the log-likelihood is that of
@@ -86,8 +87,8 @@ class Likelihood:
 
     Attributes:
         volumes: by topic, the ranges (m,) of the innovations' components, in which outliers are uniform.
-        count: by estimate, the number of innovations, including those of the broad model.
-        starts: the common start of all trials, if the log contains none.
+        count: by estimate, the number of innovations and of messages that the broad model scores.
+        starts: the initial states that all trials share, if the log contains none.
         readings: by estimate, functions that read the measured numbers, if known.
         broad: by topic, the mean log-likelihood of a message under the broad model.
         later_ns: shift of all stamps, so that no alteration moves them to before 1970.
@@ -104,8 +105,8 @@ class Likelihood:
     def begin(self, trial: Trial) -> dict[str, Stream]:
         """Set the trial with which others are compared, and return its innovations by topic.
 
-        If the log has no initial state, they are those of the most likely broad start. Raises BadInput
-        if the estimator cannot begin.
+        If the log has no initial state, the innovations from the most likely broad start are returned.
+        Raises BadInput if the estimator cannot begin.
         """
         bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
@@ -234,7 +235,7 @@ class Likelihood:
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
-        """Compute log-likelihoods of equal shares of the measurements, each given those before it."""
+        """Compute log-likelihoods of equal shares of the measurements, each given the shares before."""
         until = []
         for share in np.arange(1, count + 1) / count:
             found = [self._of_start(scored, part, share) for part in parts]
@@ -247,7 +248,7 @@ class Likelihood:
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float
     ) -> dict[str, float]:
-        """Compute each estimate's log-likelihood of a share; {} if too few messages are scored."""
+        """Compute the log-likelihood of the first share by estimate; {} if too few are scored."""
         found = {}
         for name, all_ in self.count.items():
             topic = _topic(name)
@@ -283,16 +284,16 @@ def _topic(name: str) -> str:
 
 
 def _name(topic: str) -> str:
-    """Return the name to which the innovations of a topic belong; a program may have several."""
+    """Return the name of the estimate to which innovations belong; a program may have several."""
     return topic.removeprefix("/estimates/").removesuffix("/innovation")
 
 
 def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
     """Find the span in which a filter can score measurements, and the time step of its controls.
 
-    Measurements up to a step before the span are scored at its start. Those after it are scored for as
-    long as the last control applies, and for the same time again. Thus messages that a small delay moves
-    across an end stay comparable.
+    Measurements at most one step before the span are scored at its start, and measurements at most two
+    steps after the span are scored as well. Thus messages that a small delay moves across an end stay
+    comparable.
     """
     begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
     for topic in controls:
@@ -338,9 +339,9 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Test whether rows are in the first share of the rows of their sensor.
+    """Test which innovations are in the first share of their sensor's innovations.
 
-    A share of all rows would contain other measurements if a delay changes their order.
+    A share of the innovations of all sensors would contain other ones if a delay changes their order.
     """
     known = np.isfinite(innovations["innovation"])
     sensor = known @ 2.0 ** np.arange(known.shape[1])
@@ -386,7 +387,7 @@ def _alike(bound: Sequence[Bound]) -> Hashable:
 
 
 def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator for runs that repeat `count` times, each with its own values."""
+    """Make one estimator for the runs of all trials, `count` for each, with the trial's parameters."""
     first = bounds[0]
     alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
     if all(each is first for each in bounds):

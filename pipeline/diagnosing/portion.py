@@ -78,7 +78,7 @@ class Portion(NamedTuple):
 def first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> Portion:
-    """Read the topics that the estimator uses, at most the first MOST_MESSAGES of a log."""
+    """Read the topics that the estimator uses, at most the log's first MOST_MESSAGES messages."""
     whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}

@@ -1,4 +1,4 @@
-"""Search for the values at which faults gain most, over all faults in parallel.
+"""Search for the values at which correcting a fault gains most, for all faults in parallel.
 
 A search is a generator that yields values, receives their gains, and returns its `Peak`. Thus one replay
 can compute the next values of all faults.
@@ -47,8 +47,8 @@ def peak(
     Args:
         of: the fault, whose gain is zero at the value zero.
         floor: a gain below which a search is not worthwhile.
-        greatest: function that returns the largest known gain of any fault. Distant values are not
-            searched if no gain is known yet, or found nearby or at a special value.
+        greatest: function that returns the largest known gain of any fault. Distant values are tried
+            only if this gain, or one at a near or special value, is large enough.
     """
     if of.size > 1:
         return (yield from _of_several(of, floor, greatest))
@@ -100,7 +100,7 @@ def _vertex(known: Mapping[float, float], low: float, best: float, high: float) 
 
 
 def _promised(known: Mapping[float, float]) -> float:
-    """Compute how far the maximum of a parabola exceeds the largest gain."""
+    """Compute by how much the parabola around the largest gain exceeds this gain."""
     around = _around(known)
     if around is None:
         return np.inf
@@ -141,7 +141,7 @@ def _is_lopsided(low: float, best: float, high: float) -> bool:
 
 
 def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
-    """Compute the maximum of the parabola through zero and the values on both sides, or infinity."""
+    """Compute the maximum of the parabola through zero and both sides; infinity if there is none."""
     if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
         return np.inf
     low, high = sorted(sides)

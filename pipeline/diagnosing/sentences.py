@@ -34,7 +34,7 @@ ALIKE: Mapping[Kind, Kind] = {"mounting": "bias or turned frame", "covariance": 
 
 @dataclass(frozen=True, kw_only=True)
 class CauseFinding(Finding):
-    """A finding from likelihoods, about the topic or parameter of its `cause`."""
+    """A finding that the search for causes made, about the topic or parameter of its `cause`."""
 
     cause: Cause
 
@@ -45,7 +45,7 @@ class CauseFinding(Finding):
 
 
 def cause_of(found: Finding) -> Cause | None:
-    """Return the cause of a finding from likelihoods; None for other findings."""
+    """Return the cause of a finding that the search for causes made; None for other findings."""
     return found.cause if isinstance(found, CauseFinding) else None
 
 
@@ -96,7 +96,7 @@ def _is_advised(setting: str, advised: Collection[str]) -> bool:
 def marks_of(
     sentences: Sequence[Finding], label: str, outputs: Sequence[str], first_ns: int
 ) -> dict[str, Stream]:
-    """Write sentences as messages by topic for a timeline, at the stamps where they begin.
+    """Write sentences as messages by topic for a timeline, at the stamps where the findings begin.
 
     `outputs` are the topics of the estimates, `first_ns` is the first stamp of the log.
     """
@@ -125,7 +125,7 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 
 
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
-    """List remarks on a diagnosis: findings in doubt, untested parts, and omissions."""
+    """List remarks on a diagnosis: causes in doubt, omitted messages and findings, missing truth."""
     notes = [
         "in doubt, like everything with a smaller gain, because the parts of the log disagree about the "
         f"number by more than chance: {each.words}"

@@ -71,7 +71,8 @@ class Fault(NamedTuple):
         value: its size, which the 95 % interval should cover; None for a fault without a size.
         record: parameters of the recorder that cause it.
         settings: settings of the estimator that cause it.
-        alteration: an alteration of `altered` (by default `topic`) by `by` (by default `value`).
+        alteration: function of the run and its number that returns an alteration of the topic
+            `altered` (by default `topic`), which is applied with the value `by` (by default `value`).
         exchanged: two topics whose messages are swapped.
     """
 

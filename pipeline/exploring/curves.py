@@ -50,14 +50,14 @@ class Case:
     Attributes:
         name: its name; may be empty.
         components, kinds: names and kinds of the components of the state's tangent space.
-        path: the path of the estimate; None if it has no position.
+        path: the path of the estimate; None if the state has no position.
         covariance: covariances (n, 2, 2) of the positions on the path.
         sigma: standard deviations (n, d) at `time_s` (n,), according to the filter.
         errors: errors relative to the truth; None without truth.
         nis: NIS over time; None without innovations.
         whiteness: whiteness of the innovations, by measured component.
         log_likelihood: log-likelihood of all measurements; NaN if the filter does not state it.
-        beside: the estimates (n,) of parameters in the state, and of components without truth.
+        beside: by name, the estimates (n,) of parameters in the state, and of components without truth.
     """
 
     name: str
@@ -194,9 +194,10 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def typical_time_s(case: Case) -> float | None:
-    """Choose the second whose share of errors outside the interval is closest to the overall share.
+    """Choose the second whose share of NEES above the interval is closest to that of the run.
 
-    Of several such seconds, choose the one closest to the middle of the run. None without truth.
+    If there are several such seconds, choose the one closest to the middle of the run. Without truth,
+    return None.
     """
     if case.errors is None or len(case.errors.nees) == 0:
         return None

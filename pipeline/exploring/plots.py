@@ -357,7 +357,7 @@ def show_likelihood(
 
 
 def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
-    """Scale the error's axis so that all except rare errors are visible, including pinned ones."""
+    """Scale the axis of errors so that all except rare errors are visible, also of pinned replays."""
     most, ends = 0.0, [0.0]
     for each in played.values():
         one = each.cases.get(case)

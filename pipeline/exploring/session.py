@@ -178,7 +178,7 @@ class Session:
         return {name: case.log_likelihood for name, case in cases.items()}
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
-        """Find the best values of some parameters, and return them with the criterion.
+        """Tune some parameters, and return all values and the criterion of the search.
 
         Raises BadInput as `tune` does.
         """

@@ -97,8 +97,8 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
     """List the parameters of filters that can be dragged, by group.
 
-    For an estimator with a model, these are the parameters that its functions use on this log. For other
-    estimators, they are all positive numbers, except settings of how a program is run.
+    For an estimator with a model, these are the parameters that the model's functions use on this log.
+    For other estimators, they are all declared numbers, except settings of how a program is run.
 
     Args:
         source: the log.

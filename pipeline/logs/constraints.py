@@ -20,10 +20,9 @@ class ConstraintParameters(Parameters):
         rolling_hz: rate of messages that the body moves neither sideways nor up, as on wheels; 0 for
             none.
         window_s: length of the window before the current time in which rest is detected.
-        still_mps2: threshold for the standard deviation of the specific force; the body is at rest if
-            this is below it and the turn rate is below `still_radps`.
-        still_radps: threshold for the root mean square of the turn rate; the body is at rest if this is
-            below it and the specific force is below `still_mps2`.
+        still_mps2: threshold for the standard deviation of the specific force. The body is at rest if
+            the values in the window are below both thresholds.
+        still_radps: threshold for the root mean square of the turn rate.
     """
 
     standing_hz: NonNegativeFloat = 5.0

@@ -41,7 +41,7 @@ def is_prior(log: Log, topic: str) -> bool:
 class Thinner:
     """A filter that keeps the first stamp of every interval, which is a number of stamps or a time.
 
-    `stamps` is the number of stamps in earlier blocks, `last` the interval of the latest of them.
+    `stamps` is the number of stamps in earlier blocks, `last` the index of the last stamp's interval.
     """
 
     every: int = 0

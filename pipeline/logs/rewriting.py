@@ -33,7 +33,7 @@ class Changed(NamedTuple):
 def stream_blocks(
     log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
 ) -> Blocks:
-    """Yield the blocks of a span; the order of `topics` is that of messages with equal stamps."""
+    """Yield the blocks of a span; messages with equal stamps are in the order of `topics`."""
     for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
         yield [block[topic] for topic in topics if topic in block]
 
@@ -56,7 +56,7 @@ def write_changed(
 
 
 def ranked(log: Log) -> list[str]:
-    """Sort the topics as the log declares them, which is the order of messages with equal stamps."""
+    """Sort the topics as the log declares them; messages with equal stamps have the same order."""
     return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
 
 
@@ -137,7 +137,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
 
 
 def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """Return the common run of the logs; if their runs differ, an unknown run with all notes."""
+    """Return the common run of the logs; if runs or clocks differ, an unknown run with all notes."""
     runs = [run_of(log, target) for log in logs]
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):

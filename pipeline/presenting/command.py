@@ -19,7 +19,7 @@ PAYING_SEGMENTS = 3
 
 
 def save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
-    """Write the runs as a dataset to a folder, with what was recorded and estimated in chosen ones."""
+    """Write the runs as a dataset to a folder, with the streams and estimates of the chosen runs."""
     check_folder(folder, {"input": [runs.path]})
     kept = Kept(runs)
     made = _all_made(kept, chosen)
@@ -95,7 +95,7 @@ def _add(dataset: Dataset, kept: Kept, missing: Sequence[Segment], listener: Lis
 
 
 def _all_made(kept: Kept, chosen: Sequence[Segment]) -> list[Made]:
-    """Draw what is missing of the chosen runs, and return all drawn ones."""
+    """Draw the chosen runs that are not drawn yet, and return all drawn runs."""
     missing = _missing(chosen, kept.made())
     for each in progress(kept.make(missing, _pool(missing)), "drawing runs", len(missing)):
         _tell(each)

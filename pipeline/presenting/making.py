@@ -49,7 +49,7 @@ APPLICATION = "fuselog"
 
 
 class Made(NamedTuple):
-    """The layers of a drawn segment: their folder, and what differs from the result."""
+    """A drawn segment: the folder of its layers, and warnings about differences from the result."""
 
     segment: Segment
     folder: Path
@@ -57,7 +57,7 @@ class Made(NamedTuple):
 
     @property
     def layers(self) -> list[tuple[Path, str]]:
-        """Return the files of the layers with their names, what was recorded first."""
+        """Return the files of the layers with their names, beginning with the recorded streams."""
         files = [self.folder / f"{BASE}.rrd", *self.folder.glob("*.rrd")]
         return [(path, unquote(path.stem)) for path in dict.fromkeys(files)]
 
@@ -104,9 +104,9 @@ class Kept:
         return [Made(each, place, []) for each in drawn if (place := self._place(each)).is_dir()]
 
     def make(self, segments: Sequence[Segment], open_pool: PoolFactory) -> Generator[Made]:
-        """Draw segments in parallel, and yield each as it is finished; those in progress are in memory.
+        """Draw segments in parallel, yield each when it is finished; memory holds those in progress.
 
-        If it is interrupted, unfinished files are removed.
+        If the drawing is interrupted, unfinished files are removed.
         """
         waiting = list(reversed(segments))
         pending: dict[Future[list[str]], Segment] = {}

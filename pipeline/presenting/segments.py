@@ -109,7 +109,8 @@ class Segment:
     def load(self) -> tuple[Recorded, MemorySource, dict[str, str]]:
         """Return the run, the estimates of all versions, and the version of each estimator by label.
 
-        Estimators of later versions with a label that is taken get the version's title as well.
+        If an earlier version has an estimator with the same label, the version's title is appended to
+        the label.
         """
         source, first = self.parts[0].load()
         versions = dict.fromkeys(labels_of(first), self.parts[0].title)
@@ -171,7 +172,7 @@ class Runs(NamedTuple):
 
 
 def runs_in(path: Path, gap_limit_s: float) -> Runs | None:
-    """Return the runs of a result or of a folder of logs; None if there is no row for each run.
+    """Return the runs of a result or of a folder of logs; None if the path has no separate runs.
 
     Raises BadInput if a result or a log cannot be read.
     """
@@ -189,7 +190,7 @@ def runs_in(path: Path, gap_limit_s: float) -> Runs | None:
 
 
 def together(given: Sequence[Runs]) -> Runs:
-    """Join the runs of several results: the first one's, with the estimates of all as versions.
+    """Join several results of the same runs, with the estimates of each result as a version.
 
     Raises BadInput if they are not the same runs.
     """
@@ -283,7 +284,7 @@ def runs_of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
     """Return a run for each log, with the estimates in all estimates logs of it as versions.
 
     Args:
-        path: next to which the drawings are kept.
+        path: the path next to which the drawings are kept.
         files: logs and estimates logs.
         gap_limit_s: longest gap over which the truth is interpolated.
 
@@ -392,7 +393,7 @@ def _worst_spans(times: "pd.DataFrame | None", quantity: str) -> list[dict[Hasha
 def _failures(
     rows: "pd.DataFrame", parts: Mapping[str, object], failures: "pd.DataFrame | None"
 ) -> dict[str, str]:
-    """Return by run why estimators failed, or which of them have no errors."""
+    """Return by run why estimators failed, or which estimators have no errors."""
     found: dict[str, list[str]] = {}
     if len(rows):
         for label, own in rows.groupby("estimator", sort=False):

@@ -183,7 +183,7 @@ def update_signature(name: str) -> str:
 
 
 def data_of(sensor: Sensor) -> list[str]:
-    """List the numbers of a sensor's message: measured components, references, its own noise."""
+    """List the numbers in a sensor's message: measured components, references, and stated noise."""
     names = [*sensor.measured]
     names += reference_names(sensor)
     measured = list(sensor.measured)

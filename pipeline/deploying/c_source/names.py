@@ -107,7 +107,7 @@ class CFilter(NamedTuple):
 
     @property
     def values(self) -> dict[str, dict[str, float]]:
-        """Return the parameters that motion and sensors read, by part, with their values."""
+        """Return by name of the motion or sensor the parameters that it reads, with their values."""
         names = number_fields(self.filtering.bound_model.model.parameters)
         return {
             part: {
@@ -129,7 +129,7 @@ class CFilter(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """Return a digest that is the same for the same graphs and numbers."""
+        """Return a digest of the filter's graphs and numbers, which identifies the filter."""
         words = [repr([[*step.outputs] for step in self.steps.all])]
         words += [word for step in self.steps.all for word in described([*step.outputs.values()])]
         words += [

@@ -115,14 +115,14 @@ def _step(made: CFilter) -> str:
 
 
 def _starting(made: CFilter) -> list[str]:
-    """Write the start of sampling."""
+    """Write the call that prepares the samples of the belief before the prediction."""
     if made.is_root:
         return ["start_samples(filter, &samples);"]
     return ["if (!start_samples(filter, &samples))", "    return NAME_NOT_POSITIVE_DEFINITE;"]
 
 
 def _factorising(made: CFilter, columns: int) -> list[str]:
-    """Write the factorisation of a prediction with this number of columns and its noise."""
+    """Write the calls that factorise a predicted covariance, from its `columns` and the noise."""
     t = made.tangent
     return [
         f"if (!factorise(&found, {t}, {columns}, {t}, &noise[0][0], T))",
@@ -145,7 +145,7 @@ def _pass_gap(made: CFilter) -> str:
 
 
 def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
-    """Write the body of a prediction, with declarations of the variables that its lines use."""
+    """Write the body of a prediction from its lines, and declare the variables that they use."""
     text = "\n".join([*declared, *lines])
     real, span = made.precision.real, "seconds(filter->time_ns, time_ns)"
     used = {

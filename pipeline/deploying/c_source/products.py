@@ -1,7 +1,7 @@
 """Products of covariances with Jacobians in C, as loops over entries that are not known to be zero.
 
 Sums have the same order as in `fuselog.replay.inference.linear_algebra.sparse`. Placeholders are those
-of `algebra`. `columns` lists the columns of a matrix row by row; each row ends with -1.
+of `algebra`. `columns` lists, for each row of a matrix, the columns of these entries, followed by -1.
 """
 
 from collections.abc import Mapping
@@ -112,12 +112,12 @@ _TIMES_FACTOR = """\
 
 
 def slope_text(*, is_root: bool) -> str:
-    """Write the code that finds how a curved state changes, from a covariance or its factor."""
+    """Write the code that finds how a curved state changes along the direction of its curvature."""
     return SLOPE.replace("PRODUCT", _TIMES_FACTOR if is_root else _TIMES)
 
 
 def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
-    """Write the code that adds noise with at most `gains` gains, for matrices of these sizes."""
+    """Write the functions that add noise with at most `gains` components to matrices of these sizes."""
     if not sizes:
         return []
     texts = [ADD_THROUGH.replace("WHAT", what).replace("SIZE", size) for what, size in sizes.items()]
@@ -125,7 +125,7 @@ def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
 
 
 def columns_text(name: str, columns: list[list[int]], size: str) -> str:
-    """Write the table of a matrix's columns."""
+    """Write the table that lists columns row by row; see the module."""
     rows = ", ".join("{" + ", ".join(map(str, [*row, -1])) + "}" for row in columns)
     return f"static const signed char {name}[{size}][T + 1] = {{{rows}}};"
 

@@ -13,7 +13,7 @@ from fuselog.replay.tracing.graph import INPUT, Node, needed
 
 
 class Inputs:
-    """The names of a step's inputs, and declarations of those that it uses."""
+    """The C names of a step's inputs, with declarations of the inputs that the step uses."""
 
     def __init__(self, made: CFilter, part: str) -> None:
         model = made.filtering.bound_model.model
@@ -22,11 +22,11 @@ class Inputs:
         self.part, self.made = part, made
 
     def names(self, step: Step, *arrays: str) -> tuple[dict[Any, str], list[str]]:
-        """Return the names by place, and the lines that declare them.
+        """Return the C name of each input, and the lines that declare these names.
 
         Args:
             step: the step.
-            arrays: the inputs after mean and covariance; "" for a missing one.
+            arrays: C names of the arguments after mean and covariance; "" for an unused argument.
         """
         names: dict[Any, str] = {}
         lines: dict[str, str] = {}
@@ -71,7 +71,7 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
 
 
 class Loops(NamedTuple):
-    """Loops, with their declarations, the results of the graph that they need, and their calls."""
+    """Calls of loops, with the declarations and the results of the graph that they need."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -82,7 +82,7 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
     """Write the products with a step's Jacobian, and the sum with its noise.
 
     Args:
-        step: a step that returns the Jacobian, G and u, N.
+        step: a step that returns the Jacobian and its noise: gains G of variances u, or a covariance N.
         jacobian: the name of the Jacobian, F or H.
         rows: its number of rows.
         multiply: the call that forms the product.

@@ -23,7 +23,7 @@ from fuselog.replay.tracing.c_text import c_lines
 
 
 def correcting_text(made: CFilter) -> list[str]:
-    """Write the functions that correct the state and find its curvature."""
+    """Write the function that corrects the state and, for a curved state, one for its curvature."""
     if not made.sensors:
         return []
     step, direction = made.steps.correct, made.steps.direction

@@ -125,7 +125,7 @@ class Cell(NamedTuple):
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """Yield all faults with a compass, and without one unless the fault concerns the compass."""
+    """Yield a cell with a compass for every fault, and one without if the compass is not at fault."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):
@@ -209,9 +209,9 @@ def named_by(cause: Cause) -> Iterator[Right]:
 def results(
     seeds: Sequence[int], progress: Progress
 ) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
-    """Compute tables and metrics over all cells with and without a prior, all pairs, and the unit.
+    """Compute tables and metrics of all cells with and without a prior, all pairs, and unit faults.
 
-    There are more seeds for the unit than for the other logs.
+    There are more seeds for the inertial unit than for the other logs.
     """
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:

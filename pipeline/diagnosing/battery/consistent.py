@@ -25,8 +25,8 @@ class FalseCausesOptions(Parameters):
 
     Attributes:
         to_fix: ratios of the wheels' error between two fixes to the error of a fix.
-        to_compass: ratios of their error between two headings to that of a heading; 0 means no
-            compass.
+        to_compass: ratios of the wheels' error between two headings to the error of a heading; 0 means
+            no compass.
     """
 
     to_fix: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.1, 0.3, 1.0, 3.0, 10.0)

@@ -138,7 +138,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _seeds(experiment: Experiment, case: int) -> range:
-    """Return the seeds of a case; logs with the same seed would have the same noise and errors."""
+    """Return the seeds of a case; no other case has them, so no logs share noise and errors."""
     first = experiment.seed + case * experiment.runs
     return range(first, first + experiment.runs)
 

@@ -34,7 +34,7 @@ LARGEST_FACTOR = 12.0  # a logarithm
 def of_components(
     stream: Stream, reading: Reading | None, parameters: Parameters | None, first_ns: int
 ) -> Iterator[Hypothesis]:
-    """Yield all faults of the numbers of a topic; a drifting bias begins to grow at `first_ns`."""
+    """Yield all faults of the numbers in a topic; a drifting bias begins to grow at `first_ns`."""
     is_control = reading is not None and stream.topic in reading.controls
     entries = entries_of(stream, reading)
     if "latitude_deg" in stream.columns:
@@ -68,8 +68,8 @@ def of_components(
 class _Own(NamedTuple):
     """The parameters for the bias and the factor of a topic's number.
 
-    A bias of the number is multiplied by `bias_sign` to obtain the change of the parameter, which has
-    the value `bias_value`.
+    A bias of the number is multiplied by `bias_sign` to obtain the change of the parameter `bias`, whose
+    current value is `bias_value`.
     """
 
     bias: str

@@ -1,4 +1,4 @@
-"""Hypotheses that two numbers of a map, or two topics, are swapped."""
+"""Hypotheses that two identifiers in a map, or two topics, are swapped."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ SUSPECTS = 12  # number of suspects; all pairs of them are tried
 def of_numbers(
     bound: Sequence[Bound], source: MemorySource, innovations: Mapping[str, Stream]
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses that two numbers of a map, or two topics, are swapped."""
+    """Yield hypotheses that two identifiers in a map, or two topics, are swapped."""
     maps = {
         topic: field.name
         for each in bound

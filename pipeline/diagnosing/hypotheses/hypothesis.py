@@ -39,7 +39,7 @@ class Hypothesis:
         topic: the topic, or the parameter, that is wrong.
         part: the component of the topic, if only one is wrong.
         tried: values at which the search begins, the first two nearest to zero; empty for a fault
-            without a value. For a fault with several values, the step of each.
+            without a value. For a fault with several values, one tuple with the step of each.
         limit: the largest magnitude of the value.
         without: function that returns the trial without a fault of this value.
         words: function that describes the fault, from the value and the ends of its 95 % interval.
@@ -215,7 +215,7 @@ def noise_gain_over(
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute how much log-likelihood opposite noises cost in the first trial, (pairs,)."""
+    """Compute the loss of log-likelihood, (pairs,), by each pair of opposite noises in later trials."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)
@@ -224,11 +224,11 @@ def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64
 def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:
     """Make a function that computes the inflation of a fault's gain.
 
-    The gain is inflated if parts of the log disagree about the value more than their likelihoods imply:
-    the variance of the slopes of PARTS of the log at the maximum is compared with the curvature of the
-    whole, which equals it for a correct model. Kent, Robust properties of likelihood ratio tests,
-    Biometrika 69, 1982, pages 19 to 27. The factor is 1 for faults without a value, and if chance can
-    explain the disagreement.
+    The gain is inflated if parts of the log disagree about the value more than their likelihoods imply.
+    The log is divided into PARTS parts. The inflation is PARTS times the variance of the slopes of their
+    log-likelihoods at the maximum, divided by the curvature of the whole; for a correct model, this
+    ratio is about 1. Kent, Robust properties of likelihood ratio tests, Biometrika 69, 1982, pages 19
+    to 27. The inflation is set to 1 for faults without a value, and if chance can explain it.
     """
 
     def inflation(of: Hypothesis, value: Number, gain: float) -> float:

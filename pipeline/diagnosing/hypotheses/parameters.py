@@ -47,7 +47,7 @@ STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """Yield noises that the model assumes, or that parameters or channels state."""
+    """Yield hypotheses that noises of the model, which parameters or channels state, are wrong."""
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
     parameters = bound[0].parameters
     if parameters is None:
@@ -60,10 +60,10 @@ def of_noises(
 
 
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
-    """Yield other values of the numbers that an estimator declares, if its reading is unknown.
+    """Yield hypotheses that numbers which an estimator declares are wrong, if its reading is unknown.
 
-    Noises and numbers that cannot be negative are multiplied by factors, and so are positive numbers in
-    the command of a program that reads a log, about which nothing else is known.
+    Noises and numbers that cannot be negative are multiplied by factors. So are positive numbers in the
+    command of a program that reads a log, because nothing else is known about them.
     """
     parameters = bound[0].parameters
     if parameters is None:
@@ -110,7 +110,7 @@ def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
-    """Yield the covariances that messages, or their channels, state."""
+    """Yield hypotheses that covariances which messages or their channels state are wrong."""
     fields = [
         (field, alter.spread(field))
         for field in ("covariance_m2", "covariance_m2ps2", "covariance")
@@ -143,7 +143,7 @@ def _factor(logarithm: float) -> float:
 
 
 def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
-    """Yield other values of parameters that can be estimated; those with the same unit form a vector.
+    """Yield hypotheses that estimable parameters are wrong, jointly for those with the same unit.
 
     Biases and factors of a topic's numbers are omitted, because they are tried separately. Angles are
     also tried one by one over the full circle, because units are often mounted a quarter turn off about
@@ -220,10 +220,10 @@ def _parameters(
 
 
 def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that some measurements are outliers; a gate rejects them.
+    """Yield the hypothesis that some measurements are outliers, which a gate would reject.
 
     The value is the time in seconds after which the gate opens again: `REOPENS_S` for single outliers,
-    and `NEVER_S` for a stretch of outliers, of which one would be accepted every second otherwise.
+    and `NEVER_S` for stretches of outliers, because a gate that reopens would accept some of them.
     """
     if not has(parameters, "gate_probability"):
         return

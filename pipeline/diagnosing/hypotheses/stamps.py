@@ -30,7 +30,7 @@ def of_stamps(
     hold_s: float,
     lags_s: tuple[float, ...],
 ) -> Iterator[Hypothesis]:
-    """Yield a topic's delay and its clock drift.
+    """Yield the hypotheses that a topic is delayed, and that its clock drifts.
 
     Args:
         stream: the topic's messages.
@@ -92,7 +92,7 @@ def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
 
 
 def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
-    """Estimate the lag in s of the speeds of positions behind a control that correlates with them.
+    """Estimate how far speeds from positions lag behind a control that correlates with them, in s.
 
     The lag with the best correlation is found on a grid of a tenth of a second, which is accurate enough
     for the start of a search.
