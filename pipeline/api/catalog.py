@@ -69,7 +69,7 @@ def estimators() -> Entries:
 
 
 def models() -> Entries:
-    """List models with their parts, and the methods that can estimate them."""
+    """List models with their states, sensors and controls, and the methods that can estimate them."""
     return _registered("models", Model, _model)
 
 

@@ -179,7 +179,7 @@ class Replay(Showing):
 
     @property
     def steps(self) -> pd.DataFrame:
-        """Return a table with a row per estimator, case and step: RMSE, mean NEES, its 95 % interval."""
+        """Return a table by estimator, case and step: RMSE, mean NEES and the NEES's 95 % interval."""
         return joined(self.judge.steps.values())
 
     @property

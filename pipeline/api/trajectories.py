@@ -98,7 +98,7 @@ class Evaluation:
 
     @property
     def pairs(self) -> pd.DataFrame:
-        """Return a table with a row per pair of poses, with its last pose and its RPE."""
+        """Return a table with a row per pair of poses: number of the later pose, and RPE."""
         done = self.compared
         columns = {"last_pose": done.last, "rpe_translation_m": done.relative_m}
         if done.relative_deg is not None:
@@ -178,7 +178,8 @@ def evaluate(
         association: "nearest" pairs poses that are close in time, "interpolated" interpolates the truth.
         max_difference_s: the largest time difference of matched poses, for "nearest".
         gap_limit_s: the longest gap over which the truth is interpolated.
-        time_offset_s: seconds to add to the estimate's stamps; "estimate" determines them.
+        time_offset_s: offset in seconds to add to the estimate's stamps; "estimate" finds the offset
+            with the smallest error.
         format: format of the estimate's file: "tum", "kitti", "euroc"; by default detected.
         truth_format: format of the truth's file.
 

@@ -61,7 +61,7 @@ def matrix_of(values: Floats) -> Floats:
 
 
 def middle(readings: Floats) -> tuple[Floats, float]:
-    """Compute the middle (3,) of readings (n, 3), and their median distance from it."""
+    """Compute the middle (3,) of readings (n, 3), and the median distance of readings from it."""
     place = 0.5 * (readings.min(axis=0) + readings.max(axis=0))
     return place, float(np.median(np.linalg.norm(readings - place, axis=1)))
 

@@ -29,7 +29,7 @@ class CalibrationOptions(Parameters):
     """Options of the study: the cars to calibrate, and the motions.
 
     Attributes:
-        seeds: the first seed of each block of the experiment's runs.
+        seeds: the first seed of each block; every block has as many cars as the experiment has runs.
         motions: the motions for which undetermined parameters are listed.
     """
 

@@ -27,9 +27,10 @@ class Vectors(NamedTuple):
 
     Attributes:
         start_ns, mean, covariance: the prior.
-        time_ns, source, data: the events (n,), (n,), (n, width).
-        accepted, nis: the measurements (n,), -1 and NaN if the event has no measurement.
-        judged: (n,) rows of the estimates after events, -1 if there is no estimate.
+        time_ns, source, data: stamps (n,), sources (n,) and numbers (n, width) of the events.
+        accepted, nis: (n,) whether the filter accepts the measurement of an event, and the NIS; -1 and
+            NaN if the event has no measurement.
+        judged: (n,) the row of `means` after each event, -1 if there is no estimate.
         means, covariances: the estimates.
     """
 

@@ -715,7 +715,8 @@ class Sought(NamedTuple):
         causes: the causes, the most likely first.
         tried: every hypothesis, with its gain on the unaltered log.
         in_doubt: a cause that would be the most likely, but about which the parts of the log disagree.
-        log_likelihood: that of the unaltered log; NaN if it is unknown, so that no hypothesis is tried.
+        log_likelihood: log-likelihood of the unaltered log; NaN if it is unknown, in which case no
+            hypothesis is tried.
     """
 
     causes: Sequence[Cause] = ()

@@ -74,7 +74,7 @@ class Fit(NamedTuple):
 
     Attributes:
         faults: the faults with these values.
-        log_likelihood: that of the log without the faults.
+        log_likelihood: log-likelihood of the log with the faults corrected.
         losses: loss of log-likelihood if a fault is removed and all others are refitted, from the
             curvature; infinite for a fault without a value.
         are_estimates: whether the values of a fault are estimates; they are not if the search ended at

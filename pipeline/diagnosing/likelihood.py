@@ -163,7 +163,7 @@ class Likelihood:
         return found
 
     def disturbed(self, trial: Trial) -> list[Trial]:
-        """Copy a trial with noise added to the controls of its log."""
+        """Make copies of a trial with noise added to the controls of its log."""
         copies = disturbed(trial.source, self._bound_to(trial))
         return [replace(trial, runs=[each]) for each in copies]
 
@@ -310,7 +310,7 @@ def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) 
 
 
 def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
-    """Compute the mean log-likelihood of messages (n, m) whose steps have their usual size."""
+    """Compute the mean log-likelihood of messages (n, m) under a random walk with their mean steps."""
     steps = np.diff(numbers, axis=0)
     is_angle = np.array(kinds) == "angle"
     steps[:, is_angle] = np.remainder(steps[:, is_angle] + np.pi, 2.0 * np.pi) - np.pi
@@ -381,7 +381,7 @@ def _key(trial: Trial) -> str:
 
 
 def _alike(bound: Sequence[Bound]) -> Hashable:
-    """Return a key that is equal for estimators that can be replayed together; None if none can."""
+    """Return a key that is equal for estimators that can be replayed together; None if these cannot."""
     keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
     return tuple(keys) if len(keys) == len(bound) else None
 
@@ -396,7 +396,7 @@ def _together(bounds: Sequence[Bound], count: int) -> Bound:
 
 
 def _extents(stream: Stream) -> Floats:
-    """Compute the ranges (m,) of innovations by component; that of an angle is a full turn."""
+    """Compute the ranges (m,) of innovations by component; the range of an angle is a full turn."""
     kinds = stream.metadata["kinds"].split(",")
     known = np.where(np.isfinite(stream["innovation"]), stream["innovation"], np.nan)
     highest = np.fmax.reduce(known, axis=0, initial=-np.inf)  # result for a component without values

@@ -116,7 +116,7 @@ def marks_of(
 
 
 def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> list[str]:
-    """List findings that are not sentences: hints, and those that a cause describes differently."""
+    """List findings that are not sentences: hints, and findings that a cause describes differently."""
     return [
         f"hint: {each.sentence}" if each.severity == "hint" else f"the log itself shows: {each.evidence}"
         for each in of_log

@@ -43,7 +43,7 @@ class Part:
         title: name of this version, if the run has several.
         log: the log of the run, if it was kept.
         estimates: the log of the estimates, if they were kept.
-        runner: what records or opens the run and replays it, if it was not kept.
+        runner: object that records or opens the run and replays it, if it was not kept.
         run: the number of the run for the runner.
     """
 
@@ -92,7 +92,7 @@ class Segment:
     """One run in a dataset.
 
     Attributes:
-        name: its name, which a file name may contain.
+        name: the run's name, from which file names are made.
         parts: the versions of its estimates, the current one first.
         properties: what is known about the run, and about each estimator.
     """
@@ -135,7 +135,7 @@ class Runs(NamedTuple):
     Attributes:
         path: the result or the folder.
         segments: the runs, the worst first.
-        order: how they are sorted, in words.
+        order: description of the order of the runs.
         columns: groups and names of the properties that a table shows first.
         gap_limit_s: longest gap over which the truth is interpolated.
     """
@@ -339,7 +339,7 @@ def _sorted(
 ) -> Runs:
     """Combine what is known about runs, and sort them: failed ones, then by error, the worst first.
 
-    The error is that of the estimator whose error is smallest over all runs.
+    Runs are sorted by the error of the estimator that has the smallest error over all runs.
     """
     tables, verdicts = tables or {}, verdicts or {}
     quantity = next((str(key) for key in rows if is_error(str(key))), "")

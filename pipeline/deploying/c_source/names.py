@@ -48,12 +48,12 @@ class CFilter(NamedTuple):
 
     @property
     def tangent(self) -> int:
-        """Return the number of components of its tangent space."""
+        """Return the number of components of the state's tangent space."""
         return self.filtering.bound_model.model.tangent
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Return the names of its controls."""
+        """Return the names of the filter's controls."""
         control = self.filtering.bound_model.model.control
         return control.components if control else ()
 

@@ -1,7 +1,7 @@
 """Functions at weighted samples in C, as in `fuselog.replay.inference.kalman.regression`.
 
-Placeholders are those of `algebra`. SAMPLES, DRAWN, VALUES and PLACES are the largest numbers of
-samples, of entries in a sample, of tangent components of a function's values, and of their components.
+Placeholders are those of `algebra`. SAMPLES is the largest number of samples, and DRAWN of entries in a
+sample. VALUES is the largest size of a function's value in tangent components, PLACES in components.
 """
 
 import re

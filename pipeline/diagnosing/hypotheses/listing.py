@@ -33,7 +33,7 @@ def hypotheses(
     Args:
         bound: the bound estimators.
         base: the unaltered run, and the settings.
-        innovations: those of the unaltered run, without a gate.
+        innovations: the innovations of the unaltered run, with an open gate.
         readings: functions that read the measured numbers, by the name of the estimate.
     """
     source, parameters = base.source, bound[0].parameters
