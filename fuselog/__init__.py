@@ -22,7 +22,7 @@ _RENAMED = {"Told": "Diagnostics"}  # names of the previous release
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """Read from the stub, for each public name, its module and its name in that module."""
+    """Read the stub; map each public name to its module and to its name in that module."""
     stub = ast.parse((_HERE / "__init__.pyi").read_text(encoding="utf-8"))
     return {
         alias.asname or alias.name: (node.module or "", alias.name)

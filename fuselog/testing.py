@@ -28,12 +28,12 @@ def assert_golden(
 ) -> None:
     """Replay estimators over logs and compare the estimates with a golden file, field by field.
 
-    If the environment variable FUSELOG_UPDATE_GOLDENS is set, the golden file is written, not compared.
+    If the environment variable FUSELOG_UPDATE_GOLDENS is set, the golden file is written instead.
 
     Args:
         logs: a log, a folder of logs, or runs by name, such as `{"seed 7": fuselog.record(...)}`.
         golden: the golden file. Its name ends in .golden.xz; keep it next to the tests.
-        estimators: as for `fuselog.replay`; by default those that the golden file names.
+        estimators: as for `fuselog.replay`; by default, the estimators that the golden file names.
 
     Raises AssertionError with the first difference: topic, run, stamp, component, both values, and the
     innovation at this stamp. Raises BadInput if the golden file does not exist or was made from other

@@ -48,7 +48,7 @@ class TopicRead(_Part):
         fields: fields that the filter reads, in this order; `position_m[2]` is a vector of two numbers.
         message: schema of its messages, such as `fuselog.RangeBearing`; "" for any schema.
         static: whether all of its messages are passed to the filter before the start, as for a map.
-        optional: whether a log may lack it.
+        optional: whether the filter also runs on logs without the topic.
         estimates: whether the filter is asked for an estimate after each of its messages.
         target: field with the identifier of the measured target.
     """
@@ -107,8 +107,7 @@ class Description(_Part):
         prior: topic of the prior; "" if it starts without one.
         truth: topic of the truth.
         output: last part of the name of its topic of estimates.
-        failures: sentences; if a function of the filter returns n, the n-th sentence describes the
-            failure.
+        failures: descriptions of failures: if a function of the filter returns n, the n-th applies.
         digest: for a filter written by `fuselog deploy`, the digest of its graphs and numbers.
         protocol: for a streaming program, its version of the protocol.
     """

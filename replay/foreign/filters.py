@@ -159,8 +159,8 @@ def _named(
 ) -> str:
     """Return the topic of the prior or truth that a description names; "" if the log has none.
 
-    Raises BadInput if the log has another such topic under the prefix of the filter's topics, because
-    the name is then probably wrong.
+    Raises BadInput if the log has another prior or truth under the prefix of the filter's topics,
+    because the name in the description is then probably wrong.
     """
     topic = resolved(name, prefix)
     if not name or topic in topics:

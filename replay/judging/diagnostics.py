@@ -151,5 +151,5 @@ def _wide_angles(estimates: Stream) -> dict[str, int]:
 
 
 def name_of(topic: str) -> str:
-    """Return the estimator and the case of a topic, for use in sentences."""
+    """Return the name of a topic's estimator and case for use in sentences."""
     return " ".join(filter(None, split_topic(topic)))

@@ -339,7 +339,7 @@ class Judge:
 
     @property
     def failed_runs(self) -> list[tuple[int, str]]:
-        """Return the numbers of these runs with the sentences."""
+        """Return the numbers of the failed runs, with a sentence for each."""
         return self._diagnostics.failures(self._names)
 
     @property
@@ -371,7 +371,7 @@ class Judge:
 
     @property
     def times(self) -> "pd.DataFrame":
-        """Return a table with a row per run and time span, which ends `until_s` after the epoch."""
+        """Return a table with a row per run and time span; a span ends `until_s` after the epoch."""
         from fuselog.replay.judging.tables import joined, time_table
 
         return joined(time_table(each) for each in self._quantities.values())
@@ -399,5 +399,5 @@ class Judge:
 
     @property
     def judged(self) -> dict[str, Errors]:
-        """Return, by topic, the last block of estimates with errors, for its names and kinds."""
+        """Return, by topic, the last errors of estimates, for the names and kinds of components."""
         return {topic: each.errors for topic, each in self._quantities.items()}

@@ -1,7 +1,7 @@
 """Interface for families that judge other outputs than estimates, such as tracks.
 
-A judge is registered as an entry point `fuselog.judges`. Metrics for the type of its results compute
-numbers from them.
+A judge is registered as an entry point `fuselog.judges`. The metrics that are registered for the type of
+its results compute numbers from the results.
 """
 
 from abc import ABC, abstractmethod

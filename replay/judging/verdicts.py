@@ -29,8 +29,8 @@ class Consistency(StrEnum):
 class Comparison(StrEnum):
     """Verdict on whether a second estimator is better than a first.
 
-    For a metric without a target value, the verdict is only higher or lower. It is withheld if changes
-    that should not matter move the metric by more than the difference.
+    For a metric without a target value, the verdict is only higher or lower. The verdict is withheld if
+    changes that should not matter move the metric by more than the difference.
     """
 
     BETTER = "better"
@@ -43,7 +43,7 @@ class Comparison(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Comparison | None":
-        """Accept values of older results."""
+        """Accept the verdicts of older versions in result.json."""
         return {"no difference": cls.TIE, "unclear": cls.UNDECIDED}.get(str(value))
 
 
@@ -63,7 +63,7 @@ class Claimed(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Claimed | None":
-        """Accept values of older results."""
+        """Accept the verdicts of older versions in result.json."""
         return cls.INCONCLUSIVE if value == "not shown" else None
 
 
@@ -103,7 +103,7 @@ class Squares:
 
     @property
     def is_far(self) -> bool:
-        """Test whether errors exceed the claimed errors so much that the covariance is unreliable."""
+        """Test whether errors exceed the claimed errors by so much that the covariance is unreliable."""
         return self.factor > FAR
 
     @property

@@ -1,7 +1,8 @@
 """Datasets of recordings, served by Rerun's catalog server on the loopback interface only.
 
-A dataset has segments, one for each run. A segment has layers, each a file: its properties, which are
-columns of the dataset's table, what was recorded, and one for each estimator.
+A dataset has segments, one for each run. A segment consists of layers, each of which is a file: one with
+its properties, which are columns of the dataset's table, one with the recording, and one for each
+estimator.
 """
 
 import errno
@@ -109,7 +110,7 @@ def column_of(group: str, name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a name as columns have it: Rerun replaces some other characters, and escapes the rest."""
+    """Return a name with an underscore for each character that Rerun would replace or escape."""
     return re.sub(r"\W", "_", name)
 
 

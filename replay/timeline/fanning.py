@@ -1,4 +1,4 @@
-"""Plots of the distances between an estimate and copies that diverge from it, over time."""
+"""Plots of the distances between an estimate and its diverging copies over time."""
 
 from collections.abc import Sequence
 from itertools import cycle

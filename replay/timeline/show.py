@@ -48,7 +48,8 @@ class Drawing:
         at: `worst` or `worst:ESTIMATOR`; without a focus, the case of this moment is shown first.
         sides: estimators whose scenes are shown side by side, with the differences of their errors.
         fans: distances of copies from their estimates.
-        layout: file for the layout of a dataset's segments, which has a text about the segment as well.
+        layout: file to write the layout of a dataset's segments to; it also shows a text about the
+            segment.
 
     Raises BadInput if neither `save` nor `connect` is given, if a sink fails (see `open_recording`), or
     if the focus does not exist.

@@ -76,7 +76,7 @@ def _draw_differences(
 
 
 def _sizes(errors: Errors) -> Floats:
-    """Compute the size (n,) of the error of the main quantity."""
+    """Compute the magnitude (n,) of the error of the main quantity."""
     _, columns, scale = errors.main
     sizes: Floats = scale * np.linalg.norm(errors.error[:, columns], axis=1)
     return sizes

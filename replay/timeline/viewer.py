@@ -63,7 +63,8 @@ def screenshot(
         size: width and height in pixels.
         progress: function that is called with a description of the current step.
 
-    Returns the reports of errors in views; empty without errors. The bar of the viewer is cut off.
+    Returns the reports of errors in views; empty without errors. The viewer's menu bar is cropped from
+    the picture.
 
     Raises BadInput if a file cannot be found or written, if `at_s` is outside the run, or if no Vulkan
     driver is installed.

@@ -87,7 +87,7 @@ def _solve(given: Given[ShooterParameters]) -> list[Ragged]:
 
 
 def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tuple[Batches, Detections]:
-    """Arrange the detections of all sensors by shot, with the latest fix of each sensor at that time."""
+    """Arrange detections by shot and sensor, with the latest fix of each sensor at that shot."""
     table = table_of(detections, ["shot_id", *HEARD])
     batches, shot = batches_of(table, "shot_id", detections[0].runs)
     heard = np.full((3, len(batches.run), len(detections)), np.nan)

@@ -1,8 +1,8 @@
 """Localization of a shooter from a single shot: the three methods of Osborne et al., JAIF 2014.
 
 The parameters are the shooter's position, the bullet's direction (except in bearings-only mode, which
-has no information about it) and, if they are estimated, the sensors' positions. If the sensors'
-positions are not estimated, each position fix is used as it is, and its error is added to that of the
+has no information about it) and, if they are estimated, the sensors' positions. Otherwise, each sensor
+is assumed to be at its position fix, and the error of the fix is added to the covariance of the
 sensor's measurements.
 """
 
@@ -28,7 +28,7 @@ from fuselog.replay.estimators.localization.least_squares import (
 )
 from fuselog.replay.estimators.localization.rays import intersect_rays
 
-# Derivatives by azimuth, range and trajectory.
+# Derivatives with respect to azimuth, range and trajectory.
 BY_AZIMUTH = (1.0, 0.0, 0.0)
 BY_RANGE = (0.0, 1.0, 0.0)
 BY_TRAJECTORY = (0.0, 0.0, 1.0)
@@ -59,7 +59,7 @@ class Setting(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """One shot per run as detected by all sensors: (runs, sensors), positions (runs, sensors, 2).
+    """Detections (runs, sensors) of one shot per run, and positions (runs, sensors, 2) of the sensors.
 
     The shockwave and the time difference are NaN if the shockwave was not heard.
     """
@@ -95,9 +95,9 @@ def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m:
 
     Args:
         setting: assumptions of the estimator.
-        shooter_m: (runs, 2).
-        trajectory_rad: (runs,), the direction of the bullet.
-        sensor_m: (sensors, 2), or (runs, sensors, 2).
+        shooter_m: (runs, 2), the true positions of the shooter.
+        trajectory_rad: (runs,), the true directions of the bullet.
+        sensor_m: (sensors, 2), or (runs, sensors, 2), the true positions of the sensors.
     """
     heard = noise_free(setting.medium, shooter_m, trajectory_rad, sensor_m)
     parts = [shooter_m]
@@ -126,7 +126,7 @@ def noise_free(
 
 
 def starting_point(setting: Setting, heard: Detections) -> Floats:
-    """Compute the intersection of the bearings, the mean trajectory of the shockwaves, and the fixes.
+    """Return the intersection of the bearings, the mean direction of the bullet, and the position fixes.
 
     The tangents and cotangents of eqs (32)-(34) describe the same rays with other weights.
     """
@@ -184,7 +184,8 @@ class _Blocks(NamedTuple):
     """Blocks of k measurements per sensor, NaN where missing, with derivatives in the last axis.
 
     residual (runs, sensors, k), jacobian (..., k, d), covariance (..., k, k), and its derivative slope
-    (..., k, k, d): by azimuth, range and trajectory (d = 3) at first, by all parameters in the end.
+    (..., k, k, d). The derivatives are first with respect to azimuth, range and trajectory (d = 3),
+    and in the end with respect to all parameters.
     """
 
     residual: Floats
@@ -199,7 +200,7 @@ def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Bloc
 
 
 def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Compute both directions of arrival and the delay; choose the branch nearest to the shockwave."""
+    """Linearize both directions of arrival and the delay, on the side that fits the shockwave better."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     misses = [
@@ -220,7 +221,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
 
 
 def _local_estimates(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Compute the bearing, and the range and trajectory that a sensor derives from its detections."""
+    """Linearize the bearing, and the range and trajectory that a sensor derives from its detections."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     side = model.measured_side(heard.muzzle_blast_rad, heard.shockwave_rad)
@@ -292,7 +293,7 @@ def _stack(entries: list | tuple | Floats | float, shape: tuple[int, ...]) -> Fl
 
 
 def _chain_rule(setting: Setting, azimuth: Floats, distance: Floats) -> Floats:
-    """Compute derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
+    """Compute the Jacobian (runs, sensors, 3, n) of azimuth, range and trajectory for all parameters."""
     runs, sensors = distance.shape
     x, y = np.cos(azimuth), np.sin(azimuth)
     by_shooter = _stack([[-y / distance, x / distance], [x, y], [0.0, 0.0]], distance.shape)
@@ -329,7 +330,7 @@ def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
 
 
 def _absorb_fixes(view: _Blocks, sigma_m: float) -> _Blocks:
-    """Add the error of position fixes, which has the same effect as a shift of the shooter."""
+    """Add the error of position fixes to the covariance; it acts like a shift of the shooter."""
     by_shooter = view.jacobian[..., :2]
     share = sigma_m**2 * by_shooter @ np.swapaxes(by_shooter, 2, 3)
     return view._replace(covariance=view.covariance + share)

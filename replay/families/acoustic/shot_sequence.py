@@ -1,10 +1,11 @@
 """Model `moving-shooter`, which locates a moving shooter from all shots so far.
 
 A report contains the muzzle blast's direction of arrival, the bullet's direction derived from the
-shockwave, and the shockwave's lead. All of them refer to the shooter's position at the time of the shot,
-not at the arrival of the sound. Reports may be wrong, because of an echo or a shockwave of another shot.
-Gaussian methods treat a report as entirely right or entirely wrong, see
-`fuselog.replay.inference.linear_algebra.inflation`; `particles:N` treats each component separately.
+shockwave, and the shockwave's lead, that is, the time from the shockwave to the muzzle blast. All of
+them refer to the shooter's position at the time of the shot, not at the arrival of the sound. Reports
+may be wrong, because of an echo or a shockwave of another shot. Gaussian methods treat a report as
+entirely right or entirely wrong, see `fuselog.replay.inference.linear_algebra.inflation`;
+`particles:N` treats each component separately.
 """
 
 from collections.abc import Mapping
@@ -34,7 +35,7 @@ CUT = 3.0
 
 
 class MovingShooterParameters(ModelParameters):
-    """Noise of motion, sensors and air, and the search for the start.
+    """Noise of motion and sensors, properties of sound and bullet, and search for the initial state.
 
     Attributes:
         acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
@@ -47,7 +48,7 @@ class MovingShooterParameters(ModelParameters):
         outlier_probability: probability that a component of a report is wrong and may have any value;
             only `particles:N` uses it.
         longest_s: longest time between shockwave and muzzle blast in a wrong report.
-        start_s: duration of the first reports, from which the start is found.
+        start_s: length of the span of first reports from which the initial state is found.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
         start_sigma_rad: standard deviation of the direction of shots at the start.
@@ -118,7 +119,7 @@ def hear_noise(parameters: Any) -> Components:
 def log_likelihood(
     state: Components, measured: Components, sensor: Components, parameters: Any
 ) -> float:
-    """Compute the log-likelihood of a report; each of its components may be an outlier of any value."""
+    """Compute the log-likelihood of a report; each component may be an outlier with any value."""
     azimuth, trajectory, left, right = hear(state, sensor, parameters)
     turn, longest, share = 2.0 * HALF_TURN, parameters.longest_s, parameters.outlier_probability
     lead_s = parameters.sigma_time_difference_s
@@ -132,7 +133,7 @@ def log_likelihood(
 
 
 def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> float:
-    """Compute the log density of a mixture of Gaussian and uniform density; 0 for a missing value."""
+    """Compute the log density of a Gaussian mixed with a uniform density; 0 if the deviation is NaN."""
     if np.isnan(deviation):
         return 0.0
     gaussian = -0.5 * (deviation / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_TWO_PI

@@ -31,10 +31,10 @@ WIDER = 100.0  # factor on the standard deviations of the start, which then has 
 
 
 class SoundSourceParameters(ModelParameters):
-    """Speed of sound, and the search for the start.
+    """Speed of sound, and standard deviations of the initial state.
 
-    The start is found by least squares. Its standard deviations are a hundred times those that the
-    differences imply, so the start has little weight.
+    The initial state is found by least squares. Its standard deviations are a hundred times those that
+    the measured differences imply, so the initial state has little weight.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
@@ -130,9 +130,9 @@ def _settled(
 ) -> tuple[Floats, Floats]:
     """Refine a position (n,) to a root of the cost's gradient; return it and the information (n, n).
 
-    A search for the lowest cost ends where rounding hides lower values; this point differs between CPUs.
-    If the differences do not determine the distance, the gradient is zero only at infinity; the position
-    is then not changed.
+    A search for the lowest cost ends where rounding errors hide any further decrease, which is at
+    different points on different CPUs; the root does not have this problem. If the differences do not
+    determine the distance, the gradient is zero only at infinity; the position is then not changed.
     """
 
     def cost(there: Floats) -> float:

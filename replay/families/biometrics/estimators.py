@@ -76,10 +76,11 @@ class LearnerParameters(Subsets):
     """Training data of a learned fusion, and the pairs of users that it scores.
 
     Attributes:
-        seed: seed of folds and impostors.
+        seed: seed of the random folds and impostors.
         folds: number of folds of users for cross-validation.
         pairs: the paper's trimmed database (all genuine, two random impostors per user), or all pairs.
-        failures: whether failures to enrol keep their scores, as in the paper, or are missing.
+        failures: whether the scores of failed enrolments are kept, as in the paper, or treated as
+            missing.
         logarithmic: modalities whose scores are replaced by log(1 + score).
         impostor_limit: largest number of impostor pairs in the training data.
     """
@@ -134,7 +135,7 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """Fit a classifier with scores above zero for genuine pairs; missing scores are set to the mean.
+    """Fit a classifier, positive for genuine pairs; missing training scores are replaced by the mean.
 
     QDA, LDA, logistic regression and all calibrated classifiers compute a log-likelihood ratio for equal
     priors.
@@ -142,8 +143,8 @@ def learn_classifier(
     Args:
         parameters: the classifier and its settings.
         vectors: the training scores (rows, matchers), in z units, NaN if missing.
-        genuine: (rows,), whether each of them compares the same user.
-        rng: random numbers for classifiers that need them.
+        genuine: (rows,), whether each row compares two samples of the same user.
+        rng: random number generator for classifiers that need them.
 
     Raises BadInput if the classifier cannot be fitted to these scores.
     """
@@ -206,12 +207,12 @@ def learn_mixture(
     """Fit the log-likelihood ratio of two HMMs, eq. 5 with eta 0.
 
     Args:
-        parameters: how the models are fitted.
+        parameters: settings of the fit.
         components: Gaussians per state of the genuine and of the impostor model.
-        sequence: (n, m), the shape of the sequence that a vector of n * m scores contains.
+        sequence: (n, m): each vector of n * m scores is a sequence of n vectors with m scores.
         vectors: the training scores, (rows, n * m).
-        genuine: (rows,), whether each of them compares the same user.
-        rng: random numbers for k-means.
+        genuine: (rows,), whether each row compares two samples of the same user.
+        rng: random number generator for k-means.
     """
     models = []
     for of_class, count in zip((genuine, ~genuine), components, strict=True):
@@ -300,7 +301,7 @@ def _learnt(
 
 
 def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
-    """Return scores (users, users, matchers) in global z units, or logarithms for some modalities."""
+    """Return z-normalized scores (users, users, matchers), for some modalities of their logarithms."""
     scores = compared.scores
     if parameters.failures == "missing":
         scores = np.where(compared.failed, np.nan, scores)

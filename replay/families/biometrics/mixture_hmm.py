@@ -50,8 +50,8 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
     Args:
         sequences: (count, n, m), NaN if a score is missing.
-        how: the model's sizes, and how it is fitted.
-        rng: random numbers for k-means.
+        how: sizes of the model, and settings of the fit.
+        rng: random number generator for k-means.
     """
     whole = sequences[~np.isnan(sequences).any(axis=(1, 2))]
     if len(whole) <= how.components:
@@ -116,10 +116,10 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def _uneven(vectors: Floats) -> Floats:
-    """Return vectors (count, m) with slightly distorted scales, different in each dimension.
+    """Return vectors (count, m) with a slight quadratic distortion, which differs between dimensions.
 
-    Whole-number scores are often equally far from two means. With the distortion, the lower mean is
-    nearer; without it, rounding would decide.
+    Integer scores are often equally far from two means, so rounding would decide to which of them they
+    belong. With the distortion, the lower mean is nearer.
     """
     bend = UNEVEN * np.arange(1, vectors.shape[1] + 1)
     return vectors + bend * (vectors - vectors.min(axis=0)) ** 2

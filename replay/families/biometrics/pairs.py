@@ -115,7 +115,7 @@ def cross_validate(
         pairs: the users of each vector, and the folds of users.
         learner: fits a fusion to training vectors.
         limit: largest number of impostor vectors to learn from.
-        rng: random numbers to draw these vectors with.
+        rng: random number generator that selects these vectors.
     """
     fused = np.empty(len(vectors))
     genuine = pairs.probe == pairs.gallery

@@ -127,7 +127,7 @@ def identified(scores: Floats) -> int:
 
 
 def verification_rate(fused: Fused) -> float:
-    """Compute the share of correct decisions by the threshold, averaged over the folds.
+    """Compute the share of decisions with the threshold that are correct, averaged over the folds.
 
     If the fusion has no threshold, 0 is used, as for a log-likelihood ratio.
     """
@@ -154,9 +154,9 @@ def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, 
 def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
     """Compute the GAR at three FARs and the EER (replicates, 4) for users resampled with replacement.
 
-    The weight of a comparison is the number of draws of its probe's user times that of its gallery's
-    user; the weight of a genuine comparison is the number of draws of its user. This preserves the
-    dependence of scores of the same user (Bolle, Ratha & Pankanti 2004).
+    The weight of a comparison is the number of draws of the probe's user times the number of draws of
+    the gallery user; for a genuine comparison, it is the number of draws of this user. This preserves
+    the dependence of scores of the same user (Bolle, Ratha & Pankanti 2004).
     """
     users = int(fused.gallery.max()) + 1
     order = np.argsort(-fused.score, kind="stable")

@@ -49,14 +49,15 @@ class Steps(NamedTuple):
 
 
 def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
-    """Make steps of vectors that are checked and scaled to exactly unit length.
+    """Make steps from vectors, which are checked and scaled to exactly unit length.
 
     Args:
         offsets: (runs + 1,), the first row of each run.
         increment: known rotations (rows, d), unit vectors.
         measurement: unit vectors (rows, d), NaN if there is no measurement.
 
-    Raises BadInput if a vector is neither a unit vector nor NaN, or if the numbers of rows differ.
+    Raises BadInput if a vector is neither a unit vector nor NaN, or if the arrays have different
+    numbers of rows.
     """
     if not len(increment) == len(measurement) == offsets[-1]:
         raise BadInput(

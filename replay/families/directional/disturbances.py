@@ -28,7 +28,8 @@ def disturbances(samples: Stream, estimates: Stream, limit_ut: float = 8.0) -> D
     Args:
         samples: samples of an inertial unit with a magnetometer.
         estimates: estimates with the components `COMPONENTS`; samples without an estimate are ignored.
-        limit_ut: limit in uT, usually four times the standard deviation of an undisturbed field.
+        limit_ut: limit of the deviation in uT, usually four times the standard deviation of an
+            undisturbed field.
     """
     row = np.searchsorted(estimates.publish_time_ns, samples.publish_time_ns).clip(0, len(estimates) - 1)
     field = samples["magnetic_field_ut"]

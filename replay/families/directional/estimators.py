@@ -72,11 +72,11 @@ class KalmanParameters(BinghamParameters):
 
 
 class HeadingsFilterParameters(Parameters):
-    """Parameters of the model of `headings`; by default, the numbers that the channel of the log states.
+    """Parameters of the model of `headings`; by default, the values that the channel of the log states.
 
     Attributes:
-        coupling_rad: in each step, the first heading turns by this times the cosine of the second, and
-            the second by this times the sine of the first.
+        coupling_rad: in each step, the first heading turns by this angle times the cosine of the
+            second, and the second by this angle times the sine of the first.
         drift1_rad: additional turn of the first heading per step.
         drift2_rad: additional turn of the second heading per step.
         system_sigma_rad: standard deviation of a heading's noise per step.
@@ -105,7 +105,7 @@ class TorusParameters(HeadingsFilterParameters):
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """Parameters of the model of `headings`, and the comparison of angles.
+    """Parameters of the model of `headings`, and treatment of the innovation's angles.
 
     Attributes:
         wrapped: whether the innovation is wrapped to [-pi, pi); if not, only the angles are reduced
@@ -162,7 +162,7 @@ def as_bingham(noise: DirectionalNoise) -> Bingham:
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
-    """Return the covariance (d, d) of the Gaussian; for a Bingham distribution, (57) about its mode."""
+    """Return the covariance (d, d) of the Gaussian; for a Bingham distribution, by (57)."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
     return bingham.hemisphere_covariance(as_bingham(noise))
@@ -206,7 +206,7 @@ def _widened(state: Any, runs: int) -> Any:
 
 
 def heading_model(given: Given[Any]) -> HeadingModel:
-    """Return the model that the parameters and the channel state."""
+    """Return the model defined by the parameters and, if they are not set, by the channel."""
     stated = {name: given.stated("headings", name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])

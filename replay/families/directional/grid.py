@@ -1,7 +1,7 @@
 """Bayesian filters on a grid over the half circle and the torus, as a reference.
 
-They discretize the domain and do not approximate densities, so they show the best accuracy that a filter
-of the same model can reach.
+They discretize the domain instead of approximating the densities, so they show the best accuracy that
+any filter with the same model can reach.
 """
 
 from collections.abc import Iterator
@@ -88,7 +88,7 @@ def run_torus_grid_filter(
         offsets: (runs + 1,), the rows of each run.
         measurement: (rows, 2), rad; NaN if the row is only a prediction, or if the second angle is not
             measured.
-        motion: motion of the angles.
+        motion: function that moves both angles by one step.
     """
     n = state.shape[1]
     grid = torus_grid(n).reshape(-1, 2)
@@ -146,7 +146,7 @@ def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> "sparse.c
 
 
 def _in_step(offsets: Integers) -> Iterator[tuple[Integers, Integers]]:
-    """Yield the runs that have a next row, and these rows, until all rows have been used."""
+    """Yield the runs with a first row, and these rows; then the runs with a second row, and so on."""
     counts = np.diff(offsets)
     for step in range(int(counts.max(initial=0))):
         runs = np.flatnonzero(counts > step)

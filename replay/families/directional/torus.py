@@ -46,7 +46,7 @@ class HeadingModel(NamedTuple):
     """The motion of two headings and their noise.
 
     Attributes:
-        coupling_rad: c in the motion.
+        coupling_rad: c in the motion, see `turn_together`.
         drift_rad: additional turns per step, (2,).
         system: covariance of w, (2, 2), rad^2.
         measurement: covariance of v, (2, 2), rad^2.
@@ -81,14 +81,14 @@ Motion = Callable[..., tuple[Component, Component]]
 def make_heading_model(
     coupling_rad: float, drift_rad: ArrayLike, system: ArrayLike, measurement: ArrayLike
 ) -> HeadingModel:
-    """Make a heading model after checking its numbers.
+    """Make a heading model after checking its values.
 
     Args:
-        coupling_rad: c in the motion.
+        coupling_rad: c in the motion, see `turn_together`.
         drift_rad: additional turns per step, (2,).
         system, measurement: covariances of w and v, (2, 2), rad^2.
 
-    Raises BadInput if a covariance is not positive definite or a number is not finite.
+    Raises BadInput if a covariance is not positive definite or a value is not finite.
     """
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
         raise BadInput(
@@ -120,7 +120,7 @@ def run_toroidal_filter(
         state: the distributions before the first row, batch axis (runs,).
         offsets: (runs + 1,), the rows of each run.
         measurement: (rows, 2), rad.
-        motion: motion of the angles.
+        motion: function that moves both angles by one step.
         central_weight: w5 of the five samples.
 
     Returns:

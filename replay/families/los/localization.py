@@ -58,8 +58,8 @@ class Observability(NamedTuple):
     """Observability of the parameters from the measurements of one run.
 
     `turning_axis` is the unit vector about which all sensors and targets can rotate together without a
-    change in the measurements; None if all parameters are observable, or if the unobservable directions
-    are different ones.
+    change in the measurements; None if all parameters are observable, or if something other than this
+    rotation is unobservable.
     """
 
     rank: int
@@ -125,8 +125,8 @@ def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
     """Compute the start as printed, (21)-(23), for the first two sensors, with zero nominal attitudes.
 
     The paper writes z, x, y for x, y, z. The start depends on the difference of two azimuths: if
-    everything is nearly in one vertical plane, as in the paper's three-sensor scenes, the start is too
-    inaccurate. The function is meant for experiments.
+    sensors and targets are nearly in one vertical plane, as in the paper's three-sensor scenes, the
+    start is too inaccurate. The function is meant for experiments.
 
     Args:
         scene: knowledge before the measurements.
@@ -206,7 +206,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """Find the common axis about which a direction turns all sensors; None if there is no such axis."""
+    """Find the axis about which all sensors rotate along the direction `unseen`; None if they differ."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
@@ -223,8 +223,8 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
     """Compute the CRLB sigmas of all biases for the case that one of the unknown biases is known.
 
-    If a row has infinite or large values, its bias is not a useful choice: if it is fixed, the others
-    are still not observable.
+    If a row has infinite or large values, it is not useful to know its bias, because the other biases
+    are still unobservable.
 
     Args:
         scene: knowledge before the measurements.

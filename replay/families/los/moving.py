@@ -83,8 +83,9 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """Compute the variances that white accelerations add.
 
-    Covariances between the components are left out: in a step of a fraction of a second, the noise of
-    positions is a few millimetres, and a triangle of 23 components takes minutes to compile.
+    Covariances between the components are left out. They hardly matter, because in a step of a
+    fraction of a second the noise of positions is a few millimetres, and the lower triangle for 23
+    components takes minutes to compile.
     """
     place, _, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return (place, place, place, speed, speed, speed, place, place, place, speed, speed, speed)
@@ -107,7 +108,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Compute azimuth and elevation of a target in rad; `reference` has its number and the pose."""
+    """Compute azimuth and elevation of a target in rad; `reference` is its number and the pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (

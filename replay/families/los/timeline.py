@@ -53,7 +53,7 @@ class Sensor(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Ellipsoids of the targets of an estimator, `at_once` of them at each stamp."""
+    """Ellipsoids of an estimator's targets; each stamp has `at_once` of them."""
 
     estimator: str
     colour: Colour
@@ -128,7 +128,7 @@ def _draw_points(canvas: Canvas, name: str, places: Floats, colour: Colour) -> N
 
 
 def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> None:
-    """Draw the lines of sight as they arrive, with their biases."""
+    """Draw the lines of sight when they arrive, without a correction of their biases."""
     for sensor in sensors:
         rays = _rays(sensor, sensor.sights, np.zeros(3), length_m)
         times_ns = sensor.sights.publish_time_ns
@@ -150,7 +150,7 @@ def draw_rays(
     Args:
         canvas, entity: the canvas, and the entity on it.
         shown_ns: sorted times at which rays are drawn.
-        time_ns: (n,), sorted, the time of each ray, one of these times.
+        time_ns: (n,), sorted, the time of each ray, which is one of `shown_ns`.
         rays: (n, 2, 3), in m, begin and end.
         colour: colour of the rays.
     """

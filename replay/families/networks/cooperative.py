@@ -61,10 +61,10 @@ class CooperativeParameters(Parameters):
         criterion: quantity that covariance intersection minimizes: the trace of a pose's covariance, in
             m^2 + rad^2, or its determinant.
         anchors: numbers of the robots that know the map.
-        forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times
-            the square root of the step.
+        forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation
+            times the square root of the time step.
         turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
-            square root of the step.
+            square root of the time step.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
         gate_probability: a measurement is rejected if its NIS exceeds this quantile of chi-square; 1

@@ -234,7 +234,7 @@ def weigh_fully(count: int, weights: Floats) -> None:
 def weigh(
     rule: int, count: int, covariances: Floats, memory: FusionMemory, weights: Floats, tolerance: float
 ) -> float:
-    """Compute the weights of a rule that sums weighted information; return their certificate.
+    """Compute the weights of a rule that sums weighted information; return their gap.
 
     Args:
         rule: number of the rule in `RULES`.
@@ -242,7 +242,7 @@ def weigh(
         covariances: (K, n, n).
         memory: scratch memory with the information matrices of the estimates.
         weights: (K,), overwritten.
-        tolerance: largest remaining gain of the criterion.
+        tolerance: largest gap, see `Fusions`, at which the optimization ends.
     """
     if rule in (CI_TRACE, CI_DETERMINANT):
         by_trace = rule == CI_TRACE
@@ -259,7 +259,7 @@ def weigh(
 def fuse_together(
     rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
-    """Fuse estimates by a rule that sums weighted information; return the certificate."""
+    """Fuse estimates by a rule that sums weighted information; return the gap."""
     information, (mean, covariance, weights) = memory.information, fused
     for i in range(count):
         if not inverted(parts.covariance[i], information[i]):
@@ -280,7 +280,7 @@ def rule_number(name: str) -> int:
 def fuse_by(
     rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
-    """Fuse the first `count` estimates by the rule with the given number; return the certificate.
+    """Fuse the first `count` estimates by the rule with the given number; return the gap.
 
     `tolerance` limits the gap if the weights are optimized together; otherwise, it limits the square of
     ten times the error of a single weight.
@@ -315,10 +315,11 @@ def fuse(
         name: one of RULES.
         means: (..., K, n).
         covariances: (..., K, n, n).
-        independents: (..., K, n, n), for "split-ci": the parts that are independent of all other errors.
+        independents: (..., K, n, n), for "split-ci": the parts of the covariances due to errors that
+            are independent of all others.
         tolerance: largest gap of an optimized rule.
 
-    Raises BadInput if shapes do not match, a number is not finite, a covariance is not symmetric and
+    Raises BadInput if shapes do not match, a value is not finite, a covariance is not symmetric and
     positive definite, an independent part exceeds its covariance, or the weights do not converge.
     """
     mean, covariance = np.asarray(means, float), np.asarray(covariances, float)

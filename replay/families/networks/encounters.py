@@ -88,11 +88,11 @@ class RobotMemory(NamedTuple):
     """Scratch memory of the kernel, for one run.
 
     Attributes:
-        state, transition, gain, variances: of a prediction, (3,), (3, 3), (3, 2), (2,).
-        predicted, rows: predicted sighting (2,), and its Jacobian by the observer's pose (2, 3).
-        both: Jacobians by the poses of the observer and of the observed robot, (2, 2, 3).
+        state, transition, gain, variances: quantities of a prediction, (3,), (3, 3), (3, 2), (2,).
+        predicted, rows: predicted sighting (2,), and its Jacobian for the observer's pose (2, 3).
+        both: Jacobians for the poses of the observer and of the observed robot, (2, 2, 3).
         spread, square: H P H' and H P P H' of both robots, (2, 2, 2).
-        whole: Jacobian by the state of all robots, (2, 3 n).
+        whole: Jacobian for the state of all robots, (2, 3 n).
         product: (3, 3 n).
         update: see `fuselog.replay.inference.linear_algebra.small_matrices`.
     """
@@ -237,7 +237,7 @@ def scale(covariance: Floats, first: int, factor: float) -> None:
 
     Args:
         covariance, first: as for `fill_spread`.
-        factor: the factor.
+        factor: factor by which the covariances of the block are multiplied.
     """
     for row in range(3):
         for column in range(3):
@@ -300,7 +300,7 @@ def cooperate(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Predict the robots of an event to its time and process it, unless the state is newer."""
+    """Predict the robots of an event to its time and process the event, unless the state is newer."""
     events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)

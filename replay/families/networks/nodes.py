@@ -169,8 +169,8 @@ def observe(
 
     Args:
         mean, covariance: (n,), (n, n).
-        independent: (n, n), the part of the covariance due to measurements since this part was last
-            zero.
+        independent: (n, n), the part of the covariance due to the measurements since this part was
+            last set to zero.
         value, variance: (n,), NaN for components that are not measured.
     """
     size = len(mean)
@@ -249,13 +249,13 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
 
 
 def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
-    """Test whether two estimates of any correlation can belong to the same state.
+    """Test whether two estimates, with any correlation, agree sufficiently to be of the same state.
 
     The covariance of the difference is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
 
     Args:
         mean, covariance, received: both estimates, (n,), (n, n).
-        gate: their largest squared distance; infinity accepts everything.
+        gate: largest squared distance of estimates that agree; infinity accepts everything.
     """
     if gate == np.inf:
         return True

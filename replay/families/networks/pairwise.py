@@ -103,7 +103,7 @@ class Stake(NamedTuple):
 
 
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """Find the best weight w of a measurement of part of a state that depends on another estimate.
+    """Find the best weight w for a sighting, which measures part of a state and uses another estimate.
 
     One part of the measurement's noise has an unknown correlation with the state; the other part, that
     of the sensor, is independent. The fusion uses P / w and the noise shared / (1 - w) + own, where w

@@ -212,7 +212,7 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
 
 
 def _line_of(sent: Stream) -> str:
-    """Summarize the messages sent at one time in a line."""
+    """Summarize, in one line of text, the messages that are sent at one time."""
     ways = [f"{a}>{b}" for a, b in zip(sent["sender_id"], sent["receiver_id"], strict=True)]
     late_s = (sent["arrival_time_ns"] - sent.publish_time_ns) * 1e-9
     parts = [f"{len(sent)} messages sent"]

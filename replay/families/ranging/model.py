@@ -30,10 +30,10 @@ _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """Noise of motion and ranges, bias, height of the tag, and search for the start.
+    """Noise of motion and ranges, bias, height of the tag, and search for the initial state.
 
-    The start is found by least squares from the first ranges, beginning at positions on all sides of the
-    anchors' centre.
+    The initial state is found by least squares from the first ranges, starting at positions on all
+    sides of the anchors' centre.
 
     Attributes:
         acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
@@ -41,7 +41,7 @@ class RangingParameters(ModelParameters):
         bias_range_m: bias of ranges: measured minus true.
         height_m: height at which the tag moves.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
-        start_s: duration of the first ranges, from which the start is found.
+        start_s: length of the span of first ranges from which the initial state is found.
         start_reach_m: distance of the starting points of the search from the anchors' centre, on all
             sides.
         start_sigma_m: standard deviation of the position at the start, per axis.
@@ -230,7 +230,7 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
     """Find the best of the robust least-squares fits from several starts.
 
     Args:
-        residuals: position or pose (k,) -> residuals (n,) of ranges, in m.
+        residuals: function that maps a position or pose (k,) to the residuals (n,) of ranges, in m.
         starts: positions or poses (k,) from which to search.
         parameters: with `sigma_range_m`; residuals above three times this value have less weight.
     """

@@ -1,8 +1,9 @@
 """Model of an extended target: a random walk, measured with multiplicative noise.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
-VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The
-filters treat the scales h as Gaussian although they are uniform, so E h^4 = 1/3.
+VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012.
+The filters treat the scales h, which are uniform, as Gaussian; they therefore use E h^4 = 1/3 instead
+of 1/5.
 """
 
 from typing import Any
@@ -47,7 +48,7 @@ def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
 
 
 def measure(target: Components, noise: Components, reference: Any, parameters: Any) -> Components:
-    """Compute a point of the surface and its squares, with noise in two scales and in the point."""
+    """Compute a point of the surface with noise in both scales and in the point, and its squares."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
 
@@ -82,7 +83,7 @@ def moments(
     Args:
         mean, covariance: (4,) and (4, 4), of the state: two half sides l and the centre c, in m.
         reference: not used.
-        parameters: with `point_variance_m2`, r.
+        parameters: parameters with `point_variance_m2`, which is r.
         predicted, spread, cross: E y (4,), Cov(y) (4, 4), Cov(state, y) (4, 4), overwritten.
     """
     for i in range(2):

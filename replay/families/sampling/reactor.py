@@ -55,7 +55,7 @@ def moments(
     Args:
         mean, covariance: (2,) and (2, 2), of both partial pressures, changed in place.
         control, duration_s: not used: every step is `parameters.step_s` long.
-        parameters: with `step_s`.
+        parameters: parameters with `step_s`.
     """
     square = mean[0] * mean[0] + covariance[0, 0]
     variance = 2.0 * covariance[0, 0] ** 2 + 4.0 * mean[0] ** 2 * covariance[0, 0]

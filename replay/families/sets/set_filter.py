@@ -1,4 +1,4 @@
-"""Filter of guaranteed position sets, which odometry moves and every frame of bearings cuts.
+"""Filter of guaranteed position sets, which are moved by odometry and cut by every frame of bearings.
 
 Briechle, Hanebeck (2004) derive the set of one frame of relative bearings, see `set_membership`; the
 recursion that moves and intersects sets is that of Schweppe, Recursive State Estimation: Unknown but
@@ -113,7 +113,7 @@ class SetStep(NamedTuple):
         time_ns: stamp of the frame.
         anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if there was
             none.
-        parts: the set, with a second part if it contradicts a frame.
+        parts: the set; if a frame contradicts it, also the set of that frame.
         headings: interval of the heading.
         growth: factor by which the form L = 8 enlarged the set.
         finding: index in FINDINGS of the finding at this frame; None if there is none.
@@ -157,7 +157,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """Narrow headings to those that agree with the bearings of landmarks; None if no heading does."""
+    """Narrow headings to those that agree with the bearings of landmarks; None if no heading agrees."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:

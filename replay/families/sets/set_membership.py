@@ -1,8 +1,8 @@
 """Guaranteed position sets from bounded relative bearings, one for each frame of equal stamps.
 
-Briechle, Hanebeck (2004). The estimate is a set: the exact one, its tightest box, or a pseudo-ellipsoid
-with L = 4 or L = 8. An empty set is a fault; the wrong relative bearing is then repeated on the topic of
-faults.
+Briechle, Hanebeck (2004). The estimate is a set: the exact one, its tightest box, or a
+pseudo-ellipsoid with L = 4 or L = 8. An empty set is a fault: the relative bearing that is probably
+wrong is then also written to the topic of faults.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -46,8 +46,8 @@ class SetParameters(Parameters):
         sweeps: number of times that pseudo-ellipsoids fuse all pairs.
         least_landmarks: smallest number of landmarks at one stamp for which a set is computed.
         arena_m: rectangle that certainly contains the robot (low x, low y, high x, high y).
-        maximum_range_m: without an arena, the greatest distance of a robot from a landmark that it sees;
-            by default, the longest range that its sensor has measured.
+        maximum_range_m: without an arena, the greatest distance of a robot from a landmark that it
+            sees; by default, the longest range that its sensor measured.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"
@@ -141,7 +141,7 @@ def set_streams(
 
 
 def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
-    """Make a stream of the wrong relative bearings of empty sets, from frames and indices of pairs."""
+    """Make a stream of the relative bearings that caused empty sets, each given by frame and pair."""
     pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
     return make_stream(
         f"{prefix}/fault",

@@ -1,4 +1,4 @@
-"""Timeline of vessels: a map and the tangent plane, with reports in the colours of their tracks.
+"""Timeline of vessels: a map and the tangent plane, with reports coloured by track.
 
 Map tiles are loaded from the network; offline, the reports are still drawn at their positions. Next to
 the map are the numbers of live tracks and vessels, and the share of each vessel's reports in its own

@@ -2,9 +2,10 @@
 
 Source: Vo, Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 54(11), 2006,
 table I (recursion), II (pruning, merging), III (extraction). Targets are equally likely to appear
-anywhere, as in Beard, Vo, Vo, Arulampalam, "A partially uniform target birth model for Gaussian mixture
-PHD/CPHD filtering", IEEE TAES 49(4), 2013: every detection also begins a component, and births without a
-detection are not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
+anywhere, as in Beard, Vo, Vo, Arulampalam, "A partially uniform target birth model for Gaussian
+mixture PHD/CPHD filtering", IEEE TAES 49(4), 2013: every detection also begins a component, and births
+that are not detected are dropped. The state is (x, vx, y, vy); accelerations are white and constant
+between scans.
 """
 
 import warnings

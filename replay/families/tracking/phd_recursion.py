@@ -97,8 +97,8 @@ class PhdMemory(NamedTuple):
         weight, mean, covariance: the components after a scan, before reduction.
         factor, is_merged, heaviest, step, shift: memory for merging them.
         innovation: innovation of a detection for a component.
-        seen_factor, seen_gain, seen_covariance: for the update of each component: the factor L of the
-            innovation covariance S (2, 2), W = C L^-T (4, 2), and the updated covariance.
+        seen_factor, seen_gain, seen_covariance: quantities for the update of each component: the factor
+            L of the innovation covariance S (2, 2), W = C L^-T (4, 2), and the updated covariance.
     """
 
     weight: Floats
@@ -162,7 +162,7 @@ def add_detected(
     work: PhdMemory,
     end: int,
 ) -> int:
-    """Append all components after the update by one detection, and a birth; return the new end.
+    """Append all components as updated with one detection, and a birth; return the new end.
 
     Args:
         run: index of the run.
@@ -229,7 +229,7 @@ def update(
 
 
 def squared_distance(work: PhdMemory, member: int, other: int) -> float:
-    """Compute the squared Mahalanobis distance of two means under the member's covariance."""
+    """Compute the squared Mahalanobis distance of two means, with the covariance of `member`."""
     squared = 0.0
     for row in range(STATES):
         value = work.mean[member, row] - work.mean[other, row]

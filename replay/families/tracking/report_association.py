@@ -21,7 +21,7 @@ NO_TRACK = -1
 
 
 class ReportSettings(NamedTuple):
-    """Parameters as the kernel reads them; parameters of the levels have the shape (LEVELS,)."""
+    """Parameters as the kernel reads them; parameters of the noise levels have the shape (LEVELS,)."""
 
     acceleration_density: Floats
     position_variance: Floats
@@ -132,7 +132,7 @@ def reported(
     Args:
         spread, duration_s: as for `widened`.
         level: the level, below `LEVELS`.
-        velocity_variance: the report's own variance, added to that of the level, in (m/s)^2.
+        velocity_variance: variance of the reported velocity, added to that of the level, in (m/s)^2.
         settings: settings with the noise of the levels.
     """
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
@@ -188,11 +188,11 @@ def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: R
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
-    """Compute the density of such reports from new vessels, per m^2, s and (m/s)^2.
+    """Compute the density of reports with this velocity from new vessels, per m^2, s and (m/s)^2.
 
     Args:
         velocity: reported velocity, (2,) in m/s.
-        own_variance: variance of that velocity, in (m/s)^2.
+        own_variance: variance of the reported velocity, in (m/s)^2.
         settings: settings with the rate of births and the speeds of vessels.
     """
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)

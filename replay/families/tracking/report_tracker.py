@@ -186,7 +186,8 @@ def _memory(reports: int, places: int) -> ReportMemory:
 def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
     """Convert the parameters to settings of the kernel, with births per m^2 and s.
 
-    Raises BadInput if the last level is not the widest, because gates are computed with it.
+    Raises BadInput if the last level does not have the largest noise, because gates are computed with
+    it.
     """
     for name in ("acceleration_density", "sigma_position_m", "sigma_velocity_mps"):
         levels = getattr(parameters, name)

@@ -82,7 +82,7 @@ def place_clutter(detection: Any, parameters: Any) -> Component:
 def place_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return position, covariance and m^2 per measured unit of a target at a detection."""
+    """Return a target's position at a detection, its covariance, and the m^2 per unit of measurement."""
     x = detection[0] - parameters.bias_x_m + origin[0]
     y = detection[1] - parameters.bias_y_m + origin[1]
     return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters), 1.0
@@ -136,7 +136,7 @@ def polar_clutter(detection: Any, parameters: Any) -> Component:
 def polar_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return position, covariance and m^2 per measured unit of a target at a detection."""
+    """Return a target's position at a detection, its covariance, and the m^2 per unit of measurement."""
     range_m, bearing_rad = detection[0] - parameters.bias_range_m, detection[1] - parameters.bias_rad
     cosine, sine = np.cos(bearing_rad), np.sin(bearing_rad)
     x, y = origin[0] + range_m * cosine, origin[1] + range_m * sine

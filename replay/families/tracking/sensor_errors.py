@@ -1,8 +1,8 @@
 """Persistent errors of sensors, as additional components of the state of every track.
 
-A registration error is constant and shared by all tracks. A correlated error belongs to one track (an
-example is the point of a hull that is detected) and decorrelates with the time constant `correlation_s`,
-as a first-order Gauss-Markov process.
+A registration error is constant and shared by all tracks. A correlated error belongs to one track (for
+example, because any point of a hull may be detected); it is a first-order Gauss-Markov process with the
+time constant `correlation_s`.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,8 @@ class Errors(NamedTuple):
 
     Attributes:
         names: names of the components.
-        sigma, correlation_s: (errors,), of each error; `correlation_s` is infinite for a constant error.
+        sigma, correlation_s: (errors,), standard deviation and time constant of each error;
+            `correlation_s` is infinite for a constant error.
         shared: the number of registration errors.
         places: for each sensor, the indices of its errors by kind of error and measured component, such
             as `registration_at_0`; -1 for no error.

@@ -64,7 +64,7 @@ class Targets(NamedTuple):
 
     Attributes:
         bound_model: bound model of the targets, with one motion or with all modes.
-        parameters: the numbers of the model; NaN for numbers that are not used.
+        parameters: the parameters of the model; NaN for those that are not used.
         newborn: a target of which only the position is known.
     """
 
@@ -77,7 +77,7 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
     """Build the targets from the parameters of a tracker, or from channels for missing parameters.
 
     Raises BadInput, with a message that begins with `where`, if the model cannot describe a target or if
-    a number is missing.
+    a parameter is missing.
     """
     name = parameters.model
     if name is None:

@@ -188,7 +188,7 @@ class Joined(NamedTuple):
 
 
 def _joined(scan: Stream, seen: Stream) -> Joined:
-    """Replace each chain of near detections of a scan by its mean, in order of first detections.
+    """Replace each chain of near detections of a scan by its mean, in order of their first detections.
 
     The channel of the scans states the distance; see
     `fuselog.replay.families.tracking.association.scanning.join_near`.

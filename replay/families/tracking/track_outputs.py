@@ -59,7 +59,7 @@ def _bounds(ends: Integers) -> Integers:
 
 
 def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
-    """Return the stamps of all tracks after all scans."""
+    """Return a stamp for each track after each scan."""
     used = tracked.confirmed != NEVER
     return np.repeat(scans.time_ns[used], tracked.confirmed[used])
 

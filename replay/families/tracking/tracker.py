@@ -88,8 +88,8 @@ class TrackerParameters(Parameters):
         sensors: the sensors to use, such as ["radar", "lidar"]; all by default.
         model: a registered model with a position, which describes the motion of targets; constant
             velocity by default.
-        mode: the mode of that model to use; all modes by default.
-        motion: parameters of that model, by name.
+        mode: the mode of `model` to use; all modes by default.
+        motion: parameters of `model`, by name.
         acceleration_density: power spectral density of the acceleration of targets without a model, in
             m^2/s^3.
         birth_sigma_mps: standard deviation of a new track's velocity, per axis.
@@ -133,7 +133,7 @@ class TrackerParameters(Parameters):
         far_clutter_factor: factor on clutter far from the sensor.
         sector_from_rad: start of a sector with different detection and clutter, anticlockwise from the x
             axis.
-        sector_to_rad: end of that sector, anticlockwise from the x axis.
+        sector_to_rad: end of the sector, anticlockwise from the x axis.
         sector_detection_factor: factor on the probability of detection in the sector.
         sector_clutter_factor: factor on clutter in the sector.
         joined_within_m: distance within which detections are joined and count as one target.
@@ -144,7 +144,7 @@ class TrackerParameters(Parameters):
         detection_probability: probability that a near target is detected.
         blind_from_rad: start of the sector in which a sensor cannot detect targets, anticlockwise from
             the x axis.
-        blind_to_rad: end of that sector, anticlockwise from the x axis.
+        blind_to_rad: end of the sector, anticlockwise from the x axis.
         interval_s: least time between two detections of one sensor that update a track.
         registration_sigma_m: standard deviation of the registration error of positions or ranges; 0 for
             no such error.
@@ -216,7 +216,7 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Set the management, and the probabilities of existence, that match the association."""
+        """Set defaults of management and existence that suit the association; check given values."""
         association = values.get("association", "jipda")
         goes_by_existence = association in EXISTING
         given = values.get("management")
@@ -295,7 +295,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
 
 
 class TrackerSettings(NamedTuple):
-    """Numbers that the tracking loop reads (one row per sensor), and the errors of the sensors."""
+    """Parameters that the tracking loop reads, one row per sensor, and the errors of the sensors."""
 
     names: tuple[str, ...]
     numbers: Floats

@@ -15,7 +15,7 @@ SETTLED = 2000
 
 
 class Axis(NamedTuple):
-    """Squared position errors of one axis: from the filter's covariance, and for a truth without noise.
+    """Squared position errors of one axis, for a truth with random accelerations and for one without.
 
     `gain` (2,) is the last gain, of position and velocity.
     """
@@ -65,7 +65,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """Compute the smallest total errors; a topology measures 1 combination, a free pose all but 3."""
+    """Compute the total errors; the topology measures one combination, a free pose all but three."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

@@ -315,7 +315,7 @@ def _draw_close(
     canvas.fix(f"{CLOSE}/truth", truth)
 
     def near(points: Points) -> Points:
-        """Return points in the cell of every vehicle to which they are near."""
+        """Place each point in the close-ups of all vehicles to which it is near."""
         apart = points.places[:, None] - vehicles.places[vehicles.rows(points.time_ns)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2, initial=0.0) < SHOWN_M)
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])

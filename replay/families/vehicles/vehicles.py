@@ -50,7 +50,7 @@ def positions(motion: Motion, mean: Floats) -> Floats:
     """Return the positions (runs, vehicles, 2) of the vehicles.
 
     Args:
-        motion: the vehicles' motion, for their number.
+        motion: motion of the vehicles, which states their number.
         mean: means of the joint states, (runs, n).
     """
     count = motion.vehicles
@@ -261,7 +261,7 @@ class Scalar(NamedTuple):
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
     """Linearize the topology of scans, which does not depend on their frame and order.
 
-    The innovation is NaN if it is too improbable, because a vehicle was then missed and something else
+    The innovation is NaN if it is too improbable: a vehicle was then probably missed and something else
     was detected.
 
     Args:

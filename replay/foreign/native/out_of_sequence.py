@@ -121,7 +121,7 @@ def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
 
 
 def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
-    """Find the last row of the newest stamp with estimates; row `last` is the newest."""
+    """Find the last row of the newest stamp that has an estimate; row `last` has the newest stamp."""
     row, order = last, arrived.order
     while row > 0 and arrived.estimating[order[row]] == 0:
         row -= 1

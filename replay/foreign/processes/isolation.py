@@ -60,7 +60,7 @@ class Watch:
         self._since = time.monotonic()
 
     def look(self, progress: object, allowed_s: float | None = None) -> None:
-        """Raise Ended if the process exceeds a limit; a new value of `progress` shows an advance."""
+        """Raise Ended if the process exceeds a limit; time counts from the last change of `progress`."""
         now, limit_s = time.monotonic(), allowed_s or self._limits.time_s
         if progress != self._seen:
             self._seen, self._since = progress, now
@@ -282,7 +282,7 @@ def _end_kept() -> None:
 def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with filters in parallel, in one process per core; None stays None."""
+    """Process runs with filters in parallel, one process per core; the result of None is None."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
     workers = Workers()
 
@@ -301,7 +301,7 @@ def follow_runs_apart(
 def in_threads(
     work: Callable[[Given], Found], items: Sequence[Given], count: int, stop: Callable[[], None]
 ) -> list[Found]:
-    """Process all items in threads and return the results; `stop` ends the processes they wait for."""
+    """Process all items in threads; `stop` ends the processes for which the threads wait."""
     with ThreadPoolExecutor(count) as threads:
         try:
             return [each.result() for each in [threads.submit(work, item) for item in items]]

@@ -40,7 +40,7 @@ class Conditioning(NamedTuple):
     elapsed_s: float = 0.0
 
     def plus(self, other: "Conditioning") -> "Conditioning":
-        """Return the combination with `other`."""
+        """Combine the samples with those of `other`."""
         worst = other if other.least < self.least else self
         return worst._replace(
             sampled=self.sampled + other.sampled,
@@ -88,7 +88,7 @@ def _sampled(count: int) -> NDArray[np.int64]:
 
 
 def _least_of_all(covariances: NDArray[np.float64]) -> float:
-    """Compute the smallest pivot of covariances (count, n, n); NaN if one of them has no factor.
+    """Compute the smallest pivot of covariances (count, n, n); NaN if one has no Cholesky factor.
 
     Every replay calls this function and precision is rarely lost, so it uses few calls of NumPy.
     """

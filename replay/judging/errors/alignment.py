@@ -83,7 +83,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
 
 
 def rotation_error_rad(estimate_m: Floats, truth_m: Floats, align: Align) -> float:
-    """Compute half the 95 % interval of a rotation from positions, about the least certain axis.
+    """Compute half the width of the 95 % interval of the rotation about its least certain axis.
 
     With errors of variance s^2 per axis, the information on a rotation about a unit vector u is sum |u x
     p|^2 / s^2 over the centred positions p, so its variance is s^2 divided by the sum of squared

@@ -75,7 +75,7 @@ class Difference(NamedTuple):
         more: second - first.
         margin: differences up to this value are unimportant.
         verdict: verdict on the second estimator: whether the interval is beyond the margin or within it.
-        sure: fraction of the resamples in which the difference has this sign.
+        sure: fraction of the resamples in which the difference has the sign of `more`.
         runs: number of runs.
     """
 
@@ -111,7 +111,7 @@ def paired_difference(
         target: target of the metric.
         margin: unimportant difference, as a fraction of the first estimator's mean or of the target
             value.
-        scale: value that replaces this mean or target value.
+        scale: value that replaces the first estimator's mean or the target value.
     """
     means = float(first.mean()), float(second.mean())
     if scale is None:
@@ -161,7 +161,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
-    """Return the verdict on a difference; if the two are on both sides of a target, only its sign."""
+    """Return the verdict on a difference; with a value as target, only the sign if neither is closer."""
     if target in ("low", "high"):
         return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):

@@ -69,7 +69,7 @@ class Errors:
         error: (n, d) estimate minus truth.
         covariance: (n, d, d) as stated by the estimator.
         nees: (n,) normalised estimation error squared; NaN if the covariance is not positive definite.
-        without_truth: number of estimates without truth within the gap limit.
+        without_truth: number of estimates at stamps for which the truth cannot be interpolated.
         components_without_truth: components of the estimate that are not judged because the truth lacks
             them.
         is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
@@ -193,9 +193,10 @@ def nis_by_bin(
     Args:
         place: (n,), the bin of each innovation.
         squared: (n,) NIS.
-        degrees: (n,), the numbers of components.
+        degrees: (n,), the numbers of measured components.
 
-    Returns the bins with a component (m,), and for each the mean and its 95 % interval.
+    Returns the bins (m,) with at least one measured component, and the mean and its 95 % interval in
+    each bin.
     """
     bins, place = np.unique(place, return_inverse=True)
     count, total = (np.bincount(place, each) for each in (degrees, squared))

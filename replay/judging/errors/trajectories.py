@@ -196,7 +196,7 @@ def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, 
 def _interpolated(
     truth: Trajectory, time_ns: Integers, gap_limit_s: float
 ) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """Interpolate the truth at stamps; return it where it is known, and mark these stamps."""
+    """Interpolate the truth at stamps; return the known poses, and whether each stamp has one."""
     poses = truth.position_m
     if truth.rotation is not None:
         quaternion = Rotation.from_matrix(truth.rotation).as_quat(scalar_first=True)
@@ -218,7 +218,7 @@ def _stamps(trajectory: Trajectory) -> Integers:
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
-    """Find the first and last poses of consecutive parts of the path, each just above the delta."""
+    """Find the first and last poses of consecutive parts of the path, each at least the delta long."""
     unit, delta = comparison.delta_unit, comparison.delta
     steps: NDArray = np.ones(len(estimate) - 1)
     if unit == "m":
@@ -274,7 +274,7 @@ def statistics(error: Floats) -> dict[str, float]:
 
 
 def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
-    """Compute APE and RPE over all poses of runs, as `ape_translation_rmse_m`, and their counts."""
+    """Compute APE and RPE over all poses of runs, such as `ape_translation_rmse_m`, and count poses."""
     errors: dict[tuple[str, str], list] = {
         ("ape_translation", "m"): [run.absolute_m for run in runs],
         ("ape_rotation", "deg"): [run.absolute_deg for run in runs],

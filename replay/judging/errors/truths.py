@@ -23,7 +23,7 @@ COVERS, SOME_TARGETS = "covers", "some targets"
 
 
 class Doubt(NamedTuple):
-    """Doubt about a truth with this number of messages."""
+    """Doubt about a truth, and the number of messages that it concerns."""
 
     messages: int
     why: str
@@ -141,7 +141,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """Compute the difference of two truths by component, at stamps of the first in the other's span."""
+    """Compute the difference of two truths by component, at stamps of the first within the other."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

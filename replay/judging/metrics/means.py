@@ -33,7 +33,7 @@ class OutputDiagnostics(NamedTuple):
     """Diagnostics in one output.
 
     Attributes:
-        what: kind of diagnostics, one of the names above.
+        what: kind of diagnostics: MODES, SMOOTHED_MODES, EFFECTIVE, or one of LATE.
         names: names of the values.
         values: (n, names), NaN in rows without a value.
     """

@@ -262,8 +262,8 @@ def _solved(output: Output) -> Sums:
 def solution(sums: Sums) -> dict[str, float]:
     """Compute the share of batch solutions that converged, and the largest number of iterations.
 
-    If the start is stated, the mean final cost is included; for single iterations, the cost at the
-    start.
+    If the channel states the start, the mean final cost is included. From streams of single iterations,
+    only the mean cost at the start is computed.
     """
     if sums.get("starts"):
         return {"start_cost": sums["start_cost"] / sums["starts"]}

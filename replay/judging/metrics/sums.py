@@ -114,7 +114,7 @@ def fill_sums(
         width: width of a bin.
         low: the first bin of `sums`.
         values: (n, columns), the rows.
-        sums: (groups, bins, 1 + columns), numbers of rows and their sums, updated.
+        sums: (groups, bins, 1 + columns), row counts and column sums; updated in place.
     """
     for row in range(len(values)):
         cell = sums[group[row], max(position[row], 0) // width - low]

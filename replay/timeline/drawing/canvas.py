@@ -258,7 +258,7 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log properties (`what`) of `entity` for all times, such as a style."""
+        """Log properties of `entity` in `what`, such as a style, which apply at all times."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
@@ -370,8 +370,9 @@ def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
 def gap_limit_ns(time_ns: Times) -> int:
     """Compute the longest silence of a stream with these sorted times that is not a gap.
 
-    A stream without a rate, such as gunshots or objects seen by a camera, has bursts. Its limit is based
-    on the pauses that make up half of its time, without the longest pause.
+    A stream without a rate, such as gunshots or objects seen by a camera, has bursts. Its limit is a
+    multiple of the pause length up to which pauses make up half of the total time, not counting the
+    longest pause.
     """
     intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)
     usual_ns = usual_interval_ns(time_ns)

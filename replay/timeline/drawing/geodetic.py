@@ -67,7 +67,7 @@ def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
 
     Args:
         covariance_m2: (n, d * d), row-major; d is 0 if fixes have no covariance.
-        unknown: colour if it is NaN.
+        unknown: colour of fixes whose deviation is NaN.
     """
     size = round(covariance_m2.shape[1] ** 0.5)
     sigma_m = np.full(len(covariance_m2), np.nan)

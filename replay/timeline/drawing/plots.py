@@ -129,7 +129,7 @@ def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None 
 
 
 def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
-    """Group views by component: axes of a vector together, single numbers up to the size of a tab."""
+    """Group views by quantity: axes of a vector together, up to a tab full of other components."""
     groups: dict[str, list[rrb.View]] = {}
     for component, view in views.items():
         groups.setdefault(_vector_of(component), []).append(view)

@@ -10,7 +10,7 @@ def flatten(array: NDArray, batch: tuple[int, ...], *core: int) -> NDArray[np.fl
     Args:
         array: (..., *core).
         batch: the batch axes (...) to broadcast to; n is their product.
-        core: the sizes of its last axes.
+        core: the sizes of the array's last axes.
     """
     flat = np.broadcast_to(array, (*batch, *core)).reshape(-1, *core)
     return np.ascontiguousarray(flat, dtype=np.float64)

@@ -38,7 +38,7 @@ class Bingham(NamedTuple):
 def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
     """Make a distribution from axes and concentrations in any order and with any offset.
 
-    Raises BadInput if d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
+    Raises BadInput if d is not 2 or 4, a value is not finite, or the axes are not orthonormal.
 
     Args:
         axes: (..., d, d), orthonormal, as columns.
@@ -202,7 +202,7 @@ def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
     """Compute E((x - m)(x - m)^T), (..., d, d), over the hemisphere about the mode m.
 
     This is the covariance of a Gaussian about that mode, (57), which lacks a factor of 2 in the paper.
-    E|x_d| is exact too; its integrand has one more factor (s - z_d)^(-1/2).
+    E|x_d|, on which it depends, is also exact: its integrand has an additional factor (s - z_d)^(-1/2).
     """
     integrand, factors = _on_contour(bingham.concentrations)
     absolute = _sum(integrand * np.sqrt(factors[..., -1, :])) / (np.sqrt(np.pi) * _sum(integrand))

@@ -76,7 +76,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
 
     Args:
         angles: (n, 2), in rad.
-        components: number of densities to fit.
+        components: number of wrapped normals in the mixture.
         iterations: maximum number of iterations.
     """
     if len(angles) < 10 * components:
@@ -113,7 +113,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
 
 
 def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Return the logarithms of weighted densities (n, k, turns), and the deviations from both means."""
+    """Return the logarithms of weighted densities (n, k, turns), and both angles' deviations."""
     (c11, c12), (_, c22) = np.moveaxis(mixture.covariance, 0, 2)[..., None]
     determinant = c11 * c22 - c12**2
     most = int(_REACH * np.sqrt(max(c11.max(), c22.max())) / (2.0 * np.pi) + 0.5)
@@ -194,7 +194,7 @@ def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[F
 
 
 def _normalisation(kappa: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """Return the logarithms (k,) of the integrals, and their derivatives by the concentrations (k, 3).
+    """Return log normalization integrals (k,), with derivatives (k, 3) for the concentrations.
 
     The integral over the second angle is a Bessel function. The integral over the first angle is a sum
     over equal steps, which is exact up to rounding for a smooth periodic function.

@@ -56,7 +56,7 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
         mean: (..., 2), in rad; it is wrapped.
         covariance: (..., 2, 2), in rad^2.
 
-    Raises BadInput if a number is not finite or the covariance is not symmetric and positive definite.
+    Raises BadInput if a value is not finite or the covariance is not symmetric and positive definite.
     """
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
@@ -77,7 +77,7 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
     """Compute the density (...) at angles x (..., 2).
 
     Args:
-        distribution: with batch axes (...).
+        distribution: wrapped normals with batch axes (...).
         x: (..., 2), in rad.
     """
     deviation = np.asarray(x, float) - distribution.mean
@@ -122,7 +122,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 
 
 def require_central_weight(central_weight: float) -> None:
-    """Raise BadInput if w5 is outside [0, 1/2], where real positions exist for every m_1."""
+    """Raise BadInput unless w5 is in [0, 1/2], the range with real positions for every m_1."""
     if not 0.0 <= central_weight <= 0.5:
         raise BadInput(f"central weight {central_weight:g} is not in [0, 0.5]; the paper uses 0.2")
 
@@ -148,7 +148,7 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
 
 
 def fit_mixed_mle(samples: Samples) -> WrappedNormal:
-    """Fit moments, and C_12 by maximum likelihood over three wraps (Kurz and Hanebeck, CDC 2015).
+    """Fit means and variances by moments, C_12 by maximum likelihood (Kurz and Hanebeck, CDC 2015).
 
     This does not invert `five_samples`: for sigma (0.8, 1.3) and a correlation of 0.5 it returns 0.461.
     """

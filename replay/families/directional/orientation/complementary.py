@@ -1,6 +1,6 @@
 """Orientation by common methods: Madgwick's, Mahony's, and VQF by Laidig and Seel.
 
-Filters are compared with these methods. The methods estimate no covariance, so one is assumed. Madgwick,
+These methods are baselines for filters. They estimate no covariance, so one is assumed. Madgwick,
 "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
 Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
 Automatic Control 53(5), 2008; VQF is the unchanged library of its authors. Default gains and parameters
@@ -48,7 +48,7 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """Gain of the filter; the default is the author's value for such a unit.
+    """Gain of the filter; the default is the author's value for a nine-axis unit.
 
     Attributes:
         gain: step along the normalized gradient, in rad/s.

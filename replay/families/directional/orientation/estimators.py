@@ -42,8 +42,8 @@ class InertialParameters(Parameters):
         rest_s: duration of the rest at the start; if not set, it is found in the log, up to 20 s.
         block_s: averaging time, in s, of an attitude from accelerometer and magnetometer.
         attitude_sigma_deg: standard deviation of this attitude, in deg.
-        drift_sigma_deg: random walk of the gyro's orientation, in deg/sqrt(s).
-        gap_s: duration without samples, in s, above which there is a gap.
+        drift_sigma_deg: random walk of the orientation by the gyro, in deg/sqrt(s).
+        gap_s: time between two samples, in s, above which the orientation becomes unknown.
     """
 
     rest_s: NonNegativeFloat | None = None

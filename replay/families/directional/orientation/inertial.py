@@ -153,8 +153,8 @@ def run_inertial_filter(
 ) -> tuple[InertialState, OrientationEstimates]:
     """Process the samples of an ensemble; return the state after them and the estimates.
 
-    The estimates are written to `estimates`, which must be NaN everywhere, if given. Raises BadInput if
-    the columns have different lengths or the model's numbers are not positive.
+    If `estimates` is given, it must be NaN everywhere and is filled. Raises BadInput if
+    the columns have different lengths or a value in the model is not positive.
     """
     samples, estimates = prepared(model, samples, estimates)
     state = InertialState._make(part.copy() for part in state)

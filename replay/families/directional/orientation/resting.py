@@ -84,8 +84,8 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
 def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
     """Return the estimator with automatic detection of its unit's initial rest.
 
-    The rest is detected if the estimator has a parameter `rest_s` and it is not set. The estimator's
-    `start` finds the samples of the rest under `REST`.
+    The rest is detected if the estimator has a parameter `rest_s` and it is not set. The samples of
+    the rest are passed to the estimator's `start` under the name `REST`.
     """
 
     def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
@@ -108,7 +108,7 @@ def _find(
 ) -> Initialized:
     """Find the initial rest of every run.
 
-    Raises BadInput if a unit moves within `LEAST_S` of its start.
+    Raises BadInput if a unit moves within `LEAST_S` of its first sample.
     """
     [(topic, samples)] = first.items()
     counts, rests_s, facts = [], [], list[Fact]()

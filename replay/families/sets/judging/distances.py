@@ -60,8 +60,8 @@ def gospa(
         estimates: (n, d).
         truths: (m, d).
         cutoff: upper limit of a distance, in the unit of the points.
-        order: of the sum, at least 1.
-        alpha: a surplus point costs cutoff^order / alpha.
+        order: order of the sum, at least 1.
+        alpha: determines the cost of a surplus point, cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
         raise BadInput(f"alpha {alpha:g}: alpha must be above 0 and at most 2")
@@ -90,7 +90,7 @@ def gospa_pairs(
         estimates: (n, d).
         truths: (m, d).
         cutoff: greatest distance of a pair.
-        order: of the sum, at least 1.
+        order: order of the sum, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     near = costs.pairs < cutoff**order

@@ -40,7 +40,7 @@ class SetErrors(NamedTuple):
         run, time_ns, elapsed_s: the number of the run, the stamp, and the time since the run's epoch.
         ospa, gospa: the distances, in m.
         localisation, missed, false: GOSPA's parts, in m^2.
-        estimated, true: numbers of targets.
+        estimated, true: estimated and true number of targets.
     """
 
     estimator: str
@@ -123,7 +123,7 @@ def _judge_run(
     cutoff_m: float,
     gap_limit_s: float,
 ) -> Floats:
-    """Compute OSPA, GOSPA, its three parts, and the estimated and true numbers (n, 7)."""
+    """Compute OSPA, GOSPA, its three parts, and the estimated and true number of targets: (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
     frame, at_ns = frame_of(sizes.metadata), sizes.publish_time_ns

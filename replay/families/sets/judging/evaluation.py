@@ -92,10 +92,10 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Test whether the positions are in each frame's arena and satisfy its bound: (2, frames).
+    """Test whether the true position at each frame is in the arena and within the bounds: (2, frames).
 
     Args:
-        sizes: the sets of one run, a message per frame.
+        sizes: the numbers of vertices of the sets of one run, one message per frame.
         source: the run.
         places: (frames, 2), true positions in m.
     """

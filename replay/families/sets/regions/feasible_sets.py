@@ -57,7 +57,7 @@ class Arcs(NamedTuple):
 def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_rad: float) -> Pairs:
     """Make the relative bearings of a frame after checking them.
 
-    Raises BadInput if shapes differ, a number is not finite, two landmarks coincide, or the bound is not
+    Raises BadInput if shapes differ, a value is not finite, two landmarks coincide, or the bound is not
     above 0 and below pi / 2 (with a larger bound, the set is not an intersection of discs).
 
     Args:
@@ -204,9 +204,9 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
     """Cut each circle at its intersections with all others, into 2 k + 1 pieces.
 
     A circle is traversed from its point nearest to the centre of the arena. With tau = tan(h s) / h,
-    where h is half the curvature and s the distance along the circle, any other constraint is quadratic
-    in tau, for discs and for lines. The circle's own constraint is zero everywhere, so its roots would
-    only be rounding errors.
+    where h is half the curvature and s the distance along the circle, any other constraint is
+    quadratic in tau, for discs and for lines. The circle's own constraint is left out: it is zero
+    everywhere, so its roots would only be rounding errors.
     """
     centre = 0.5 * (arena.low + arena.high)
     reach = 4.0 * float(np.linalg.norm(arena.high - arena.low))
@@ -279,8 +279,8 @@ def box(border: Arcs) -> Arena:
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
     """Compute closed polygons (n, 2) around the set; the set is on their left.
 
-    The polygons contain the set: vertices are on concave arcs and outside convex ones. Their area
-    exceeds that of the set by at most the relative tolerance.
+    The polygons contain the set: their vertices are on concave arcs and outside convex ones. The area
+    of the polygons exceeds that of the set by at most the relative tolerance.
     """
     tolerance_m = relative_tolerance * max(area(border), 1e-12) / max(border.length.sum(), 1e-12)
     end = border.at(border.length)

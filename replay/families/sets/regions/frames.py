@@ -28,8 +28,8 @@ NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 class Known(NamedTuple):
     """Bound of the bearings, and limits on the robot's position.
 
-    `arena_m` is (low x, low y, high x, high y), or None if the arena follows from the sensor's maximum
-    range. `maximum_range_m` is None if it is the longest measured range.
+    `arena_m` is (low x, low y, high x, high y), or None if the arena is computed from the sensor's
+    maximum range. If `maximum_range_m` is None, the longest measured range is used.
     """
 
     bound_rad: float

@@ -60,7 +60,7 @@ class Odometry(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """Bound of the error of odometry over a span of time: `offset` + `rate` × length in s."""
+    """Bound of the error of odometry over a span of time: `offset` + `rate` × duration in s."""
 
     offset: float
     rate: float
@@ -121,7 +121,8 @@ def relative_pose(first: Floats, second: Floats) -> Floats:
 def common_headings(one: Headings, other: Headings) -> Headings | None:
     """Return the intersection of two intervals of headings; None if it is empty.
 
-    If wide intervals overlap at both ends, the narrower of them contains the intersection.
+    If wide intervals overlap at both ends, their intersection is not an interval; the result is then
+    the narrower of the two, which contains it.
     """
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     if one.half_rad + other.half_rad >= 2.0 * np.pi - abs(apart):
@@ -154,9 +155,9 @@ def moved(
 ) -> shapely.Geometry:
     """Compute the positions of a robot after a motion or, with direction -1, before it.
 
-    `headings` apply before the motion. The displacements for all of them are on an arc, which is
-    contained in a disc; if the headings span half a circle or more, the centre of the disc is the
-    origin.
+    `headings` apply before the motion. The displacements for all headings are on an arc, and the set
+    is offset by a disc that contains the arc; if the headings span half a circle or more, the centre
+    of the disc is the origin.
     """
     half = min(headings.half_rad, 0.5 * np.pi)
     length = float(np.hypot(*motion.displacement_m))

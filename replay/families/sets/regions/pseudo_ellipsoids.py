@@ -28,7 +28,8 @@ ROUNDING = 1e-11
 class PseudoEllipsoid(NamedTuple):
     """The set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
 
-    Zero information, the prior of V, is represented by zeros; a huge covariance would lose digits.
+    A prior without information, as in section V, is represented by zeros; a huge covariance would lose
+    digits.
     """
 
     information: Floats
@@ -285,7 +286,7 @@ def _shares(logarithms: Floats) -> Floats:
 
 
 def _area_over(rings: Floats, weights: Floats, arena: Arena, order: Order) -> Size:
-    """Make a function that computes the area of the fused set for weights near the given ones.
+    """Make a function that computes the area of the fused set for weights near given weights.
 
     The area is computed in a window; a set that extends beyond it counts as larger than the window.
     """

@@ -1,7 +1,7 @@
 """Association of detections with tracks: greedy, by the best assignment, or by all assignments.
 
-An assignment gives every track at most one detection of its own; detections without a track are clutter.
-With Poisson clutter of density lambda, an assignment has the weight
+An assignment gives each track at most one detection, which no other track has; detections without a
+track are clutter. With Poisson clutter of density lambda, an assignment has the weight
 
     prod over detected tracks (P_D r_i g_ij / lambda)  *  prod over missed ones (1 - P_D P_G r_i),
 
@@ -39,11 +39,11 @@ def nearest(
     """Choose an assignment greedily: the most likely pair first, then the most likely remaining pair.
 
     Args:
-        weights: of pairs and of misses.
-        tracks: number of tracks; arrays may be longer.
-        detections: number of detections; arrays may be longer.
-        probability: (tracks, 1 + detections), filled: 1 for an assigned pair, and in the first column
-            for a track without a detection.
+        weights: weights of pairs and of misses.
+        tracks: number of tracks; the arrays may be longer.
+        detections: number of detections; the arrays may be longer.
+        probability: (tracks, 1 + detections), filled: 1 for an assigned pair, and 1 in the first
+            column for a track without a detection.
         memory: scratch memory.
 
     Returns:
@@ -75,9 +75,9 @@ def hungarian(
     Column j of the assignment problem is detection j, and column detections + i is a miss of track i.
 
     Args:
-        weights: of pairs and of misses.
-        tracks: number of tracks; arrays may be longer.
-        detections: number of detections; arrays may be longer.
+        weights: weights of pairs and of misses.
+        tracks: number of tracks; the arrays may be longer.
+        detections: number of detections; the arrays may be longer.
         probability: (tracks, 1 + detections), filled as by `nearest`.
         memory: scratch memory.
 

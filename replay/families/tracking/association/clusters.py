@@ -95,9 +95,9 @@ def jpda(
     clusters with approximated marginals.
 
     Args:
-        weights: of pairs and of misses.
-        tracks: number of tracks; arrays may be longer.
-        detections: number of detections; arrays may be longer.
+        weights: weights of pairs and of misses.
+        tracks: number of tracks; the arrays may be longer.
+        detections: number of detections; the arrays may be longer.
         probability: (tracks, 1 + detections), filled.
         memory: scratch memory.
     """
@@ -130,8 +130,8 @@ def gather_cluster(
 
     Args:
         first: index of the track.
-        weights: of pairs and of misses.
-        tracks, detections: numbers of tracks and detections; arrays may be longer.
+        weights: weights of pairs and of misses.
+        tracks, detections: numbers of tracks and detections; the arrays may be longer.
         probability: (tracks, 1 + detections), whose first column is NONE for tracks in no cluster yet.
         memory: whose `rows` and `columns` are filled.
     """
@@ -159,12 +159,12 @@ def enumerate_maps(
 ) -> None:
     """Compute the marginals of one cluster by summing over all of its assignments.
 
-    The smaller group (tracks or detections) are the slots; the others are the items, which occupy slots
-    one after another. The choices of later items depend only on the set of occupied slots, so sums over
-    assignments become sums over these 2^slots sets.
+    The members of the smaller group (tracks or detections) are the slots; those of the other group are
+    the items, which occupy slots one after another. The choices of later items depend only on the set
+    of occupied slots, so sums over assignments become sums over these 2^slots sets.
 
     Args:
-        weights: of pairs and of misses.
+        weights: weights of pairs and of misses.
         rows, columns: numbers of tracks and detections of the cluster.
         probability: (tracks, 1 + detections), filled for the tracks of the cluster.
         memory: with the cluster that `gather_cluster` found.

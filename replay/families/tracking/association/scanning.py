@@ -58,7 +58,7 @@ class ScanMemory(NamedTuple):
         likelihood: (tracks, modes, detections), joint likelihood of a mode and a detection.
         weights, probability, association: see `association.association`.
         is_free: (detections,), whether a detection is outside all gates; left: (detections,),
-            probability that it belongs to no track.
+            probability that a detection belongs to no track.
         given: (1 + detections,), probabilities of a track's associations in one mode.
         after: (modes,), the probability of each mode of a track after these associations.
         moment: (2, 2), second moment of the weighted innovations; `shift` (2,) is their mean.

@@ -7,9 +7,10 @@ over the tracks,
 
     B+^-1 = B^-1 + sum_i (B_i^-1 - B^-1),   B+^-1 b+ = B^-1 b + sum_i (B_i^-1 b_i - B^-1 b),
 
-where B_i and b_i are those after the update of track i only. Then every track gets the new marginal and
-keeps its conditional Gaussian of the target given b. States have no rotations. For constant b and
-certain associations, this is the joint Kalman filter.
+where b and B are the mean and covariance of the errors, and b_i and B_i are the same after the update
+of track i only. Then every track gets the new marginal and keeps its conditional Gaussian of the
+target given b. States have no rotations. For constant b and certain associations, this is the joint
+Kalman filter.
 """
 
 from typing import NamedTuple

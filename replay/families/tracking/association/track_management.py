@@ -42,7 +42,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         detectable: probability of a detection in the gate, if the target exists.
-        probability: (1 + detections,), of no detection and of each detection, see
+        probability: (1 + detections,), the probabilities of no detection and of each detection, see
             `fuselog.replay.families.tracking.association.association`.
         weights: weights of all tracks.
     """
@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
 
 
 def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether no sensor that begins tracks has detected a track for too long."""
+    """Test whether the last detection by a sensor that begins tracks is too long ago."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
     longest_s: float = p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s
     is_over: bool = silent_s > longest_s
@@ -137,7 +137,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Set
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether a track is silent, or its score is too far below zero (if confirmed, its best)."""
+    """Test whether a track is silent, or its score is too far below zero (confirmed: below its best)."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

@@ -38,7 +38,7 @@ def smooth_tracks(
 
     Args:
         bound_model: the bound model of the targets.
-        parameters: the numbers that its functions read.
+        parameters: the parameters that the functions of the model read.
         track: (n,), index of the track of each estimate.
         time_ns: (n,), increasing in each track.
         mean: (n, size), filtered.

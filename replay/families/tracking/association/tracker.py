@@ -17,7 +17,7 @@ from fuselog.replay.inference.modes.mixture import ModeBelief
 
 
 class Tracker(NamedTuple):
-    """Tracker as an assembly of its parts.
+    """Parts of a tracker.
 
     Attributes:
         bound_model: the targets' bound model, with one of its motions or with all modes.
@@ -73,9 +73,9 @@ BeliefOf = Callable[[int, Tracks], Belief]
 
 
 def believing(bound_model: BoundModel) -> BeliefOf:
-    """Make `belief(run, tracks)`, which returns the tracks of a run as the belief of filters.
+    """Make `belief(run, tracks)`, which returns the tracks of a run in the form that filters process.
 
-    The first axis of the belief is the place of the track.
+    The first axis of the result is the track.
     """
 
     def of_one(run: int, tracks: Tracks) -> Gaussian:

@@ -19,8 +19,8 @@ class Tracks(NamedTuple):
     """Tracks of all runs, oldest first; axes are run and place; the first `used` places are occupied.
 
     Attributes:
-        used, met: (runs,), numbers of current tracks and of all tracks so far; the latter numbers new
-            tracks.
+        used, met: (runs,), number of current tracks, and number of all tracks so far, from which new
+            tracks get their number.
         time_ns: (runs,), stamp of all states; NEVER before the first scan.
         number, existence, is_confirmed: (runs, places).
         mean, covariance: (runs, places, modes, ...).

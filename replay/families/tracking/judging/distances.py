@@ -54,10 +54,10 @@ def trajectory_gospa(
 ) -> TrajectoryGospa:
     """Compute the trajectory GOSPA of tracks and trajectories, and its parts.
 
-    If two estimates swap their truths, each costs the switch penalty to the power of the order; an
-    estimate that begins or ceases to be paired costs half of that. By default, the metric is computed by
-    linear programming, in which an estimate may be split among truths; with `exactly`, all assignments
-    are enumerated step by step, which is feasible for small cases.
+    If two estimates swap their truths, the cost of each is the switch penalty to the power of the
+    order; if an estimate begins or ceases to be paired, the cost is half as large. By default, the
+    metric is computed by linear programming, in which an estimate may be split among truths; with
+    `exactly`, all assignments are enumerated step by step, which is feasible for small cases.
 
     Raises BadInput if the shapes do not match, a cutoff or penalty is not positive, the order is below
     1, or there are more than MOST_ASSIGNMENTS assignments to enumerate.
@@ -67,7 +67,7 @@ def trajectory_gospa(
         truths: (m, steps, axes), NaN when a target is absent.
         cutoff: upper limit of a distance, in the unit of the points.
         switch_penalty: penalty of a switch, in the same unit.
-        order: of the sum, at least 1.
+        order: order of the sum, at least 1.
         exactly: whether to enumerate all assignments.
     """
     if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
@@ -141,7 +141,7 @@ def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
 
 
 def _assignments(n: int, m: int) -> Floats:
-    """List all assignments (ways, n, m) of some of n to some of m."""
+    """List all one-to-one assignments (ways, n, m) of some of n estimates to some of m truths."""
     found = []
     for count in range(min(n, m) + 1):
         for rows in combinations(range(n), count):
@@ -167,16 +167,16 @@ def hota(
 ) -> Hota:
     """Compute the HOTA of tracks and trajectories at every threshold.
 
-    The similarity of two points is max(0, 1 - distance / cutoff); they match if it reaches the
-    threshold. The pairs of a step are those with the best match over the whole span. The usual single
-    figure is the mean over the thresholds 0.05, 0.10, ..., 0.95. Raises BadInput if the shapes do not
-    match or the cutoff is not positive.
+    The similarity of two points is max(0, 1 - distance / cutoff); they match if the similarity reaches
+    the threshold. The pairs of a step are those with the best match over the whole span. The usual
+    single figure is the mean over the thresholds 0.05, 0.10, ..., 0.95. Raises BadInput if the shapes
+    do not match or the cutoff is not positive.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
         truths: (m, steps, axes), NaN when a target is absent.
-        cutoff: distance at which the similarity of two points becomes zero, in their unit.
-        thresholds: of the similarity, 0 to 1.
+        cutoff: distance at which the similarity of two points becomes zero, in the unit of the points.
+        thresholds: thresholds of the similarity, 0 to 1.
         others: number of points of further tracks, none of which is ever within the cutoff.
     """
     if not 0.0 < cutoff < np.inf:

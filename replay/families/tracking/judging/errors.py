@@ -6,9 +6,9 @@ in which a target is followed. Switches to another track, and breaks, are counte
 MOT, which are kept while they are within the cutoff.
 
 By default, every track counts. If the metadata of a truth states that truths cover only some of the
-targets (`COVERS`), a track of another target is not a false track: tracks that are farther than a limit
-from all targets with a truth are counted separately as unreferenced, and figures that exclude them have
-separate names.
+targets (`COVERS`), a track of another target is not a false track: tracks that are farther than a
+limit from all targets with a truth are counted separately as unreferenced, and metrics that exclude
+them have separate names.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -271,8 +271,8 @@ def near_tracks(tracks: Sequence[TracksAt], truths: Floats) -> tuple[Floats, int
         tracks: the tracks at each of k instants.
         truths: (targets, k, 2), in m, NaN when a target is absent.
 
-    Returns:
-        These tracks (tracks, k, 2), NaN when one is absent, and the number of points of all others.
+    Returns: The near tracks (tracks, k, 2), NaN when a track is absent, and the number of points of all
+    other tracks.
     """
     near: set[int] = set()
     for at, true in zip(tracks, truths.transpose(1, 0, 2), strict=True):

@@ -1,8 +1,8 @@
 """Evaluation of the tracks of a replay against the targets in its log, block by block.
 
-Instants, pairs and distances are defined in `errors`, as in experiments with trackers. A target is
-present from the first to the last stamp of its truth. The judged span begins a while after the start of
-the log and ends with the last scan that the tracker processed.
+Instants, pairs and distances are defined in `errors`; experiments with trackers use the same
+definitions. A target is present from the first to the last stamp of its truth. The judged span begins
+a while after the start of the log and ends with the last scan that the tracker processed.
 """
 
 from collections.abc import Mapping, Sequence
