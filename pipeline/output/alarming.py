@@ -1,8 +1,8 @@
-"""Warnings about the numbers of a replay, the worst first, each with advice.
+"""Warnings about the results of a replay, the worst first, each with advice.
 
 For a filter with correct covariances, NIS, NEES and the share of rejected measurements are within their
-limits in 999 of 1,000 logs. A value outside its limits causes a warning, and so does a constant error.
-The class `fuselog.replay.judging.verdicts.Squares` explains what the values mean for the filter.
+limits in 999 of 1,000 logs. A value outside its limits causes a warning, as does a constant error. The
+class `fuselog.replay.judging.verdicts.Squares` explains what the values mean for the filter.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -71,7 +71,7 @@ def alarms_of(
     """Find the warnings of a judged replay, the worst first.
 
     Args:
-        judge: of all runs.
+        judge: judge of all runs.
         parameters: parameters of the estimators by label, if known.
         coverage: how many measurements of each topic were used.
     """

@@ -45,8 +45,8 @@ class Maps(Parameters):
     Attributes:
         scenario: scenario with the sensors.
         aims: aim point (x, y), in m, by the label of an estimator.
-        low_m: smallest x and y of the grid of shooters.
-        high_m: largest x and y of the grid of shooters.
+        low_m: smallest x and y of the grid of shooter positions.
+        high_m: largest x and y of the grid of shooter positions.
         step_m: spacing of the grid.
     """
 
@@ -203,7 +203,7 @@ def bound_of(parameters: AcousticParameters, settings: Mapping[str, Any], label:
 
 
 def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
-    """Return the shooter (1, 2) in m, the trajectory (1,) in rad, and the sensors (sensors, 2) in m."""
+    """Return positions (m) of shooter (1, 2) and sensors (sensors, 2), and trajectory (1,) in rad."""
     return (
         np.array([parameters.shooter_position_m]),
         np.radians([parameters.trajectory_deg]),
@@ -222,7 +222,7 @@ def _heard(sources: list[MemorySource]) -> Detections:
 
 
 def hearing(case: Case) -> list[float]:
-    """Return the numbers of the sensors that hear the shockwave."""
+    """Return the numbers, from 1, of the sensors that hear the shockwave."""
     true = acoustic.noise_free(case.parameters.medium, *truth_of(case.parameters))
     return [float(sensor + 1) for sensor in np.flatnonzero(np.isfinite(true.shockwave_rad[0]))]
 
@@ -245,7 +245,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Compute how much larger ellipses are with bearings only than in a mode, on a grid of shooters."""
+    """Compute the ratios of ellipse areas, bearings only to a mode, on a grid of shooter positions."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

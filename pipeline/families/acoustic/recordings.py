@@ -28,7 +28,8 @@ class Published(Parameters):
     """Published arrival differences of a sound.
 
     Attributes:
-        delay_s: delays of all microphones relative to the first, in the order of their numbers.
+        delay_s: delays of all microphones relative to the first, in the order of the microphones'
+            numbers.
     """
 
     delay_s: Annotated[list[float], Field(min_length=2)]
@@ -131,7 +132,7 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
 
 
 def known_place(errors: Errors) -> dict[str, MetricValue]:
-    """Compute the error of a sound at a known position, its number of coordinates, and its NEES."""
+    """Compute the largest error and NEES of a sound at a known position, and count its coordinates."""
     axes = [errors.components.index(name) for name in ("x_m", "y_m", "z_m") if name in errors.components]
     away_m = np.linalg.norm(errors.error[:, axes], axis=1)
     found = {
@@ -162,10 +163,10 @@ def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
 
 
 def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
-    """Compute how well one position explains the differences of a sound, and how many are redundant.
+    """Compute how well one position explains a sound's arrival differences, and how many are redundant.
 
-    The degrees of freedom of the sum of squared innovations, without those that the start uses, are the
-    number of differences minus the number of coordinates.
+    The estimator's start uses as many differences as the position has coordinates. The sum of the other
+    squared innovations has one degree of freedom per redundant difference.
     """
     heights_m = table["z_m"][table["sound"] == name]
     extra = len(squared) - (2 if np.ptp(heights_m) == 0.0 else 3)

@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Tabulate how much larger ellipses are with bearings only than in a mode, figures 22 and 23."""
+    """Tabulate the ratios of ellipse areas, bearings only to another mode, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)
@@ -152,7 +152,7 @@ def _table_of_maps(maps: Maps) -> pd.DataFrame:
 
 
 def _metrics(cases: list[Case]) -> dict[str, Any]:
-    """Compute the metrics of a scenario at the paper's noise, and lists over all noise levels."""
+    """Compute a scenario's metrics at the paper's noise, and lists of some over all noise levels."""
     values: dict[str, Any] = {}
     name = f"scenario-{cases[0].number}"
     for case in _nominal(cases):

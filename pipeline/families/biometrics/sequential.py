@@ -1,11 +1,11 @@
 """Study of sequential verification, with Wald's test of each probe and Page's test of the matcher.
 
-Log-likelihood ratios are calibrated on other users than those to whom they are applied. A matcher's
+Log-likelihood ratios are calibrated on users other than those to whom they are applied. A matcher's
 ratios are resampled by users as clusters: a replicate draws users with replacement, and all intervals
 are quantiles over the replicates. The data contain one genuine score per user and matcher, so further
-probes of a person are simulated by scores of other persons. They are independent, or have an assumed
-correlation of their normal scores. Only two kinds of sequences are entirely real: one person with one
-matcher after another, and many impostors against one identity.
+probes of a person are simulated by scores of other persons. These simulated probes are independent, or
+their normal scores have an assumed correlation. Only two kinds of sequences are entirely real: one
+person with one matcher after another, and many impostors against one identity.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -64,7 +64,7 @@ class Options(Parameters):
         most_probes: number of probes after which an undecided sequence ends.
         label_ratio: log-likelihood ratio of the other matchers above which a probe is used to monitor a
             matcher.
-        run_length: specified mean number of such probes until a false alarm.
+        run_length: specified mean number of labelled probes until a false alarm.
         watched: number of series of probes in which a matcher is monitored.
         watched_probes: probes in a series without a fault.
         fault_probes: probes in a series with a fault.
@@ -83,13 +83,13 @@ class Options(Parameters):
 
 
 class Drawn(NamedTuple):
-    """A matcher's ratios (users, users) by probe and gallery entry, and a replicate's users (n,)."""
+    """A matcher's ratios (users, users) by probe and gallery entry, and users (n,) of a replicate."""
 
     ratios: Floats
     users: Integers
 
     def others(self, gallery: Integers, rng: np.random.Generator) -> Integers:
-        """Draw for each gallery entry (n,) a different user."""
+        """Draw a probe for each gallery entry (n,), from a user other than the entry's."""
         probe = rng.choice(self.users, len(gallery))
         while (same := probe == gallery).any():
             probe[same] = rng.choice(self.users, int(same.sum()))
@@ -146,7 +146,7 @@ def _matrix(fused: Fused) -> Floats:
 def wald_tests(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate the error rates and numbers of probes of Wald's test, by way, matcher and rates."""
+    """Evaluate errors and numbers of probes of Wald's test by kind of sequence, matcher and rates."""
     count, most = options.sequences, options.most_probes
     for stated in options.rates:
         rates = Rates(*stated)
@@ -220,7 +220,7 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
     Args:
         ratios: (users, users), log-likelihood ratios by probe and gallery entry.
         rates: the error rates to meet.
-        rng: random numbers to draw the probes.
+        rng: random number generator that draws the probes.
 
     Returns:
         The number of probes; NaN if `FIXED_PROBES` are not enough.
@@ -283,7 +283,7 @@ def labelled(
         label: (users, users), the summed log-likelihood ratios of the other matchers.
         least: smallest absolute ratio for which a probe is labelled.
         count: number of probes to draw, about half of them genuine.
-        rng: random numbers to draw the probes.
+        rng: random number generator that draws the probes.
 
     Returns:
         The labelled probes.
@@ -370,7 +370,7 @@ def _case(rates: tuple[float, float]) -> str:
 
 
 def _chart_of_tests(table: pd.DataFrame, options: Options) -> Chart:
-    """Draw false accepts and mean numbers of probes by matcher, one series per way and rates."""
+    """Draw false accepts and mean numbers of probes by matcher, per kind of sequence and rates."""
     panels = []
     for quantity, label in (
         ("false_accept", "false accepts (share)"),

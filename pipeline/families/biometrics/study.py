@@ -161,7 +161,7 @@ def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFr
 
 
 def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate the mean relative increase by fusing one, two or all modalities, table 5."""
+    """Tabulate the mean relative increase due to fusion of one, two or all modalities, table 5."""
     kinds = {case: "one modality" if case in METHODS else "two modalities" for case in CASES[:-1]}
     judged = factors[factors["fusion"].isin(PAPER_FUSED) & factors["subset"].isin(CASES)]
     kind = judged["subset"].map(kinds).fillna("all").rename("fused")

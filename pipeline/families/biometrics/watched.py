@@ -25,7 +25,7 @@ def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.
         fault: "misses", "accepts" or "drifts"; any other name means no fault.
         seen: n probes without the fault.
         steady: ratios of impostors and of genuine probes without a fault, each in ascending order.
-        rng: random numbers to draw replacements.
+        rng: random number generator that draws replacements.
 
     Returns:
         The log-likelihood ratios of the same probes, (n,).
@@ -43,7 +43,7 @@ def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.
 
 
 def normal_scores(values: Floats, reference: Floats) -> Floats:
-    """Compute the quantiles of values in a reference as standard normal scores.
+    """Convert values to standard normal scores through their ranks in a reference sample.
 
     Args:
         values: (n,).
@@ -66,8 +66,9 @@ def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
         steady: ratios of impostors and of genuine probes without a fault, each in ascending order.
 
     Returns:
-        Ratios (4, n) of these changes: genuine ratios become those of impostors, or fall by
-        `DRIFT_SIGMA` in normal scores; ratios of impostors become genuine ones, or rise likewise.
+        Ratios (4, n), one row per change: genuine probes score like impostors; genuine normal scores
+        fall by `DRIFT_SIGMA`; impostors score like genuine probes; impostors' normal scores rise by
+        `DRIFT_SIGMA`.
     """
     others, own = (
         DRIFT_SIGMA * sign * normal_scores(seen.ratio, reference) - 0.5 * DRIFT_SIGMA**2

@@ -62,8 +62,8 @@ def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[
 
     Args:
         source: the log.
-        case: the trial, with which the topic's name begins.
-        time_ns: (n,), the stamps.
+        case: name of the trial, with which the topic's name begins.
+        time_ns: (n,), the stamps to test.
 
     Returns:
         The value (n,) of the last message at or before each stamp; False before the first message.

@@ -43,9 +43,9 @@ class OrientationOptions(Parameters):
     """The added magnet, and the limit of a disturbance.
 
     Attributes:
-        magnet_ut: field of the magnet in the unit's axes (x, y, z).
-        magnet_s: time spans of a trial in which the magnet is near.
-        limit_ut: difference from the local field above which the field counts as disturbed.
+        magnet_ut: field of the magnet in µT, in the unit's axes (x, y, z).
+        magnet_s: time spans of a trial, in s, in which the magnet is near.
+        limit_ut: difference from the local field, in µT, above which the field counts as disturbed.
         estimator: label of the estimator to compare with the others.
     """
 
@@ -171,7 +171,8 @@ def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
         wanted_ns: (n,).
 
     Returns:
-        Rows (n,) of `time_ns`, and whether (n,) the wanted stamp exists, so that its row is valid.
+        Row indices (n,) into `time_ns`, and a mask (n,) that is True if the wanted stamp exists; other
+        row indices are invalid.
     """
     row = np.searchsorted(time_ns, wanted_ns).clip(0, max(len(time_ns) - 1, 0))
     known = time_ns[row] == wanted_ns if len(time_ns) else np.zeros(len(wanted_ns), bool)

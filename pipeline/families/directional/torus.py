@@ -43,7 +43,8 @@ class PropagationOptions(Parameters):
         couplings_rad: couplings of the two angles, in rad.
         correlations: correlations of the two angles.
         random_samples: number of random samples to compare with.
-        central_weights: weights of the central sample to compare; the first is ours.
+        central_weights: weights of the central sample to compare; the first is the one that fuselog
+            uses.
     """
 
     sigma_rad: tuple[PositiveFloat, PositiveFloat] = (0.8, 1.3)
@@ -63,7 +64,7 @@ class MomentErrors(NamedTuple):
 def propagation_errors(
     options: PropagationOptions, coupling_rad: float, runs: int, rng: np.random.Generator
 ) -> dict[str, MomentErrors]:
-    """Propagate samples once, and fit both samples and truth by mixed maximum likelihood.
+    """Propagate samples and truth once, fit both by mixed maximum likelihood, and compare their moments.
 
     Keys of the result: `five-wW` for every central weight, W in percent, `ukf`, `random`.
     """
@@ -117,7 +118,7 @@ def _moved(samples: Samples, coupling_rad: float) -> Samples:
 
 
 def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study propagation, figure 3; see `fuselog.pipeline.runs.experiment.Study`. `runs` are random."""
+    """Study propagation, figure 3, in random `runs`; see `fuselog.pipeline.runs.experiment.Study`."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation uses no data; leave out record, import and estimators")

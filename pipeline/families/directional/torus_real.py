@@ -203,7 +203,7 @@ def interval(values: Floats | pd.Series, block: int) -> Interval:
     """Compute the mean and its 95 % interval, by Student's distribution of block means.
 
     Args:
-        values: (n,), whose neighbours may be correlated.
+        values: (n,), in an order in which neighbouring values may be correlated.
         block: number of values in a block; an incomplete last block is dropped.
     """
     whole = np.asarray(values)[: len(values) // block * block]
@@ -219,14 +219,14 @@ FILTERS: dict[str, Filter] = {
 def most_likely(
     wind: Floats, run: Callable[..., tuple[WrappedNormal, WrappedNormal]]
 ) -> dict[str, float]:
-    """Find the coupling and the sigmas with which directions are predicted best.
+    """Find the coupling and the sigmas that predict directions best.
 
     Args:
         wind: (hours,), directions in rad.
-        run: the filter.
+        run: function that runs the filter.
 
     Returns:
-        Their values by parameter name.
+        The coupling and the sigmas, by parameter name.
     """
 
     def given(x: Floats) -> dict[str, float]:
@@ -260,9 +260,9 @@ def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> 
     """Predict direction and turn of every hour except the first from the previous hours.
 
     Args:
-        wind: (hours,), directions in rad; the filter begins at the first.
-        run: the filter.
-        parameters: its coupling and sigmas, by name.
+        wind: (hours,), directions in rad; the filter begins at the first direction.
+        run: function that runs the filter.
+        parameters: the filter's coupling and sigmas, by name.
 
     Returns:
         Means (hours - 1, 2) in rad, and their covariances.
@@ -282,8 +282,8 @@ def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Predi
 
     Args:
         wind: (hours,), directions in rad.
-        run: the filter.
-        parameters: its coupling and sigmas, by name.
+        run: function that runs the filter.
+        parameters: the filter's coupling and sigmas, by name.
 
     Returns:
         The log densities and the errors in rad, (hours - 1,) each.

@@ -37,7 +37,7 @@ class Condition(Parameters):
     """Biases and noise of a condition.
 
     Attributes:
-        bias_deg: multiple of the biases in the scenario files, which are 1 deg.
+        bias_deg: magnitude of the biases; it scales those of the scenario files, which are 1 deg.
         sigma_rad: standard deviation of azimuth and elevation.
     """
 

@@ -1,9 +1,10 @@
 """Study of moving lines of sight: which biases are observable, why, and how accurately.
 
-If sensors fly straight side by side, one direction of the state is unobservable: the scene may rotate
-about the line between the sensors if they roll with it, and targets with constant velocities then have
-other velocities. A manoeuvre, a sensor off the line and a known target should make this direction
-observable, in one case each.
+If sensors fly straight side by side, one direction of the state is unobservable: if the whole scene and
+the attitudes of the sensors are rotated about the line between the sensors, no measurement changes;
+targets with constant velocities then have different, but still constant, velocities. A manoeuvre, a
+sensor off the line, or a known target should make this direction observable; each is a case of the
+study.
 """
 
 from collections.abc import Mapping
@@ -102,9 +103,9 @@ def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
 def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -> pd.DataFrame:
     """Find the least observable direction of each run, and its eigenvalue relative to the prior.
 
-    By rounding, the zero eigenvalue of a singular information matrix becomes positive or negative, with
-    a magnitude of up to the precision of the largest eigenvalue. Therefore this precision is the lower
-    limit of the smallest eigenvalue.
+    Due to rounding, the zero eigenvalue of a singular information matrix becomes positive or negative,
+    with a magnitude of up to the largest eigenvalue times the machine precision. Therefore this product
+    is the lower limit of the smallest eigenvalue.
     """
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})
@@ -128,9 +129,9 @@ def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:
 def seconds_of(errors: Errors) -> pd.DataFrame:
     """Compute mean squared errors by run and second; for a bound, the square of the bound.
 
-    `common_roll_rad2` describes the mean roll of all sensors, a column named like a bias describes this
-    bias, and the others are means over components. Values are NaN if the estimator does not have the
-    components.
+    `common_roll_rad2` describes the mean roll bias of all sensors. Columns named like a bias describe
+    this bias; the other columns are means over components. Values are NaN if the estimator does not have
+    the components.
     """
     table: dict[str, Any] = {"run": errors.run, "second": errors.elapsed_s.astype(int)}
     for quantity, ending in (("target_m2", "_m"), ("bias_rad2", "_bias_rad"), ("clock_s2", "_clock_s")):

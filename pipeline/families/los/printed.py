@@ -15,12 +15,12 @@ from fuselog.pipeline.studies.toolkit.repetitions import Floats, root_mean_squar
 from fuselog.recorders.families.los.models import ANGLES
 from fuselog.replay.families.los import localization as optical
 
-# The paper's own rule for the RMSE of 100 runs.
+# The paper's rule: the RMSE of 100 runs differs from the CRLB sigma by less than this share.
 RULE = 0.15
 
 
 def metrics_of_print(paper: Printed) -> dict[str, Any]:
-    """Return the number of printed pairs that satisfy the paper's rules."""
+    """Count the printed biases, and those whose RMSE or mean error satisfies the paper's own rules."""
     sigma, rmse = np.array(paper.bias_sigma_mrad), np.array(paper.bias_rmse_mrad)
     small = np.abs(np.array(paper.bias_mean_mrad)) < 2.0 * sigma / np.sqrt(paper.runs)
     return {
@@ -31,7 +31,7 @@ def metrics_of_print(paper: Printed) -> dict[str, Any]:
 
 
 def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
-    """Compute sigmas of biases relative to the paper's, shares that satisfy its rules, and positions."""
+    """Compare CRLB sigmas, biases' errors and position errors with the printed results and rules."""
     name, error = f"{case.condition}-{case.number}", case.bias_error_mrad
     runs, sigma = error.shape[1], case.sigma_mrad
     rule = RULE * np.sqrt(paper.runs / runs)

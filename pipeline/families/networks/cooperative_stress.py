@@ -1,6 +1,6 @@
 """Study of robots that share estimates under stress, on recorded logs.
 
-When a robot sees another, both receive a message. The study removes some of these sightings from the
+When a robot observes another, both receive a message. The study removes some of these sightings from the
 log: all except one per interval, a random half, or those of a robot that leaves. In another case, a
 robot has a wrong and overconfident prior. The estimators fuse immediately, so `network-stress` tests
 out-of-sequence messages. Intervals are over the robots; for the wrong prior, they exclude the robot that
@@ -40,10 +40,11 @@ class CooperativeStressOptions(Parameters):
     """The stress on the robots.
 
     Attributes:
-        intervals_s: minimum times in s between sightings in which two robots share estimates.
+        intervals_s: minimum times in s between sightings at which two robots share estimates, one case
+            for each.
         leaving: number of the robot that is absent in the middle third.
         liar: number of the robot whose prior is wrong.
-        lie_m: error of its prior along x.
+        lie_m: error of this prior along x.
     """
 
     intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)

@@ -58,13 +58,13 @@ class QuadInertialOptions(Parameters):
     Attributes:
         filter: label of the filter.
         smoother: label of the smoother.
-        offsets_s: offset to add to the stamps of the units, in s, by the recording's folder; the most
-            likely offset for other folders.
-        search_s: smallest offset, largest offset and step of the first search, in s; the search is
-            extended if the best offset is at an end.
-        truth_sigma_m: standard deviation of the truth's positions if these are used as fixes in that
-            search.
-        scored_from_s: time from which errors are evaluated.
+        offsets_s: offset to add to the stamps of the units, in s, by the recording's folder; for other
+            folders, the most likely offset is used.
+        search_s: smallest offset, largest offset and step of the first search, in s; the search range is
+            extended if the best offset is at one of its ends.
+        truth_sigma_m: standard deviation of the truth's positions if these are used as fixes in the
+            search for offsets.
+        scored_from_s: time in s after which errors are evaluated.
     """
 
     filter: str = "ekf"
@@ -213,7 +213,7 @@ def _offsets(
     *,
     of_truth: bool,
 ) -> dict[str, float]:
-    """Find the offset of each recording's first unit that explains positions best.
+    """Find the most likely clock offset of each recording's first unit, given positions.
 
     The positions are those of the truth at all its stamps, or those of the fixes.
     """
@@ -234,7 +234,7 @@ def _offset(
     estimator: Mapping[str, Mapping[str, Any]],
     search_s: tuple[float, float, float],
 ) -> float:
-    """Find the first unit's offset that explains fixes best; extend the search if it is at an end."""
+    """Find the first unit's most likely clock offset; extend the search range if it is at an end."""
     (low, high, step), [label] = search_s, estimator
     tried = np.arange(low, high + 0.5 * step, step)
     # use the same fixes for all offsets: likelihoods of different data are not comparable
@@ -283,7 +283,7 @@ def _judged(
     runs: Mapping[tuple[str, str, str], int],
     options: QuadInertialOptions,
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the errors with one unit, with the mean of all units, and with all filters fused."""
+    """Yield the errors with one unit, the mean of all units, and the fused filters of all units."""
     estimates = outputs[f"/estimates/{label}/state"]
     innovation = outputs[f"/estimates/{label}/innovation"]
     late_ns = flight.time_ns[0] + round(1e9 * options.scored_from_s)
@@ -334,9 +334,9 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
 
     Args:
         flight: the recording with the truth.
-        time_ns: (m,), the stamps of the poses.
+        time_ns: (m,), the poses' stamps.
         pose: (m, 10), position in m, velocity in m/s, orientation as a quaternion.
-        late_ns: stamp from which errors are evaluated.
+        late_ns: stamp in ns from which errors are evaluated.
 
     Returns:
         RMSE by name: position, horizontal position, velocity, and heading in deg.

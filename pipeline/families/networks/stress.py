@@ -35,11 +35,11 @@ class StressOptions(Parameters):
         settle_s: time from the beginning after which errors are evaluated.
         cases: changes to the scenario's parameters, by the name of a case.
         intervals_s: minimum times in s between two messages of a node, one case for each.
-        divergences: differences in nats from its last message at which a node sends a new one; one case
-            for each.
+        divergences: differences in nats between a node's estimate and its last message at which the node
+            sends a new message; one case for each.
         liar: number of the node that sends false estimates.
-        lie_after_s: time after which it sends false estimates.
-        lies_m: offsets in m that it adds to its estimates, one case for each.
+        lie_after_s: time in s after which this node sends false estimates.
+        lies_m: offsets in m that this node adds to its estimates, one case for each.
         gate_probability: consistent estimates pass the gate with at least this probability.
     """
 
@@ -101,13 +101,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _measure(rows: pd.DataFrame, key: str, outcome: Outcome) -> None:
-    """Measure mean NEES and RMSE by run; `key` has a placeholder for the quantity."""
+    """Measure mean NEES and RMSE over the runs; `key` has a placeholder for the quantity."""
     outcome.measure(key.format("nees"), mean_interval(rows["nees"]))
     outcome.metrics[key.format("position_rmse_m")] = float(np.sqrt(rows["squared_m2"].mean()))
 
 
 def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure the RMSE of sending news relative to sending at intervals, at equal bandwidth."""
+    """Measure the RMSE of sending on change relative to sending at intervals, at equal bandwidth."""
     by_interval, by_news = (rows[rows["policy"] == policy] for policy in (INTERVAL, NEWS))
     grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
     for limit, own in by_news.groupby("limit", sort=False):
@@ -122,7 +122,7 @@ def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> pd.DataFrame:
-    """Compute mean NEES and squared position error by estimator and run, over all nodes except one."""
+    """Compute mean NEES and squared position error by estimator and run; skip node `without`."""
     parts = []
     for errors in replayed.errors:
         if errors.case != f"node{without}":
@@ -174,7 +174,7 @@ def _of(outputs: Mapping[str, Ragged], estimator: str, leaf: str) -> list[Ragged
 
 
 def _lying(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Tabulate errors of the other nodes while one lies, by run, offset and gate (with or without)."""
+    """Tabulate errors of the other nodes while one lies, by run and offset, with and without a gate."""
     parts = []
     own = runner.experiment.estimators[CI]
     for lie_m in (0.0, *options.lies_m):

@@ -127,7 +127,7 @@ def _rule(label: str, values: Mapping[str, Any]) -> str:
 
 
 def _by_loss(runner: Runner, options: NetworkOptions, settled: Replayed) -> pd.DataFrame:
-    """Tabulate NEES and RMSE ratio of some rules over the share of lost messages."""
+    """Tabulate NEES and RMSE ratio of the rules in `loss_rules` by the share of lost messages."""
     experiment = runner.experiment
     labels = [label for label in experiment.estimators if label in options.loss_rules]
     chosen = {
@@ -162,7 +162,8 @@ def _loss_chart(table: pd.DataFrame) -> Chart:
 def traces_of_equation_17() -> dict[str, float]:
     """Compute the trace of (17) as printed and of the fused covariance, for independent errors.
 
-    The paper equates P_c^-1 with the expression in brackets, but two factors P around it are missing.
+    The paper equates P_c^-1 with the expression in brackets, B; the fused error has the covariance P B P
+    instead, where P is the covariance that covariance intersection states.
     """
     stated = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
     fused = fuse(CI, np.zeros((2, 2)), stated)

@@ -22,10 +22,10 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """Delays that the data do not contain.
+    """A delay of the ranges that the recordings do not state.
 
     Attributes:
-        range_delay_s: age of a range at its stamp, in addition to an estimator's own `range_delay_s`.
+        range_delay_s: age of a range at its stamp, in s; added to an estimator's own `range_delay_s`.
     """
 
     range_delay_s: float = 0.0

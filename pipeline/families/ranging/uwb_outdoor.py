@@ -1,8 +1,8 @@
 """Study of positions from ranges outdoors: uwb_outdoor, compared with published tracks.
 
 Published errors are for a part of each path, which begins and ends when the path enters given regions.
-The truth is interpolated linearly between its rows, without rows whose height is off by half a metre.
-Published tracks are evaluated at their stamps, our estimates at the rows of the truth.
+The truth is interpolated linearly, after samples with a wrong height are removed (see `level_m`).
+Published tracks are evaluated at their stamps, our estimates at the stamps of the truth.
 """
 
 import re
@@ -60,8 +60,8 @@ class Window(Parameters):
     """The part of a path that is evaluated.
 
     Attributes:
-        begin: region in which the window begins, the first time that the path is there.
-        end: region in which it ends, the first time after that.
+        begin: the window begins when the path first enters this region.
+        end: the window ends when the path first enters this region after the beginning.
     """
 
     begin: Place = Place()
@@ -69,12 +69,13 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """The windows, and the selection of rows of the truth.
+    """The windows, and the selection of samples of the truth.
 
     Attributes:
         windows: the part of a path to evaluate, by the name of a folder that contains the recording;
             the whole path if there is no window.
-        level_m: largest distance of a row of the truth from the path's median height.
+        level_m: largest difference in m between the height of a sample of the truth and the path's
+            median height.
     """
 
     windows: dict[str, Window] = {}

@@ -1,8 +1,8 @@
 """Study of poses from ranges between anchors and tags: lias, ultra-wideband with motion capture.
 
 Estimates are evaluated at their stamps from `skip_s` on, and the truth is interpolated linearly. The
-body of the motion capture differs slightly from that of the tags, so errors have a mean that no filter
-can know. Therefore results are also computed without the mean.
+body of the motion capture differs slightly from that of the tags, so errors have a constant part that no
+filter can estimate. Therefore results are also computed without the mean.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class UwbPoseOptions(RangingOptions):
-    """The time at which evaluation begins, and the mounting of the truth.
+    """The time at which evaluation begins, and the mounting of the tags relative to the truth.
 
     Attributes:
         skip_s: time after the first estimate at which evaluation begins.

@@ -67,8 +67,8 @@ def step_errors(ensemble: Ensemble) -> pd.DataFrame:
 
     The columns are the RMSE of area and position relative to the filter with exact moments (as in the
     paper) and to the truth, and the median area. A half side of -l means the same rectangle as l, but
-    with a negative area. Such runs are counted, and `size` is the absolute area. Failed runs are also
-    counted.
+    with a negative area. Runs with a negative area are counted, and `size` is the absolute area. Failed
+    runs are also counted.
     """
     exact = ensemble.tracks[REFERENCE].mean
     parts = []

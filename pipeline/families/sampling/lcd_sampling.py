@@ -100,10 +100,10 @@ def draw(name: str, seed: int) -> Samples:
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """Compute the distance of 2N+1 LCD samples, raw and moment-corrected, from the UKF's samples.
+    """Compare 2N+1 LCD samples, raw and moment-corrected, with the UKF's samples, except for rotation.
 
-    The distance is the largest difference between the sorted distances of samples from each other and
-    from the origin, which a rotation does not change.
+    In each set, the distances between samples and those from the origin are sorted; a rotation does not
+    change them. Returns the largest difference from the UKF's distances, for both sets.
     """
     points = lcd_samples(dimension, 2 * dimension + 1, np.random.default_rng(seed), starts=starts)
     wanted = _invariants(unscented(dimension).points)
@@ -118,7 +118,7 @@ def _invariants(points: np.ndarray) -> np.ndarray:
 
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:
-    """Draw the sets with the circle that contains 95 %, with point areas as weights, Fig. 1."""
+    """Draw the sets, with point areas as weights, and the circle that contains 95 %, Fig. 1."""
     figure = Figure(figsize=(2.6 * len(drawn), 3.2), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 100)
     radius = np.sqrt(chi2.ppf(0.95, 2))

@@ -1,4 +1,4 @@
-"""Common parts of the S2KF paper's studies, which compare filters with the one with exact moments.
+"""Common parts of the S2KF paper's studies, which compare filters with a filter that uses exact moments.
 
 An experiment's runs are replayed for several seeds, because errors differ more between seeds than
 between sample sets of one kind; each seed is a separate ensemble.

@@ -44,8 +44,8 @@ class Options(Parameters):
 
     Attributes:
         dimensions: dimensions of the state.
-        functions: number of functions of each dimension.
-        phase_sigma_rad: standard deviation of k'x, the phase of a function.
+        functions: number of random functions for each dimension.
+        phase_sigma_rad: standard deviation of k'x, that is, the length of k.
         pays: share by which more samples must reduce an error to be worthwhile.
         drives: recordings by name.
     """
@@ -202,7 +202,7 @@ def driven(
 
 
 def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure errors with intervals over the functions, and log ratios of `RATED` to the others."""
+    """Measure errors with intervals over the functions, and log error ratios of `RATED` to others."""
     for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
         case = f"n{dimension}-{direction}"
         for quantity in ("mean_error", "covariance_error", "cross_error"):
@@ -253,7 +253,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """Draw a line for each family of samplings, and a level for the EKF, which has no samples."""
+    """Draw a line for each family of samplings, and a horizontal one for the EKF, without samples."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

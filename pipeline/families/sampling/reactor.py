@@ -2,7 +2,7 @@
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A, Fig. 7. The paper's statements are tested for the prior mean as printed, (0.5, 3.5), and
-for the swapped numbers. Only the swapped numbers reproduce the curves of the figure.
+with its components swapped. Only the swapped mean reproduces the curves of the figure.
 """
 
 import numpy as np

@@ -33,7 +33,7 @@ class BoundOptions(Parameters):
     """The rules by which bounds are computed from errors.
 
     Attributes:
-        margin: ratio of the bound to odometry's largest error.
+        margin: ratio of the odometry bound to the largest odometry error.
         bearing_quantile: quantile of bearing errors that is the bound, because a misidentified landmark
             may cause any error.
     """

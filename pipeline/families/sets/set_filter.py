@@ -154,7 +154,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Count how often a filter correctly decides whether a frame or its past is faulty."""
+    """Count how often a filter rightly, wrongly or never decides if a frame or its past is faulty."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())

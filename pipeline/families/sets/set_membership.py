@@ -70,8 +70,9 @@ def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
 def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
     """Measure the share of sets that contain the truth, the median area, and the number of violations.
 
-    A set must contain the truth if its bounds hold and the robot is in the arena; robots outside the
-    arena are counted separately. Metrics are per case and for all cases, over the frames with a truth.
+    A violation is a set without the truth although its bounds hold and the robot is in the arena; robots
+    outside the arena are counted separately. Metrics are per case and for all cases, over the frames
+    with a truth.
     """
     metrics: dict[str, MetricValue] = {}
     together: dict[str, list[JudgedSets]] = {}
@@ -100,7 +101,7 @@ def _without_errors(runner: Runner) -> dict[str, MetricValue]:
 
 
 def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValue]:
-    """Compute the median of area / exact area over the frames, and how often the box is larger."""
+    """Compute the median of area / exact area, and how often L4 and L8 sets are smaller than the box."""
     areas = {(each.estimator, each.case): each.area_m2 for each in found}
     metrics: dict[str, MetricValue] = {}
     for (name, of), area in areas.items():

@@ -1,4 +1,4 @@
-"""Study of tracks of reports without identities: which vessels kept a track of their own.
+"""Study of tracks from reports without identities: which vessels kept a track of their own.
 
 The identities in the log are used only for evaluation. A vessel's own track is the one that a one-to-one
 assignment of tracks to vessels selects; see `fuselog.replay.families.tracking.judging.tracks`.
@@ -31,7 +31,7 @@ class AisOptions(Parameters):
     """Options for counting tracks.
 
     Attributes:
-        live_s: time after a report for which a track counts as live.
+        live_s: time in s after its last report for which a track counts as live.
     """
 
     live_s: PositiveFloat = 600.0

@@ -39,7 +39,7 @@ class AutoferryOptions(Parameters):
         compared: pairs of estimators to compare, the first with the second.
         late: policies for late scans to try in order of arrival.
         late_estimators: labels of the estimators that are replayed with these policies; estimators that
-            experiment does not run are ignored.
+            the experiment does not run are ignored.
     """
 
     compared: list[tuple[str, str]] = []
@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """Find the folders of scenarios in the data's folder by number; else return that folder itself."""
+    """Find the scenario folders in the data folder by number; if none, return the data folder."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []

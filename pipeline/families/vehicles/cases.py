@@ -37,7 +37,7 @@ class VehiclesOptions(Parameters):
         cases: changes to the scenario's parameters, by the name of a case.
         reference: label of the Kalman filter.
         few: parameters of estimators that are too slow to replay all runs, by label.
-        few_runs: number of runs of the first case for these estimators.
+        few_runs: number of runs of the first case that these estimators replay.
     """
 
     cases: dict[str, dict[str, Any]] = {"deterministic": {}}
@@ -49,7 +49,7 @@ class VehiclesOptions(Parameters):
 class Scores(NamedTuple):
     """Total errors (20) of every run (runs,), with fixed labels and with the best labels.
 
-    By step, these are the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps). `failed` counts
+    The arrays by step (runs, steps) are squared errors, and GOSPA in m (cutoff 10 m). `failed` counts
     runs that did not reach the end. Sets have no labels, so their errors with fixed labels are NaN.
     """
 
@@ -137,7 +137,7 @@ def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
 def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
     """Compute the total errors of a set estimate.
 
-    A vehicle without an element of its own is assigned the nearest element.
+    A vehicle to which no element is assigned gets the nearest element.
 
     Args:
         outputs: outputs by topic.

@@ -1,8 +1,8 @@
-"""Study of how time and error of vehicles' filters grow with the number of vehicles.
+"""Study of how computing times and errors of filters grow with the number of vehicles.
 
-Vehicles start at random in a square. Either its area grows with their number, so that their density is
-constant, or it is so small that any fix may belong to any vehicle. Growth is described by a factor per
-vehicle for exponential methods, and by a power otherwise.
+Vehicles start at random in a square. Either the square's area grows with the number of vehicles, so that
+the density is constant, or the square is so small that any fix may belong to any vehicle. Growth is
+described by a factor per vehicle for exponential methods, and by a power otherwise.
 """
 
 import time
@@ -48,7 +48,7 @@ class ScalingOptions(Parameters):
         vehicles: numbers of vehicles.
         area_per_vehicle_m2: area per vehicle if they start apart.
         together_m: side of the square if they start together.
-        methods: range of each method, by label.
+        methods: largest number of vehicles and expected growth of each method, by label.
     """
 
     vehicles: tuple[PositiveInt, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 20, 35, 50)
@@ -58,7 +58,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """Growth of time over the larger half of the numbers: power of N, and factor per vehicle."""
+    """Growth of computing time over the larger half of the numbers N of vehicles."""
 
     power: float
     factor: float

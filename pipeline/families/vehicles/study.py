@@ -64,7 +64,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """Compute scores of slow estimators in the first runs of a case, and of the others in these runs."""
+    """Compute scores of slow and of other estimators in the first `few_runs` runs of a case."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]
