@@ -204,7 +204,7 @@ def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) ->
 
 
 def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
-    """Return the sorted distinct (time, target) pairs of streams, given the field of their targets."""
+    """Return the sorted distinct (time, target) pairs of streams, each with its field of targets."""
     times, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for stream, field in streams:
         times.append(stream.publish_time_ns)

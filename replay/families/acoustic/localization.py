@@ -47,8 +47,8 @@ class Setting(NamedTuple):
     """Assumptions of the estimator about sensors and medium.
 
     `cross_covariances` keeps the covariances between range and angles in local estimates. The paper
-    leaves them out: with them the search is unstable, and the bound of eq (48) falls below that of the
-    native measurements, which is impossible.
+    leaves them out: with them, the search is unstable, and the bound of eq (48) falls below the bound of
+    the native measurements, from which the local estimates are derived, so it is invalid.
     """
 
     mode: Mode
@@ -70,7 +70,7 @@ class Detections(NamedTuple):
     position_m: Floats
 
     def take(self, rows: NDArray[np.intp]) -> "Detections":
-        """Select the runs `rows`."""
+        """Select the runs with the indices `rows`."""
         return Detections(*(column[rows] for column in self))
 
 
@@ -315,7 +315,7 @@ def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
 
 
 def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
-    """Append the position fix of every sensor as two further measurements of its last two parameters."""
+    """Append the position fix of every sensor as two further measurements, of the sensor's position."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)
     wider = [(0, 0), (0, 0), (0, 2), (0, 2)]

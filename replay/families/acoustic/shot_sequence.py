@@ -174,7 +174,7 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None:
-    """Fit position and direction (3,) of a shot to reports (n, 4) of sensors (n, 2), if possible."""
+    """Fit position and direction (3,) of a shot to reports (n, 4) of sensors (n, 2); None on failure."""
     sigma = np.sqrt(np.array(hear_noise(parameters)))
 
     def residuals(shot: Floats) -> Floats:

@@ -38,7 +38,7 @@ class SoundSourceParameters(ModelParameters):
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
-        start_sigma_m: largest standard deviation of the start, per axis.
+        start_sigma_m: upper limit of the standard deviation of the initial position, per axis.
         height_sigma_m: standard deviation of the difference between the heights of source and
             microphones, if all microphones are at one height.
     """
@@ -71,7 +71,7 @@ def read_variances(stream: Stream) -> Floats:
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the position that best fits the differences of the first stamp, searching on all sides.
+    """Find the position that best fits the first stamp's differences, by searches on all sides.
 
     Raises BadInput if there are fewer differences than unknown coordinates.
     """

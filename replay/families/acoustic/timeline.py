@@ -46,7 +46,7 @@ class Cone(NamedTuple):
 
     Attributes:
         length_m: length of the bullet's path.
-        mach_angle_rad: half the opening angle of the shockwave.
+        mach_angle_rad: half the opening angle of the shockwave's cone.
         interval_ns: the usual time between shots.
     """
 
@@ -90,7 +90,7 @@ def _place(scene: Scene, sensor: int) -> Floats:
 
 
 def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
-    """Return the Mach angle that the detections' channels state, or the usual angle."""
+    """Return the Mach angle that the detections' channels state, or that of the default medium."""
     for sensor in sensors:
         stated = scene.source.topics[f"/sensor{sensor}/detections"].metadata
         if "mach_number" in stated:

@@ -112,9 +112,9 @@ class MixtureParameters(LearnerParameters):
 
     Attributes:
         topology: transitions between states; joint is a single state whose vector has all scores.
-        genuine_components: Gaussians per state of genuine pairs.
-        impostor_components: Gaussians per state of impostor pairs.
-        components_of: Gaussians per state of both kinds of pairs, by the name of a subset.
+        genuine_components: number of Gaussians per state in the model of genuine pairs.
+        impostor_components: number of Gaussians per state in the model of impostor pairs.
+        components_of: number of Gaussians per state by name of subset, instead of the two numbers above.
         covariance_floor: value added to the diagonal of every covariance, in squared z units.
         iterations: largest number of steps of expectation maximization.
         tolerance: increase of the log-likelihood below which expectation maximization ends.
@@ -208,7 +208,7 @@ def learn_mixture(
 
     Args:
         parameters: settings of the fit.
-        components: Gaussians per state of the genuine and of the impostor model.
+        components: number of Gaussians per state of the genuine and of the impostor model.
         sequence: (n, m): each vector of n * m scores is a sequence of n vectors with m scores.
         vectors: the training scores, (rows, n * m).
         genuine: (rows,), whether each row compares two samples of the same user.
@@ -324,9 +324,9 @@ def fused_stream(
     """Make a stream of fused scores as score vectors with one component, in arrival order.
 
     Args:
-        compared: the comparisons, for the arrival times of the probes.
+        compared: the comparisons, which state the arrival times of the probes.
         pairs: the n pairs that were fused.
-        fused: (n,), their scores.
+        fused: (n,), the fused scores of the pairs.
         metadata: metadata of the channel in addition to its component.
     """
     order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
@@ -342,7 +342,7 @@ def fused_stream(
 
 
 def _find(name: str, topics: Mapping[str, Topic], parameters: Subsets) -> Iterator[Binding]:
-    """Find the scores and, by case, the matchers to fuse; yield nothing if there are none."""
+    """Find the scores and, by case, the matchers to fuse; yield nothing if the log has no scores."""
     if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
         return
     subsets = subsets_of(matchers_of(topics[TOPIC].metadata))

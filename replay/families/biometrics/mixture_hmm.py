@@ -44,7 +44,7 @@ class Fit(NamedTuple):
 def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     """Fit a model to sequences (count, n, m), excluding sequences with a missing score (NaN).
 
-    The means start from k-means of the vectors at the state's position in the sequence.
+    The initial means of a state are found by k-means of the vectors at its position in the sequences.
 
     Raises BadInput unless there are more sequences than components.
 

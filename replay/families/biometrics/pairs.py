@@ -108,7 +108,7 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
 def cross_validate(
     vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
 ) -> Floats:
-    """Fuse scores (n,); each fusion is learned without the users in the fold of the gallery user.
+    """Fuse scores (n,); the fusion of a pair is learned without the users in its gallery user's fold.
 
     Args:
         vectors: (n, m), a score of each matcher.

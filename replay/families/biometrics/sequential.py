@@ -106,9 +106,9 @@ def page_sums(ratios: Floats) -> Floats:
 def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
     """Count the probes (...,) until one of the sums (..., n) exceeds its threshold; 0 if none does.
 
-    The threshold is log(together * run_length), where each probe adds to `together` sums. By the
-    martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is at least
-    `run_length` (Pollak, Annals of Statistics 13(1), 1985).
+    The threshold is log(together * run_length), where `together` is the number of sums to which a probe
+    adds. By the martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is at
+    least `run_length` (Pollak, Annals of Statistics 13(1), 1985).
 
     Args:
         sums: (..., n), from `page_sums`.

@@ -94,7 +94,7 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
     Raises BadInput if shapes do not match or a standard deviation is not positive.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
         start: (runs, n), starting point of the search; by default, the intersections of the rays.
     """
@@ -109,7 +109,7 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
     """Compute parameters (runs, n) from the intersections of rays, with zero for unknown biases.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
 
     Returns:
@@ -129,7 +129,7 @@ def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
     start is too inaccurate. The function is meant for experiments.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (runs, targets, sensors, 2), in rad.
 
     Returns:
@@ -150,7 +150,7 @@ def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearizati
     """Linearize lines of sight at parameters.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
         parameters: (runs, n).
     """
@@ -179,7 +179,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
     """Find rank and unobservable directions for one run.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (targets, sensors, 2), NaN without a line of sight; other values do not matter.
         parameters: (n,).
     """
@@ -227,7 +227,7 @@ def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats
     are still unobservable.
 
     Args:
-        scene: knowledge before the measurements.
+        scene: known properties of the sensors.
         measured: (targets, sensors, 2), in rad, for one run.
         parameters: (n,), the point of linearisation.
 

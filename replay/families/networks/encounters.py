@@ -57,7 +57,7 @@ class RobotEvents(NamedTuple):
     `robots` (m, 2) has the robot that sent the event and the robot that it sees, or -1 if it sees none.
     For odometry, the value is (forward, turn) and `is_sighting` is false. For a sighting of a robot or
     of a landmark at `place` (m, 2), the value is (range, bearing). `is_due` marks events at which the
-    first robot's estimate is written.
+    estimate of the sending robot is written.
     """
 
     offsets: Integers

@@ -220,7 +220,7 @@ def around(anchors: Floats, parameters: Any) -> list[Floats]:
 
     Args:
         anchors: (n, 3), in m; repeated anchors count once.
-        parameters: with `start_reach_m`, the distance of the positions from the centre.
+        parameters: parameters with `start_reach_m`, the distance of the positions from the centre.
     """
     middle, reach = np.unique(anchors, axis=0).mean(axis=0)[:2], parameters.start_reach_m
     return [middle + reach * np.array(side) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
@@ -232,7 +232,8 @@ def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
     Args:
         residuals: function that maps a position or pose (k,) to the residuals (n,) of ranges, in m.
         starts: positions or poses (k,) from which to search.
-        parameters: with `sigma_range_m`; residuals above three times this value have less weight.
+        parameters: parameters with `sigma_range_m`; residuals above three times this value have less
+            weight.
     """
     from scipy.optimize import least_squares  # slow to import
 

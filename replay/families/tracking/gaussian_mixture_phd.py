@@ -197,7 +197,7 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
 def _outputs(
     topic: str, frame: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture
 ) -> list[Ragged]:
-    """Make the streams of set sizes, elements, expected numbers and failed runs."""
+    """Make the streams of set sizes, elements, expected numbers of targets, and failed runs."""
     reported = np.flatnonzero(sets.is_reported)
     offsets = np.searchsorted(reported, scans.offsets)
     time_ns, elements, expected = (

@@ -131,7 +131,7 @@ def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scan
 def advance_out_of_sequence(
     setup: TrackerSetup, state: TrackerState, block: Block, *, back_ns: int
 ) -> tuple[TrackerState, list[Ragged]]:
-    """Track targets in the order of arrival, reprocessing for scans that are late by up to `back_ns`.
+    """Process scans in order of arrival, with reprocessing if a scan is late by at most `back_ns`.
 
     A late scan is inserted at its stamp, and the scans after it are processed again. Earlier outputs are
     not changed; the corrected tracks are output again at the latest stamp.

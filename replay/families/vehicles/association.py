@@ -1,7 +1,7 @@
 """Association of the detections of an unordered scan with vehicles: the best map, or all maps.
 
-A map assigns each vehicle at most one detection of its own; unassigned detections are false. Maps have
-weights, for a detection probability p_D and Poisson clutter of uniform density.
+A map assigns each vehicle at most one detection of its own; unassigned detections are false. The weights
+of maps assume a detection probability p_D and Poisson clutter of uniform density.
 """
 
 from typing import NamedTuple

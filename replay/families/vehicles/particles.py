@@ -80,8 +80,8 @@ class Cloud(NamedTuple):
     """The particles of all runs.
 
     Each particle is a Gaussian of all vehicles (runs * particles, n). In a bootstrap filter, a particle
-    has only a mean, and the covariances are empty. Log weights are (runs, particles). A run's generator
-    is made when its first fixes arrive.
+    has only a mean, and the covariances are empty. Log weights are (runs, particles). The random number
+    generator of a run is made when its first fixes arrive.
     """
 
     carried: VehiclesState

@@ -282,7 +282,7 @@ def _end_kept() -> None:
 def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with filters in parallel, one process per core; the result of None is None."""
+    """Process runs with filters in parallel, one process per core; None for runs without input."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
     workers = Workers()
 

@@ -288,7 +288,7 @@ def _note(
 def follow_runs_streaming(
     words: Sequence[str], runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with programs in parallel, one per core; the result of None is None."""
+    """Process runs with programs in parallel, one per core; None for runs without input."""
     started: list[Program] = []
 
     def one(given: RunGiven | None) -> Ran | None:

@@ -18,7 +18,7 @@ class Divergence(NamedTuple):
     Attributes:
         row: index of the innovation after which the filter diverges.
         time_ns: the stamp of this innovation.
-        nis_per_component: the mean NIS per component from this innovation.
+        nis_per_component: the mean NIS per component from this innovation on.
     """
 
     row: int

@@ -207,7 +207,7 @@ def nis_by_bin(
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Compute the interval of an RMSE over these runs, assuming that the covariances P are correct.
+    """Compute the interval of an RMSE over the given runs, assuming that the covariances P are correct.
 
     A sum of squared errors has mean tr P and variance 2 tr P^2. Its distribution is close to a scaled
     chi-square with these moments (Box 1954, theorem 3.1), and equal to it if all variances are equal.

@@ -23,14 +23,14 @@ COVERS, SOME_TARGETS = "covers", "some targets"
 
 
 class Doubt(NamedTuple):
-    """Doubt about a truth, and the number of messages that it concerns."""
+    """Doubt about a truth: the number of messages of the truth, and the reason."""
 
     messages: int
     why: str
 
 
 class Truths:
-    """Truths of one run, for several readers, each in order of time."""
+    """Truths of one run for several readers, each of which reads in order of time."""
 
     def __init__(self, source: Source) -> None:
         self.source = source

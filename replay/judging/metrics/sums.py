@@ -12,10 +12,10 @@ Integers = NDArray[np.int64]
 class BinnedSums:
     """Sums of rows of numbers (n, columns) by group and by bin of a position, an integer >= 0.
 
-    Bin b contains the positions from b width to (b + 1) width. If there is a `limit` of bins per group,
-    the width is doubled until the limit is met. `cells` limits the number of bins of all groups in the
-    same way, but only when sums are merged. `first` is the first group; nothing is stored for groups
-    before it.
+    Bin b contains the positions from b × width to (b + 1) × width. If there is a `limit` of bins per
+    group, the width is doubled until the limit is met. `cells` limits the number of bins of all groups
+    in the same way, but only when sums are merged. `first` is the first group; nothing is stored for
+    groups before it.
     """
 
     def __init__(

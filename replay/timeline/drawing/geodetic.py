@@ -109,7 +109,7 @@ def usual(places: Floats) -> Floats:
 
 
 def are_near(places: Floats) -> NDArray[np.bool_]:
-    """Find the positions that are not far off, because the view of a map centres on all its points."""
+    """Find the positions that are not outliers, which would shift the centre of a map's view."""
     low, high = usual(places)
     margin = FAR * (high - low).max()
     return ((places >= low - margin) & (places <= high + margin)).all(axis=1)

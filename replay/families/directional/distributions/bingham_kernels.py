@@ -54,7 +54,7 @@ def times(x: Complex, y: Complex) -> Complex:
 
 
 def reciprocal(x: Complex) -> Complex:
-    """Compute 1 / x, scaled by its larger part, as C does."""
+    """Compute 1 / x for a complex x, scaled by the larger of its two parts, as C does."""
     if abs(x[0]) >= abs(x[1]):
         ratio = x[1] / x[0]
         size = x[0] + x[1] * ratio
@@ -75,10 +75,10 @@ def root(x: Complex) -> Complex:
 
 
 def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
-    """Compute the moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
+    """Compute mean and covariance of x_i^2 under a Bingham distribution; z (d,), with z[-1] = 0.
 
     Args:
-        z: nonpositive concentrations.
+        z: concentrations, at most 0.
         mean: E(x_i^2), (d,), overwritten.
         covariance: Cov(x_i^2, x_j^2), (d, d), overwritten: the derivative of `mean` with respect to z.
 

@@ -209,7 +209,7 @@ def product_mixture(
 
     Args:
         mean, covariance, other_mean, other: means (2,) and covariances (2, 2) of both densities.
-        mixture: filled; large enough, see `blank_mixture`.
+        mixture: overwritten; it must be large enough, see `blank_mixture`.
     """
     first, second, inverse = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
     _limit(covariance, first)

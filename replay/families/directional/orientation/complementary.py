@@ -61,7 +61,7 @@ class MahonyParameters(AssumedParameters):
     """Gains of the corrections of orientation and bias.
 
     Attributes:
-        gain: gain of the correction, in 1/s.
+        gain: gain of the orientation correction, in 1/s.
         bias_gain: gain of the bias correction, in 1/s^2.
     """
 
@@ -186,7 +186,7 @@ def follow_mahony(
 
 
 def unit_vectors(value: Floats) -> Any:
-    """Return the directions of specific force and magnetic field, and the turn rate between them.
+    """Return the direction of the specific force, the turn rate, and the direction of the field.
 
     If the field is not finite, as between two samples of a slower magnetometer, its direction is zero
     and causes no correction.

@@ -218,9 +218,9 @@ def fit(
         pairs: the frame.
         arena: rectangle that is known to contain the robot.
         order: the number L of monomials, 4 or 8.
-        weighting: "area" minimises the area of the set at every step, "batch" over all weights together;
-            "determinant" minimises the determinant of C^e, starting from a wide prior; "equal" uses
-            equal weights. The paper mentions "area" without a procedure.
+        weighting: "area" minimises the area of the set at every step, "batch" minimises it over all
+            weights together; "determinant" minimises the determinant of C^e, starting from a wide prior;
+            "equal" uses equal weights. The paper mentions "area" without a procedure.
         sweeps: number of times that the rings are fused; fusing a set repeatedly is valid.
 
     Returns the set, which contains the exact set for any weights. Raises BadInput if the filter finds

@@ -1,4 +1,4 @@
-"""Sums over the joint associations of a cluster of tracks, by enumeration or by message passing."""
+"""Sums over the joint associations of clusters of tracks, by enumeration or by message passing."""
 
 from typing import NamedTuple
 

@@ -55,7 +55,7 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
 
 
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Fuse the errors that the confirmed tracks of a run have estimated, and update all tracks.
+    """Fuse the confirmed tracks' estimates of the shared errors, and update all tracks of a run.
 
     The errors are the components of every track's state from index `first`. If associations are so
     ambiguous that the fused information is not positive definite, the shared errors are not changed.

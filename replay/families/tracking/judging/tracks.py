@@ -86,8 +86,8 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
     """Count the senders heard within the last `live_s`; return times (m,) of changes and counts (m,).
 
     Args:
-        time_ns: (n,), sorted.
-        numbers: (n,), number of the sender.
+        time_ns: (n,), sorted stamps of the reports.
+        numbers: (n,), number of the sender of each report.
         live_s: time for which a sender counts after its last report, in s.
     """
     order = np.lexsort((time_ns, numbers))
