@@ -125,7 +125,7 @@ def _of_innovations(
     nis: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
 ) -> Iterator[Finding]:
-    """Find gates that reject too much, and NIS outside its interval.
+    """Find gates that reject too many measurements, and NIS outside its interval.
 
     The NEES of a diverged estimator is reported together with its NIS.
     """
@@ -286,7 +286,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find estimators that are not comparable because their gates differ and rejected measurements."""
+    """Find estimators that are not comparable: their gates differ and have rejected measurements."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

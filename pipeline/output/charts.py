@@ -51,7 +51,7 @@ class Axis(Parameters):
     Attributes:
         label: the quantity, with its unit.
         log: whether the axis is logarithmic.
-        limits: its ends; by default those of the data.
+        limits: ends of the axis; by default those of the data.
         ticks: texts by position, if the axis has its own ticks.
     """
 
@@ -112,7 +112,7 @@ class Panel(Parameters):
 
     Attributes:
         x, y: the axes.
-        series: curves over them.
+        series: curves over these axes.
         bands: ranges over x.
         title: the text above the panel.
         plane: whether both axes have the same scale.
@@ -142,7 +142,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Assign a colour to every label; charts with the same `first` labels give these the same."""
+        """Assign a colour to every label; `first` labels have the same colours in all charts."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -170,11 +170,11 @@ def curve(
     """Make a series of values y over x.
 
     Args:
-        label: its name in the legend.
+        label: name in the legend.
         x: (n,), numbers or names.
-        y: (n,), its values at x.
-        style: how it is drawn.
-        reference: whether the others are compared with it.
+        y: (n,), values at x.
+        style: how the series is drawn.
+        reference: whether the other curves and bands are compared with it.
 
     Returns:
         The series, for `Panel.series`.
@@ -186,7 +186,7 @@ def curves(table: "pd.DataFrame", by: list[str], x: str, y: str, style: Style = 
     """Make a series of y over x for each group of a table's rows, in order.
 
     Args:
-        table: with these columns.
+        table: table with the columns below.
         by: the columns that group the rows and name the series.
         x: a column of numbers or names.
         y: a column of numbers.
@@ -204,10 +204,10 @@ def path(
     """Make a series of points in the plane.
 
     Args:
-        label: its name in the legend.
+        label: name in the legend.
         points: (n, 2), x and y.
-        style: how it is drawn.
-        reference: whether the others are compared with it.
+        style: how the series is drawn.
+        reference: whether the other curves and bands are compared with it.
 
     Returns:
         The series, for `Panel.series`.
@@ -219,11 +219,11 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
     """Make a range over x.
 
     Args:
-        label: its name in the legend.
+        label: name in the legend.
         x: (n,), numbers or names.
-        low: (n,), its lower end at x.
-        high: (n,), its upper end at x.
-        reference: whether the others are compared with it.
+        low: (n,), lower end of the range at x.
+        high: (n,), upper end of the range at x.
+        reference: whether the other curves and bands are compared with it.
 
     Returns:
         The band, for `Panel.bands`.
@@ -235,7 +235,7 @@ def level(label: str, x: ArrayLike, y: float) -> Series:
     """Make a horizontal reference line from end to end of x.
 
     Args:
-        label: its name in the legend.
+        label: name in the legend.
         x: (n,), numbers or names; only the first and the last are used.
         y: the value.
 
@@ -250,10 +250,10 @@ def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
     """Make a constant reference range from end to end of x.
 
     Args:
-        label: its name in the legend.
+        label: name in the legend.
         x: (n,), numbers or names; only the first and the last are used.
-        low: its lower end.
-        high: its upper end.
+        low: lower end of the range.
+        high: upper end of the range.
 
     Returns:
         The band, for `Panel.bands`.
@@ -282,7 +282,7 @@ def _places(values: ArrayLike) -> Places:
 
 
 def _numbers(values: ArrayLike) -> Numbers:
-    """Convert numbers for JSON: seven digits, more than a screen can show; NaN becomes null."""
+    """Round numbers to seven digits, more than a screen can show; NaN and infinity become null."""
     array = np.asarray(values, dtype=float)
     return [float(f"{value:.7g}") if np.isfinite(value) else None for value in array.tolist()]
 

@@ -47,10 +47,10 @@ class Claim:
 
     Attributes:
         claim: the statement.
-        paper: the result in the paper, or its place there.
+        paper: the result in the paper, or where the paper states it.
         ours: what we measured.
-        verdict: a `Claimed`, or its word.
-        why: the reason for the verdict; for a refuted claim at least the numbers that contradict it.
+        verdict: a `Claimed`, or its text.
+        why: the reason for the verdict; for a refuted claim, at least the numbers that contradict it.
     """
 
     claim: str
@@ -94,24 +94,24 @@ def known(claim: Claim) -> Claim:
 class StatedClaim(Parameters):
     """A claim as written in an experiment's file.
 
-    In texts, `{EXPRESSION:FORMAT}` is replaced by a number; everywhere `$NAME` is replaced by its
-    value in `each`.
+    In texts, `{EXPRESSION:FORMAT}` is replaced by the value of the expression; everywhere `$NAME` is
+    replaced by its value in `each`.
 
     Attributes:
         sentence: the claim.
         paper: what the paper says, or the source of the limit.
-        holds: the comparison that decides: confirmed, refuted, or inconclusive if an interval allows
-            both; without it the claim is not reproducible.
-        value: the expression that is named `value` in texts and in the comparison.
+        holds: the comparison that decides whether the claim is confirmed, refuted or, if an interval
+            allows both, inconclusive; without a comparison, the claim is not reproducible.
+        value: the expression to which `value` refers in texts and in the comparison.
         ours: what we found.
-        why: the reason for the verdict, or a remark. If a refuted claim has neither this nor
-            `unless`, the reason lists the numbers that refute it.
+        why: the reason for the verdict, or a remark. If a refuted claim has neither `why` nor `unless`,
+            the reason lists the numbers that refute the claim.
         unless: a remark for every verdict except `confirmed`.
         reproducible: a comparison; if it is false, the claim is not reproducible, whatever `holds`
             says.
-        each: names and lists of their values; a claim is made for every value, or every combination. A
-            table as a value sets several names; `nees[ekf, *]` is a list of everything that its `*`
-            matches.
+        each: names and lists of their values; a claim is made for every value or, if there are several
+            names, for every combination. A table as a value sets several names; `nees[ekf, *]` is a list
+            of everything that its `*` matches.
         given: numbers or expressions, by their names in texts and in the comparison.
         optional: whether the claim is left out, instead of not reproducible, if the result lacks one
             of its metrics.
@@ -154,7 +154,7 @@ class StatedClaim(Parameters):
 
     @property
     def names(self) -> set[str]:
-        """Return the names that the claim uses but does not define; raise BadInput for invalid names."""
+        """Return names that the claim uses but does not define; raise BadInput for bad expressions."""
         found: set[str] = set()
         for meant in _combinations(self.each):
             claim = _named(self, meant)
@@ -177,7 +177,7 @@ def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
 
 
 def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: str) -> None:
-    """Raise BadInput with `where` and the claim if a claim uses an unknown number."""
+    """Raise BadInput with `where` and the claim if a claim uses the name of an unknown number."""
     for claim in stated:
         for name in sorted(claim.names.difference(names)):
             raise BadInput(

@@ -6,7 +6,8 @@
     gain[ekf, wind][0]         an entry of a list
     rmse_m[ekf] < 2 * limit    a comparison: true, false, or open if an interval allows both
 
-Numbers are named after the names that `*` and `|` match. The functions are `numbers.FUNCTIONS`.
+Each number in a list is named after the text that `*` or `|` matched. The functions are
+`numbers.FUNCTIONS`.
 """
 
 import ast
@@ -59,7 +60,7 @@ class Values(NamedTuple):
 def evaluate(expression: str, values: Values) -> Value:
     """Evaluate an expression.
 
-    Raises BadInput if it is invalid, and `NoMetric` if the result lacks one of its metrics.
+    Raises BadInput if the expression is invalid, and `NoMetric` if the result lacks one of the metrics.
     """
     try:
         return value_of(parse(expression), values)
@@ -80,8 +81,8 @@ def truth(expression: str, values: Values) -> Truth:
 def formatted(template: str, values: Values) -> str:
     """Fill a sentence with the values of its expressions: `{EXPRESSION:FORMAT}`, lists with commas.
 
-    A number with an interval is followed by it; `{EXPRESSION!n:FORMAT}` also writes the names of
-    numbers. Raises as `evaluate` does.
+    If a number has an interval, the interval follows the number; `{EXPRESSION!n:FORMAT}` also writes the
+    names of numbers. Raises as `evaluate` does.
     """
     parts = []
     for text, expression, form, conversion in Formatter().parse(template):
@@ -159,8 +160,8 @@ def names_in(expression: str) -> frozenset[str]:
 def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:
     """Test whether chance could change the result of a comparison, so that it needs many runs.
 
-    This is the case if the comparison reads a metric without an interval, uses only one end of an
-    interval, or tests what an interval contains, because fewer runs make the interval wider.
+    This is the case if the comparison reads a metric without an interval, uses only the value or one end
+    of an interval, or tests whether an interval contains a number: fewer runs make intervals wider.
 
     Args:
         expression: the comparison.
@@ -275,7 +276,7 @@ def value_of(node: ast.expr, values: Values) -> Value:
 
 
 def metric(quantity: str, of: str, values: Values) -> Value:
-    """Look up the metric of `estimator, case`, or a list if these contain `*` or `|`.
+    """Look up the metric of `estimator, case`, or a list of metrics if the text contains `*` or `|`.
 
     Raises `NoMetric` if there is none.
     """

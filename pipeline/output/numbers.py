@@ -66,7 +66,7 @@ def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Inter
 
 
 def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Interval], Truth]:
-    """Make a test whether one number and its interval are entirely below, or above, another's."""
+    """Make a test of whether the whole interval of one number is below, or above, that of another."""
 
     def compare(one: Interval, other: Interval) -> Truth:
         if one.low == one.high and other.low == other.high:
@@ -102,7 +102,8 @@ def negated(of: Truth) -> Truth:
 def all_hold(truths: Sequence[Any]) -> Truth:
     """Test whether all truth values, nested lists included, are true.
 
-    The result is missing if one value is missing, else false if one is false, else undecided if one is.
+    The result is missing if any value is missing, otherwise false if any is false, otherwise undecided
+    if any is undecided.
     """
     known = flat(truths)
     if "missing" in known:
@@ -201,7 +202,7 @@ def _falls(values: list[Interval]) -> Truth:
 def _consistent(size: Interval, count: Interval) -> Interval:
     """Compute the 95 % interval of the mean NEES of `size` components over `count` estimates.
 
-    NaN if one of these is missing.
+    Returns NaN if `size` or `count` is missing.
     """
     from fuselog.replay.judging.errors.evaluation import chi_square_interval
 

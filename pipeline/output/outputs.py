@@ -139,7 +139,7 @@ def _shown(settings: Mapping[str, str], name: str) -> str:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """Return the run of a log that fuselog wrote, or changed afterwards if `is_changed`."""
+    """Return the run of a log that fuselog wrote and did not change (did change if `is_changed`)."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None

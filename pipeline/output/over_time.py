@@ -1,4 +1,4 @@
-"""Panels over time: values in their 95 % range, and NIS in parts of a run."""
+"""Panels over time: values with their 95 % range, and the mean NIS in parts of a run."""
 
 from collections.abc import Sequence
 
@@ -24,11 +24,11 @@ def panel_over_time(
     """Draw values (n,) over their range, with a strip along the bottom where they are outside.
 
     Args:
-        label: name of the estimator; without `of_band`, also of the range.
+        label: name of the estimator; without `of_band`, also the name of the range.
         time_s: (n,).
         values: (n,).
         ends: the lower and upper ends (n,) of the range.
-        y: axis, whose limits place the strip.
+        y: vertical axis; the strip is drawn at its lower limit.
         title: text above the panel.
         of_band: name of a range that is the same for all estimators.
         others: further curves.
@@ -50,9 +50,10 @@ def nis_over_time(
     Args:
         time_s: (n,), times of the innovations.
         squared: (n,), NIS.
-        degrees: (n,), the numbers of components.
+        degrees: (n,), numbers of components of the innovations.
 
-    Returns the middle (m,) of each part with innovations, the mean, and its 95 % interval.
+    Returns, for the m parts with innovations, the middle of the part in s, the mean, and the lower and
+    the upper end of its 95 % interval, (m,) each.
     """
     width_s = max(float(np.ptp(time_s)) / BINS, 1e-9)
     place = np.minimum(((time_s - time_s.min()) / width_s).astype(np.int64), BINS - 1)

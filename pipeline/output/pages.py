@@ -10,7 +10,7 @@ from fuselog.recorders.errors import printable
 
 
 def templates(package: str, filters: Mapping[str, Any]) -> Environment:
-    """Open the templates in the folder of a package, which can use these filters and escape all text."""
+    """Open the templates of a package; they can use these filters, and escape all text."""
     environment = Environment(
         loader=PackageLoader(package, "."),
         autoescape=select_autoescape(),

@@ -51,12 +51,12 @@ class Outcome:
     """The findings of a study.
 
     Attributes:
-        metrics: by `estimator.quantity_unit[.case]`.
+        metrics: values by `estimator.quantity_unit[.case]`.
         claims: the statements of the paper, with our verdicts.
-        tables: by name.
+        tables: tables by name.
         figures: charts, or other pictures, by name.
         input_sha256: a hash of the input data.
-        parameters: those of all estimators, including defaults.
+        parameters: parameters of all estimators by label, including defaults.
         bounds: the 95 % range of a metric if the estimator is consistent.
         intervals: the 95 % interval of the true metric, from the variation over runs.
         alarms: warnings about the metrics.

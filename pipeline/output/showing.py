@@ -19,7 +19,7 @@ class Shown(NamedTuple):
     Attributes:
         title: a description in one line.
         sentences: remarks, of which the first few are displayed.
-        tables: its numbers.
+        tables: tables of the object's numbers.
     """
 
     title: str

@@ -26,9 +26,9 @@ def summarise(
     """Summarise a judged replay in metrics, warnings, tables, figures and message counts.
 
     Args:
-        judge: of all runs.
+        judge: judge of all runs.
         coverage: how many messages of each topic were used.
-        parameters: of the estimators by label, if known.
+        parameters: parameters of the estimators by label, if known.
     """
     outcome = Outcome(alarms=alarms_of(judge, parameters or {}, coverage))
     if coverage:

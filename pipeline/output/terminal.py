@@ -58,7 +58,7 @@ class OnceAMinute:
         self.begin()
 
     def begin(self) -> None:
-        """Start the first minute, at the beginning of a command."""
+        """Start timing when a command begins, so that its first line appears after a minute."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
@@ -221,7 +221,7 @@ def print_metrics(
 ) -> None:
     """Print metrics as tables, one per case, with a row per quantity and a column per estimator.
 
-    A value with bounds is followed by them: the 95 % range of a consistent estimator. If there is a
+    If a value has bounds, the 95 % range of a consistent estimator, they follow the value. If there is a
     table of runs, the mean NEES over the runs is added, or the reason why it is missing (see
     `metric_tables`). Many cases are summarised in one table of medians; `details` names the place that
     lists each case.

@@ -246,7 +246,7 @@ def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Format numbers shown together with the decimals of the largest; very different ones separately.
+    """Format numbers shown together with the decimals of the largest; separately if they differ much.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])

@@ -48,7 +48,7 @@ class Cell:
 
     Attributes:
         experiment: the complete experiment; its result depends on no other file except its logs.
-        first, end: the runs.
+        first, end: the number of the first run, and of the run after the last.
         logs: number of runs whose logs are kept.
         draws: whether the timeline of the first run is drawn.
         errors: whether all individual errors are kept.
@@ -113,7 +113,7 @@ class Pace:
     Attributes:
         runs: number of runs in all cells.
         done: number of runs in merged cells.
-        worked_off: number of runs in the cells that this command computed, not an earlier one.
+        worked_off: number of runs in the cells that this command, not an earlier one, computed.
         workers: number of workers.
     """
 

@@ -1,6 +1,6 @@
 """Recording, replay and judgement of ensembles, in one streamed pass or in memory.
 
-Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
+Runs are recorded on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
 
 import json
@@ -93,7 +93,7 @@ class Pass:
     """The result of a streamed pass over runs.
 
     Attributes:
-        judge: of all runs.
+        judge: judge of all runs.
         parameters: parameters of every estimator by label, including defaults.
         stated: parameters in the first log's channels; see `stated_of`.
         usages: how many measurements were used, by bound estimator.
@@ -172,7 +172,7 @@ def replay_parts(
         parts: the runs.
         estimators: parameters by label.
         gap_limit_s: the longest gap over which the truth is interpolated.
-        metrics: their names; all if empty.
+        metrics: names of the metrics to compute; all if empty.
         order: the clock that orders messages.
         late: how out-of-sequence messages are handled if messages are in order of log time.
         save: the file for the first run's timeline.

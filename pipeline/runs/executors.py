@@ -176,7 +176,8 @@ def _use_one_core() -> None:
 class DaskExecutor(Executor):
     """An executor that submits work to a Dask client, whose worker threads use one core each.
 
-    The limit is applied with each task, so it also holds for workers that start later or restart.
+    The limit of one core is applied with each task, so it also holds for workers that start later or
+    restart.
     """
 
     def __init__(self, client: Any) -> None:

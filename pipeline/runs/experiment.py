@@ -53,7 +53,7 @@ class Experiment(Parameters):
         gap_limit_s: longest gap over which truth is interpolated.
         arrival_order: whether messages are processed in order of arrival.
         late: how out-of-sequence measurements are handled, as for `--late` of `fuselog replay`.
-        options: of the study.
+        options: options of the study.
         recordings: the recordings that claims are about, by name, if the runs are not simulated.
         claims: claims about the resulting metrics.
         claims_of: name of another experiment whose claims are decided first.
@@ -195,7 +195,7 @@ class Stated(NamedTuple):
     Attributes:
         name: its name.
         source: the file from which it was read, for messages.
-        values: its entries.
+        values: the entries of the file.
         folder: the folder to which the paths of its logs are relative.
         files: other files from which it was read.
     """
@@ -213,7 +213,7 @@ class Stated(NamedTuple):
 
     @property
     def _values(self) -> dict[str, Any]:
-        """Return its entries, and permit the programs that they name."""
+        """Return the experiment's entries, and permit the programs that they name."""
         stated = self.values.get("estimators")
         own = {"estimators": allowed_in(stated, self.folder)} if isinstance(stated, Mapping) else {}
         return {**self.values, **own}

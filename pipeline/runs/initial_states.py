@@ -1,4 +1,4 @@
-"""Starts of replays from another state than the log's own prior.
+"""Starts of replays from a state other than the log's own prior.
 
 An estimator with a prior begins at the prior's stamp. If the replayed span begins later, the prior does
 not apply, and the state must come from the truth or from the estimates of an earlier replay. The
@@ -166,7 +166,7 @@ def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping
 
 
 def from_estimates(estimates: Source) -> Origin:
-    """Start a run from the last mean and covariance in an earlier replay before the start.
+    """Start a run from the last mean and covariance before the start, taken from an earlier replay.
 
     The estimate with the same label is used, or else the only estimate with the prior's components.
     """

@@ -1,4 +1,4 @@
-"""Recording, replay and judgement of ensembles in memory, if there is enough."""
+"""Recording, replay and judgement of ensembles that fit into memory."""
 
 import time
 from collections.abc import Mapping, Sequence

@@ -84,7 +84,7 @@ class Runner:
         )
 
     def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:
-        """Replay the runs `sources` in memory, by `estimators` or those of the experiment."""
+        """Replay the runs `sources` in memory with `estimators`, by default those of the experiment."""
         return replay_ensemble(
             sources,
             self.experiment.estimators if estimators is None else estimators,
@@ -200,7 +200,7 @@ class Runner:
 def runner_again(folder: Path, result: Result) -> Runner:
     """Make the runner of a result from its settings, to replay its runs again.
 
-    Raises BadInput if they do not state the runs and the estimators.
+    Raises BadInput if the settings do not state the runs and the estimators.
     """
     if not result.settings.get("estimators") or "study" not in result.settings:
         raise BadInput(NO_REPLAY)

@@ -113,7 +113,7 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 
 
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
-    """Return the names of the estimators' parameters by label; the arguments are their settings.
+    """Return the names of the estimators' parameters by label; `estimators` contains the settings.
 
     Raises BadInput if there is no such estimator.
     """

@@ -124,8 +124,8 @@ def points_of(
 ) -> list[dict[str, Any]]:
     """Make the points of a grid, on which the last parameter changes fastest, or samples of the ranges.
 
-    A sample contains one value of a list. Raises BadInput if there are no parameters, or too many
-    points.
+    If a parameter has a list instead of a range, a sample contains one of its values. Raises BadInput if
+    there are no parameters, or too many points.
     """
     keys = [each.key for each in over]
     if not over or len(set(keys)) < len(keys):
@@ -157,7 +157,7 @@ def points_of(
 
 
 def _at(over: Over, share: float) -> Any:
-    """Return the value at a share, from 0 to 1, of a range or a list."""
+    """Return the value at a relative position, from 0 to 1, in a range or a list."""
     if over.ends is None:
         return over.taken[min(int(share * len(over.taken)), len(over.taken) - 1)]
     low, high = over.ends
@@ -189,8 +189,8 @@ def run_sweep(
     """Run an experiment at every point, and write a result folder; return result.json.
 
     The metrics in the result are lists with a number for each point; the table has a row for each.
-    Raises BadInput if the study of the experiment does more than judge, or if the experiment cannot be
-    run.
+    Raises BadInput if the study of the experiment does more than replay and judge, or if the experiment
+    cannot be run.
     """
     for experiment in experiments:
         if experiment.study != "localization":
@@ -228,7 +228,7 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """Tabulate the metrics at a point, with the value over all runs and the range of their middle 90 %.
+    """Tabulate the metrics at a point: the value over all runs and the range of the middle 90 % of runs.
 
     NEES and NIS also have their expected value, and the 95 % range of a consistent estimator.
     """
@@ -286,7 +286,7 @@ def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
 
 
 def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
-    """Draw each quantity in each case, as a heat map if two numbers are swept, otherwise as curves."""
+    """Draw each quantity in each case: a heat map if two numeric parameters are swept, else curves."""
     numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
     grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
     figures: dict[str, Chart | Figure] = {}

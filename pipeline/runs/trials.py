@@ -21,8 +21,8 @@ class Trial:
         label: the estimator's label.
         runs: the runs; an `Ensemble` caches what its replays have in common.
         settings: the estimator's parameters, with its `kind` if that is not the label.
-        stretched: by topic, the logarithm of the volume of measurements relative to the log's: other
-            units change the density of the numbers.
+        stretched: by topic, the logarithm of the factor by which alterations scale the volume of a
+            measurement; log-likelihoods are corrected by it, because a density depends on the unit.
     """
 
     label: str
@@ -46,7 +46,7 @@ class Trial:
     def altered(
         self, topic: str, alteration: alter.Alteration, value: float, stretched: float = 0.0
     ) -> "Trial":
-        """Copy the trial with a topic altered, whose measurements become `stretched` larger."""
+        """Copy the trial with an altered topic, and add `stretched` to the topic's log volume."""
         runs = [alter.altered(each, topic, alteration, value) for each in self.runs]
         by_topic = {**self.stretched, topic: self.stretched.get(topic, 0.0) + stretched}
         return replace(self, runs=runs, stretched=by_topic if stretched else self.stretched)

@@ -36,7 +36,7 @@ def multiples_of(count: int) -> Integers:
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Compute the step between differences; neighbours of long windows are nearly the same."""
+    """Compute the step between differences; adjacent differences of long windows are nearly equal."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 
@@ -73,7 +73,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
 
 
 def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
-    """Compute the degrees of freedom of an Allan variance of `pairs` differences from its terms."""
+    """Compute the degrees of freedom of an Allan variance of `pairs` differences from noise terms."""
     coarser = _stride(multiple, pairs + 2 * multiple)
     multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
     g = terms.autocovariance(multiple, step_s, pairs)

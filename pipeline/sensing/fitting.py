@@ -1,8 +1,8 @@
 """A maximum-likelihood fit of a sensor's noise: its terms with sizes and intervals.
 
-A random walk of zero is at the boundary of the possible values. If a sensor has no walk, its most likely
-density is zero in two of three recordings. Therefore the result may be that no walk is found, with an
-upper limit.
+A random walk of zero is at the boundary of the possible values. If a sensor has no walk, the most likely
+density of the walk is zero in two of three recordings. Therefore the result may be that no walk is
+found, with an upper limit.
 """
 
 import math
@@ -39,7 +39,8 @@ class Fit(NamedTuple):
         free: the names of the parameters of the terms.
         terms: the most likely terms.
         log_likelihood: the log-likelihood with these terms.
-        curvature: (p, p) minus its second derivatives by the logarithms of the parameters.
+        curvature: (p, p) minus the second derivatives of the log-likelihood with respect to the
+            logarithms of the parameters.
         size: the number of samples.
     """
 
@@ -66,7 +67,7 @@ class Fit(NamedTuple):
 
 
 def choose(samples: Samples) -> Fit:
-    """Choose the fit with the best BIC, which has white noise and any other terms that improve it."""
+    """Choose the fit with the best BIC; it has white noise, and the other terms that improve the BIC."""
     white = fit(samples, ())
     walk, markov = fit(samples, ("walk",)), fit(samples, ("markov", "markov_time_s"))
     best = max(white, walk, markov, key=lambda each: each.criterion)
@@ -130,7 +131,7 @@ def _scaled(terms: Terms, name: str, scale: float) -> float:
 
 
 def _cost(samples: Samples, free: Sequence[str]) -> Cost:
-    """Make a function of minus the log-likelihoods (n,) of the logarithms (n, p) of parameters."""
+    """Make a function that maps logarithms (n, p) of parameters to minus the log-likelihoods (n,)."""
     return lambda points: np.array(
         [-likelihood(samples, of_point(free, each)).log_likelihood for each in points]
     )

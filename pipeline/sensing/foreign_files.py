@@ -1,8 +1,8 @@
 """Meaning and units of the numbers in noise files of imu_utils and allan_variance_ros.
 
-In imu_utils, `gyr_n` is the root of the rate times the Allan deviation at 1 s, a standard deviation per
-sample, although its README gives rad/s/sqrt(Hz); `gyr_w` is the minimum of its curve, not a walk.
-allan_variance_ros differences neighbouring bins that overlap, and its gyroscope curve is in deg/s.
+In imu_utils, `gyr_n` is sqrt(rate) times the Allan deviation at 1 s, which is a standard deviation per
+sample, although its README gives rad/s/sqrt(Hz); `gyr_w` is the minimum of the Allan deviation, not a
+walk. allan_variance_ros differences neighbouring bins that overlap, and its gyroscope curve is in deg/s.
 """
 
 import math

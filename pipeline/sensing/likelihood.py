@@ -1,8 +1,8 @@
 """The likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov noise, quantised angle.
 
-A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, which starts exactly diffuse, the
-Gauss-Markov noise g, errors e of a quantised angle and white noise v. Therefore the first sample is not
-scored. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
+A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, the Gauss-Markov noise g, errors e
+of a quantised angle and white noise v. The start of the walk is exactly diffuse, so the first sample is
+not scored. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
 squares.
 """
 

@@ -39,11 +39,11 @@ class ColumnNoise:
         topic, field, component: the column; `component` is empty for a scalar.
         step_s: the mean time between samples.
         block: the number of samples averaged before the likelihood.
-        numbers: by the names of `Terms`, and `ramp`; 0 for a walk that was not found.
+        numbers: values by the names of `Terms`, and `ramp`; 0 for a walk that was not found.
         fitted: the chosen model.
         curve: the measured Allan deviation.
         degrees: (n,) degrees of freedom of the Allan deviation.
-        notes: sentences.
+        notes: remarks on the column, one sentence each.
     """
 
     topic: str

@@ -22,7 +22,7 @@ class NamedRun(NamedTuple):
 def worst_runs(folder: Path, result: Result, found: Findings) -> list[NamedRun]:
     """Name the run with the largest error of each estimator, and runs that warnings name.
 
-    The result is empty unless it has several runs that can be opened one by one.
+    Returns an empty list unless the result has several runs that can be opened one by one.
     """
     if result.made_by != "run" or found.runs < 2 or "study" not in result.settings:
         return []

@@ -1,6 +1,6 @@
 """Evidence about each estimator of a result: its errors, consistency and failures in every run.
 
-It is computed from the metrics and the table of runs, which exist in all kinds of results.
+The evidence is computed from the metrics and the table of runs, which exist in all kinds of results.
 """
 
 import math
@@ -43,14 +43,15 @@ class Evidence:
     """Everything that is known about one estimator.
 
     Attributes:
-        estimator: its label.
-        error: the quantity by which estimators are compared; None if it has none.
+        estimator: the estimator's label.
+        error: value of the quantity by which estimators are compared; None if the estimator has none.
         squares: NEES, or NEES of the position, and NIS, if available.
         failed: the number of failed runs; None if unknown.
         runs: the number of runs, over all cases.
-        share: the share of the time with estimates.
-        outside: the number of cases in which it is inconsistent, and the number of all cases.
-        age_s: the mean age of estimates when they are available, in the case with the oldest.
+        share: the share of the time for which there are estimates.
+        outside: the number of cases in which the estimator is inconsistent, and the number of all cases.
+        age_s: the mean age of estimates at the time they become available, in the case with the oldest
+            estimates.
     """
 
     estimator: str
@@ -69,12 +70,12 @@ class Evidence:
 
     @property
     def decisive(self) -> Squares | None:
-        """Return the squares that decide: NEES, or NIS if only NIS is off."""
+        """Return the squares that decide: NEES, or NIS if only NIS is outside its limits."""
         return decisive(self.squares)
 
     @property
     def verdict(self) -> Consistency:
-        """Return the verdict on its covariances; undecided if it fails in every run."""
+        """Return the verdict on the estimator's covariances; undecided if it fails in every run."""
         by = None if self.has_failed else self.decisive
         return by.verdict if by is not None else Consistency.UNDECIDED
 
@@ -104,7 +105,7 @@ class Findings:
     """Everything that a result contains about its estimators.
 
     Attributes:
-        tables: its metrics by case.
+        tables: the result's metrics by case.
         rows: a row per estimator, case and run, with quantities; may be empty.
         runs: the number of runs.
         labels: the estimators in order, without bounds.
@@ -129,7 +130,7 @@ class Findings:
 
     @property
     def error_name(self) -> str:
-        """Return the name of that quantity in sentences, such as "position error"."""
+        """Return the name of the main quantity in sentences, such as "position error"."""
         return quantity(self.main).name.removesuffix(", RMS")
 
     @property
@@ -178,7 +179,7 @@ class Findings:
         return np.sqrt(squared).dropna()
 
     def difference(self, first: str, second: str, key: str, target: Target = None) -> Difference | None:
-        """Compute how much a quantity of the second exceeds that of the first, over the runs of both."""
+        """Compute the difference of a quantity, second minus first estimator, over the runs of both."""
         both = pd.concat([self.by_run(first, key), self.by_run(second, key)], axis=1).dropna()
         if both.empty:
             return None

@@ -66,7 +66,7 @@ class Opening:
         found: the findings about the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture specific to this kind of result.
-        numbers_of: the part of the runs that the table of numbers shows, if not all.
+        numbers_of: sentence on what the table of metrics covers, if not all runs.
     """
 
     tried: str

@@ -66,9 +66,9 @@ def plan(run: FirstRun) -> Chart:
 def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
     """Draw one second of the run for the estimators whose ellipses are too small for the scene.
 
-    Choose the second in which the share of truths outside the ellipses is closest to that of the whole
-    run, over all estimators shown, and of several such seconds the one closest to the middle. None if
-    all ellipses are large enough for the scene.
+    The typical second is the one in which the share of true positions outside the ellipses, over all
+    estimators shown, is closest to the share in the whole run; among several such seconds, the one
+    closest to the middle of the run. Returns None if all ellipses are large enough for the scene.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
@@ -142,7 +142,7 @@ def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
 
 
 def _rows_within(each: Followed, begin_s: float, length_s: float) -> NDArray[np.int64]:
-    """Find the estimates nearest to a few evenly spaced times of the second."""
+    """Find the estimates nearest to a few evenly spaced times within the typical second."""
     times = np.linspace(begin_s, begin_s + length_s, DOTS)
     return np.unique(np.abs(each.time_s[:, None] - times).argmin(axis=0))
 
@@ -225,8 +225,8 @@ def tracked(
 ) -> Chart | None:
     """Draw the first run from above, with tracks and true paths, in a panel for each tracker.
 
-    If there are several cases, the one with the median error is drawn. None if no run has both truths
-    and tracks. Raises BadInput if a log is damaged.
+    If there are several cases, the one with the median error is drawn. Returns None if no run has both
+    truths and tracks. Raises BadInput if a log is damaged.
 
     Args:
         folder: the result's folder.

@@ -71,9 +71,10 @@ class Gauge(NamedTuple):
     """The position of a mean NEES or NIS, in percent of a scale from conservative to overconfident.
 
     Attributes:
-        usual: the range that counts as consistent, which is the 95 % range or a small deviation.
+        usual: the range that counts as consistent: the 95 % range, widened to include all small
+            deviations.
         aim, value: the ideal value, and the measured one.
-        spread: the 95 % interval of the value; both ends are the value if it is unknown.
+        spread: the 95 % interval of the value; both ends are the value if the interval is unknown.
         is_beyond: whether the value is beyond the end of the scale.
         words: a description for screen readers.
     """
@@ -90,7 +91,7 @@ class Gauge(NamedTuple):
 class Card:
     """The card of one estimator, with its accuracy, run time, and reasons not to trust it.
 
-    If its look is `claims`, the card states how many of a result's claims are confirmed.
+    A card with the look `claims` states how many of a result's claims are confirmed.
     """
 
     estimator: str
@@ -137,7 +138,7 @@ def story(
     *,
     at_best: bool = False,
 ) -> Story:
-    """Write the story of judged estimators; with `at_best`, each is at the point of its smallest error.
+    """Write the story of judged estimators; `at_best`: each is at the point with its smallest error.
 
     Causes, run times and warnings are included if they are given.
     """

@@ -1,7 +1,8 @@
 """Openings of the pages of sweeps, which recommend an estimator and its parameters.
 
 Each estimator is represented by the point with its smallest error, and `story` recommends one as in an
-experiment. Points at which it is overconfident are used only if it is overconfident at all points.
+experiment. Points at which an estimator is overconfident are used only if it is overconfident at all
+points.
 """
 
 import math
