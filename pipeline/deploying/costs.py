@@ -177,6 +177,8 @@ def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Co
     if is_root:
         return Cost(count * v)
     cross = 4 * t * v * count if part else 0
+    if len(sampled.axes):
+        cross = count * (1 + 3 * v) + t * (t + 1) * v
     return added(Cost(5 * count * v * (v + 1) // 2 + cross), _cholesky(t))
 
 

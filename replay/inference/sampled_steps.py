@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuselog.replay.engine.arrays import Floats
+from fuselog.replay.engine.arrays import Floats, Integers
 from fuselog.replay.engine.vectors.tangent import WIDTHS
+from fuselog.replay.inference.kalman.regression import axes_of, has_joint_moments
 from fuselog.replay.inference.kalman.wide_angles import turning, unsuspected_rad
 from fuselog.replay.inference.linear_algebra.manifold import (
     boxminus,
@@ -36,6 +37,9 @@ class SampledFunction(NamedTuple):
 
     Attributes:
         points, weights: samples (L, t + noises) of N(0, I), and their weights (L,).
+        axes: (L,) indices of the axes of the points, if the moments are computed from points on axes;
+            otherwise empty.
+        kept: tangent components of the values that are components of the state.
         variances: returns `variance` (noises), the variances of the noise.
         centre: returns `centre`, the values of the function at the mean without noise.
         value: has the arguments (..., away, centre) and returns `value` (v), the tangent vector from the
@@ -55,6 +59,8 @@ class SampledFunction(NamedTuple):
 
     points: Floats
     weights: Floats
+    axes: Integers
+    kept: tuple[int, ...]
     variances: Step
     centre: Step
     value: Step
@@ -97,6 +103,7 @@ class Sampled(NamedTuple):
         variances: returns the variances of the noise for the state and the arguments of the step.
         arguments: returns the arguments of the function for those of the step.
         kinds, outputs: kinds of the components of the state, and of the function's values.
+        kept: tangent components of the state that the function returns unchanged, in the same place.
     """
 
     what: str
@@ -105,6 +112,7 @@ class Sampled(NamedTuple):
     arguments: StepFunction
     kinds: Kinds
     outputs: Kinds
+    kept: tuple[int, ...] = ()
 
 
 def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, ...]) -> SampledFunction:
@@ -115,10 +123,12 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         sets: sample sets; the first set is used for every step.
         given: arguments of the step, mean and covariance first.
     """
-    what, function, variances, arguments, kinds, outputs = sampled
+    what, function, variances, arguments, kinds, outputs, kept = sampled
     points, weights = sets.points[0], sets.weights[0]
     t, size = tangent_size(kinds), points.shape[1]
     values, components, read_state = tangent_size(outputs), len(outputs), tuple_of(len(kinds))
+    axes = axes_of(points)
+    axes = axes if has_joint_moments(axes, t, values) else axes[:0]
     add_state, add = boxplus(kinds), boxplus(outputs)
     gaussian = given[:2]
 
@@ -152,6 +162,8 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
     return SampledFunction(
         points,
         weights,
+        axes,
+        kept,
         traced_step(what, spread, given),
         traced_step(what, at_mean, given),
         traced_step(what, at_sample, (*given, Shape((size,)), centre)),

@@ -12,6 +12,7 @@ import numpy as np
 
 from fuselog.replay.inference.kalman.predict import motion_derivative
 from fuselog.replay.inference.kalman.regression import (
+    kept_components,
     measured_with_noise,
     moved_with_noise,
     no_variances,
@@ -204,6 +205,7 @@ def _of_motion(model: Model, motion: Motion) -> Sampled:
         lambda given: (read_control(given[0]), given[1], given[2]),
         model.kinds,
         model.kinds,
+        kept_components(motion, model.kinds),
     )
 
 

@@ -21,7 +21,7 @@ from fuselog.pipeline.deploying.c_source.products import (
     slope_text,
     turn_text,
 )
-from fuselog.pipeline.deploying.c_source.samples import MOMENTS, samples_text
+from fuselog.pipeline.deploying.c_source.samples import MOMENTS, ON_AXES, samples_text
 from fuselog.pipeline.deploying.c_source.statements import (
     body,
     count_gains,
@@ -209,7 +209,10 @@ def _moments(made: CFilter) -> list[str]:
     """Write the functions that compute moments of samples."""
     if not any(made.steps.sampled):
         return []
-    return [filled(made, SAMPLING if made.is_root else MOMENTS)]
+    if made.is_root:
+        return [filled(made, SAMPLING)]
+    is_on_axes = any(each is not None and len(each.axes) for each in made.steps.sampled)
+    return [filled(made, MOMENTS + ON_AXES * is_on_axes)]
 
 
 def _factorising(made: CFilter) -> str:

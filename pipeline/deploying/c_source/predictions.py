@@ -4,7 +4,7 @@ import re
 
 from fuselog.pipeline.deploying.c_source.header import predict_signature
 from fuselog.pipeline.deploying.c_source.names import CFilter, filled
-from fuselog.pipeline.deploying.c_source.samples import sampling_call, weighed
+from fuselog.pipeline.deploying.c_source.samples import moments_call, sampling_call, weighed
 from fuselog.pipeline.deploying.c_source.statements import (
     Inputs,
     Loops,
@@ -103,7 +103,7 @@ def _step(made: CFilter) -> str:
         first.append(
             f"spread(&samples, {weighed(sampled)}, {t}, 0, &found);"
             if made.is_root
-            else f"find_moments(&samples, {weighed(sampled)}, {t}, &P[0][0], T, NULL);"
+            else moments_call(sampled, "&P[0][0], T, NULL")
         )
         assigned = [f"filter->mean[{i}] = samples.centre[{i}];" for i in range(made.states)]
     if made.is_root:

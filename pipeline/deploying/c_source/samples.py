@@ -123,6 +123,9 @@ static void widen(drawn_samples *samples, int count, int drawn, int size, REAL s
     }
     for (int i = 0; i < size; i++)
         samples->shift[i] /= share;
+    for (int row = 0; row < drawn; row++)
+        for (int k = 0; k <= row; k++)
+            samples->factor[row][k] /= share;
 }
 """
 
@@ -160,6 +163,40 @@ static void find_moments(const drawn_samples *samples, int count, const REAL *we
 }
 """
 
+ON_AXES = """\
+/* The same for samples on axes: the covariance of the state with the values is the factor of the state's
+ * covariance times that of the points with the values. The values `kept` are unchanged states. */
+static void find_moments_on_axes(const drawn_samples *samples, int count, const REAL *weights,
+                                 const REAL *points, int drawn, const int *axes, int size, REAL *spread,
+                                 int stride, REAL (*cross)[M], const int *kept, int number)
+{
+    REAL joint[DRAWN][VALUES], mixed[T][VALUES];
+    find_moments(samples, count, weights, size, spread, stride, NULL);
+    for (int k = 0; k < drawn; k++)
+        for (int i = 0; i < size; i++)
+            joint[k][i] = 0.0_S;
+    for (int k = 0; k < count; k++) {
+        const int axis = axes[k];
+        const REAL weighted = weights[k] * points[k * drawn + axis];
+        for (int i = 0; i < size; i++)
+            joint[axis][i] += weighted * (samples->values[k][i] - samples->shift[i]);
+    }
+    for (int row = 0; row < T; row++)
+        for (int i = 0; i < size; i++) {
+            REAL entry = 0.0_S;
+            for (int k = 0; k <= row; k++)
+                entry += samples->factor[row][k] * joint[k][i];
+            mixed[row][i] = entry;
+        }
+    for (int row = 0; cross != NULL && row < T; row++)
+        for (int i = 0; i < size; i++)
+            cross[row][i] = mixed[row][i];
+    for (int k = 0; k < number; k++)
+        for (int i = 0; i < size; i++)
+            spread[kept[k] * stride + i] = spread[i * stride + kept[k]] = mixed[kept[k]][i];
+}
+"""
+
 
 def samples_text(made: CFilter) -> list[str]:
     """Write the tables of samples, and the functions of motion and sensors at samples."""
@@ -173,7 +210,10 @@ def samples_text(made: CFilter) -> list[str]:
         "PLACES": max(len(each.centre.outputs) for each in functions),
     }
     listed = ", ".join(f"{name} = {size}" for name, size in sizes.items())
-    tables = {each.points.shape[1]: _table(made, each) for each in functions}
+    # a table has the axes if any function needs them
+    by_axes = sorted(functions, key=lambda each: len(each.axes) > 0)
+    chosen = {each.points.shape[1]: each for each in by_axes}
+    tables = {size: _table(made, chosen[size]) for size in (each.points.shape[1] for each in functions)}
     return [
         f"enum {{ {listed} }};\n",
         *tables.values(),
@@ -218,6 +258,9 @@ def _table(made: CFilter, sampled: SampledFunction) -> str:
         ", ".join(number(float(each)) for each in sampled.weights[first : first + 4])
         for first in range(0, count, 4)
     )
+    axes = ""
+    if len(sampled.axes) and not made.is_root:
+        axes = f"static const int axes_{size}[{count}] = {{{', '.join(map(str, sampled.axes))}}};\n"
     text = f"""/* Samples of N(0, I) in {size} dimensions, and their weights. */
 static const REAL points_{size}[{count}][{size}] = {{
 {rows}
@@ -225,7 +268,7 @@ static const REAL points_{size}[{count}][{size}] = {{
 static const REAL weights_{size}[{count}] = {{
     {weights}
 }};
-"""
+{axes}"""
     return made.precision.text(text)
 
 
@@ -233,6 +276,19 @@ def weighed(sampled: SampledFunction) -> str:
     """Write the arguments for the number of samples and their weights."""
     count, size = sampled.points.shape
     return f"{count}, weights_{size}"
+
+
+def moments_call(sampled: SampledFunction, filled_in: str) -> str:
+    """Write the call that computes covariances, of which `filled_in` states the arrays."""
+    if not len(sampled.axes):
+        return f"find_moments(&samples, {weighed(sampled)}, {sampled.size}, {filled_in});"
+    size = sampled.points.shape[1]
+    kept = ", ".join(map(str, sampled.kept))
+    table = f"(const int[]){{{kept}}}, {len(sampled.kept)}" if kept else "NULL, 0"
+    return (
+        f"find_moments_on_axes(&samples, {weighed(sampled)}, &points_{size}[0][0], {size}, axes_{size}, "
+        f"{sampled.size}, {filled_in}, {table});"
+    )
 
 
 def sampling_call(made: CFilter, number: int) -> str:

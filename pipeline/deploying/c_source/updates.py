@@ -6,7 +6,7 @@ from fuselog.pipeline.deploying.c_source import factors
 from fuselog.pipeline.deploying.c_source.algebra import ALGEBRA, COMMON, ITERATE, UPDATE
 from fuselog.pipeline.deploying.c_source.header import update_signature
 from fuselog.pipeline.deploying.c_source.names import CFilter, filled
-from fuselog.pipeline.deploying.c_source.samples import sampling_call, weighed
+from fuselog.pipeline.deploying.c_source.samples import moments_call, sampling_call, weighed
 from fuselog.pipeline.deploying.c_source.statements import (
     Inputs,
     Loops,
@@ -165,7 +165,7 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
         else:
             first = ["if (!start_samples(filter, &samples))", "    return NAME_NOT_POSITIVE_DEFINITE;"]
             first.append(call)
-            first.append(f"find_moments(&samples, {weighed(sampled)}, {m}, &S[0][0], M, C);")
+            first.append(moments_call(sampled, "&S[0][0], M, C"))
     named = entries(step, "v") | loops.named
     lines = [*first, *c_lines(named, names, made.precision), *loops.calls]
     return loops._replace(declared=[*loops.declared, *declared]), lines

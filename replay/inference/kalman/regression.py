@@ -70,6 +70,7 @@ class SampleMemory(NamedTuple):
             `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) tangent vectors from the mean to the samples.
+        still: (n,) the mean after the addition of a rotation by zero, which normalises it.
         point, noise: (n,) one sample, and (noises,) the variances of the noise.
         values: (L, v) values of the function, as tangent vectors from a centre.
         centre, shift: mean of the values, in the space of the values, and weighted mean (v,) of their
@@ -85,6 +86,7 @@ class SampleMemory(NamedTuple):
     unsuspected: float
     factor: Floats
     offsets: Floats
+    still: Floats
     point: Floats
     noise: Floats
     values: Floats
@@ -106,14 +108,15 @@ def sample_memory(
     """
     count_of_sets, count, dimension = sets.points.shape
     values = tangent_size(outputs)
-    is_on_axes = count_of_sets == 1 and np.all(np.count_nonzero(sets.points[0], axis=1) <= 1)
-    axes = np.argmax(sets.points[0] != 0.0, axis=1)[: count if is_on_axes else 0]
+    axes = axes_of(sets.points[0] if count_of_sets == 1 else np.ones((count, 2)))
+    is_on_axes = len(axes) > 0
     return SampleMemory(
         *sets,
         axes=axes,
         unsuspected=unsuspected_rad(sets.points),
         factor=np.zeros((dimension, dimension)),
         offsets=np.empty((count, dimension)),
+        still=np.empty(len(kinds)),
         point=np.empty(len(kinds)),
         noise=np.empty(noises),
         values=np.empty((count, values)),
@@ -121,6 +124,17 @@ def sample_memory(
         shift=np.empty(values),
         joint=np.empty((dimension if is_on_axes else 0, values)),
     )
+
+
+def axes_of(points: Floats) -> Integers:
+    """Return the index (L,) of the only nonzero entry of each point (L, N); empty if one has several."""
+    is_on_axes = bool(np.all(np.count_nonzero(points, axis=1) <= 1))
+    return np.asarray(np.argmax(points != 0.0, axis=1)[: len(points) if is_on_axes else 0])
+
+
+def has_joint_moments(axes: Integers, states: int, values: int) -> bool:
+    """Test whether the covariance of states and values is computed from points on axes."""
+    return len(axes) > 0 and states * values > REGISTERS
 
 
 class Sampled(Protocol):
@@ -207,6 +221,7 @@ def sampling(
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset, along = lower_of(size), offset_of(size), axis_offset_of(size)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
+    no_step = (0.0,) * t
     turns, narrow = bool(turning(kinds)), narrowing(kinds, size, bounded=is_motion)
 
     def evaluate(
@@ -216,6 +231,9 @@ def sampling(
         triangle, state, offsets = lower(memory.factor), read_state(mean), memory.offsets
         centre = function(state, no_noise, arguments)
         fill(memory.centre, centre)
+        if len(memory.axes) and not flat_states:
+            fill_point(memory.still, state)
+            add_curved(memory.still, no_step)
         for index in range(len(points)):
             if len(memory.axes):
                 away = along(memory.factor, memory.axes[index], points[index])
@@ -225,9 +243,11 @@ def sampling(
             if flat_states:
                 point = tuple(state[row] + away[row] for row in range(components))
             else:
-                fill_point(memory.point, state)
                 if not len(memory.axes) or memory.axes[index] < end:
+                    fill_point(memory.point, state)
                     add_curved(memory.point, away)
+                else:
+                    memory.point[:] = memory.still
                 point = tuple(
                     memory.point[c] if row < 0 else state[c] + away[row]
                     for c, row in enumerate(tangents)
@@ -300,7 +320,7 @@ def regression(
         if not cholesky(memory.factor, covariance, t):
             return False
         weights = sample(mean, arguments, variances, sample_index, memory)
-        if len(memory.axes) and t * v > REGISTERS:
+        if has_joint_moments(memory.axes, t, v):
             chosen = (weights, memory.points[0], memory.axes)
             on_axes(chosen, memory.factor, memory.values, memory.shift, memory.joint, spread, cross)
         else:
