@@ -68,7 +68,7 @@ def pairs() -> list[tuple[str, ...]]:
 
 
 def triples() -> list[tuple[str, ...]]:
-    """Return a random but fixed choice of triples whose faults a log can distinguish in pairs."""
+    """Draw triples by a fixed seed, in which a log can distinguish each fault from the others."""
     every = [each for each in combinations(_in_order(), 3) if _is_told(each)]
     chosen = philox(63).choice(len(every), TRIPLES, replace=False)
     return [every[place] for place in sorted(chosen.tolist())]

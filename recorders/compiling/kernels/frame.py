@@ -22,7 +22,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """An exception for a variable that needs memory for a wider kind of number than it began with."""
+    """A signal that a variable needs a wider numeric type than that of its first assignment."""
 
 
 class Frame(Expressions):

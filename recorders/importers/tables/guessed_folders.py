@@ -56,7 +56,7 @@ def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
 
 
 def stamps_in(path: Path) -> list[str]:
-    """Read the lines of a file with times that are not blank."""
+    """Read the lines of a file of times, except blank ones."""
     with open_text(path) as file:
         lines = [line.decode("utf-8", "replace").strip() for line in lines_of(file)]
     return [line for line in lines if line]
