@@ -145,8 +145,8 @@ class Innovations(NamedTuple):
         accepted: (n,), whether the gate accepted the measurement.
         squared: (n,), normalised innovation squared (NIS).
         degrees: (n,), number of measured components.
-        log_likelihood: (n,), of the measurements; NaN if the estimator does not state it, None for old
-            logs without the field.
+        log_likelihood: (n,), log-likelihood of the measurements; NaN if the estimator does not state it,
+            None for old logs without the field.
     """
 
     estimator: str

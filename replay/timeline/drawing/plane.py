@@ -332,7 +332,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Return times and numbers of objects; a number becomes zero `shown_ns` after the last object."""
+    """Return times and the number of objects at each; it is zero `shown_ns` after the last object."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])

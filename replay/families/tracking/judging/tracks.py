@@ -34,7 +34,7 @@ class KeptTracks(NamedTuple):
 
 
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
-    """Make a table with one row per target, sorted by falling number of reports.
+    """Make a table with one row per target, most reports first.
 
     The columns are `target`; `reports`, the number of the target's reports; `track`, the track assigned
     to the target, or -1; `share`, the share of the reports in this track; `largest_share`, the largest
