@@ -64,7 +64,7 @@ class _OfPrograms(Estimator[Any]):
     """Placeholder for estimators of programs; the settings name the command."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
-        """Return the estimator of the command in `settings` of `label`; with {out}, it reads a log."""
+        """Return the estimator for the command in `settings`; a command with {out} reads a log."""
         words = tuple(split_command(what_runs(label, "exec", settings)))
         if any("{" + OUT + "}" in word for word in words):
             return _of_files(label, words)

@@ -1,4 +1,4 @@
-"""95 % intervals of numbers, by the rules in docs/judge.md.
+"""95 % intervals of means and root mean squares, by the rules in docs/judge.md.
 
 The unit is the run: errors within a run are correlated; runs are independent. A mean has Student's t
 interval. A root mean square has a percentile bootstrap interval over runs, widened for few runs like
@@ -111,13 +111,13 @@ def rms_interval(values: ArrayLike) -> Interval:
 
 
 def root_mean_square(values: ArrayLike) -> float:
-    """Compute the root mean square of numbers (n,), even if their squares overflow."""
+    """Compute the root mean square of values (n,), even if their squares overflow."""
     values, scale = _with_finite_squares(np.asarray(values, float))
     return scale * math.sqrt(np.mean(np.square(values))) if len(values) else math.nan
 
 
 def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
-    """Divide numbers (n,) by a scale, which is 1 unless an estimator diverged; return both."""
+    """Scale numbers (n,) so that their squares are finite; return them and the scale, usually 1."""
     largest = float(np.max(np.abs(values), initial=0.0))
     scale = largest if LARGE < largest < math.inf else 1.0
     return values / scale, scale

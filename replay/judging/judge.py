@@ -1,7 +1,8 @@
 """Judge of the outputs of a replay, which processes them block by block.
 
-It stores sums: of every metric, by step over the runs, and by time for each run. Memory therefore does
-not grow with the length of a log, except for two numbers per step for the NEES.
+It stores only sums: of every metric, of errors by step over the runs, and of errors by time for each
+run. Memory therefore does not grow with the length of a log, except for two numbers per step for the
+NEES.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -234,7 +235,7 @@ class Judge:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Return the numbers, as `estimator.quantity[.case]`; raise BadInput if a metric raises."""
+        """Return values by key, `estimator.quantity[.case]`; raise BadInput if a metric raises."""
         return self._measured.finish()
 
     @property

@@ -49,7 +49,7 @@ class Dataset:
         self.url = f"{client.url}/dataset/{self._entry.id}"
 
     def add(self, layers: Sequence[tuple[Path, str]]) -> None:
-        """Register files as layers, each with its name; a file states its segment itself.
+        """Register files as layers, each with its name; each file states its segment.
 
         Raises BadInput if a file cannot be read.
         """

@@ -184,7 +184,7 @@ def show(
     save: Path | None = None,
     connect: str | None = None,
 ) -> None:
-    """Draw one run of an ensemble with all its estimators, by the drawing code of its scenario family.
+    """Draw one run of an ensemble with all its estimators, with the drawing code of its scenario family.
 
     Args:
         source: the run.

@@ -42,7 +42,7 @@ def _split(layout: Board, estimators: Sequence[str]) -> Board:
 
 
 def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.View:
-    """Return a view of the same scene without the other estimators."""
+    """Return a copy of a view that shows the scene without the other estimators."""
     shown = [str(each) for each in np.atleast_1d(np.asarray(view.contents))]
     roots = [each.removesuffix("/**") for each in shown if each.endswith("/**")]
     hidden = [
@@ -56,7 +56,7 @@ def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.Vie
 def _draw_differences(
     canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot the errors of others minus those of the first estimator, at common stamps."""
+    """Plot the errors of the other estimators minus those of the first, at common stamps."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
     plot, unit, drawn = entity_path("plots", case, "difference"), "-", False

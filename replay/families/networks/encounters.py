@@ -135,7 +135,8 @@ def advance(
     Args:
         carried: the robots of all runs, changed in place.
         run, robot: the run and the robot.
-        time_ns: time to predict to; if the robot's state is not older, it is not changed.
+        time_ns: time to predict to; if the robot's state is not older than this, the state is not
+            changed.
         density: densities of the odometry's noise, forward and turn, (2,).
         work: scratch memory.
     """

@@ -108,7 +108,7 @@ class Nodes(NamedTuple):
 
 
 class NodeMemory(NamedTuple):
-    """Scratch memory of a core: nodes of a run, estimates to fuse, and their weights (most,)."""
+    """Scratch memory of one CPU core: nodes of a run, estimates to fuse, and their weights (most,)."""
 
     nodes: Nodes
     parts: Estimate

@@ -121,7 +121,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
 
 
 def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
-    """Draw the true trajectory and those of all nodes for each estimator, with the errors below."""
+    """Draw the true trajectory and the nodes' trajectories for each estimator, with the errors below."""
     truth, shown = f"{ROOT}/truth", [np.empty((0, 2))]
     for stream in scene.truths_of(""):
         places = stream["state"][:, [stream.components.index(name) for name in PLACE]]

@@ -42,7 +42,7 @@ def stay(target: Components, control: Any, duration_s: Any, parameters: Any) -> 
 
 
 def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the variances of one step of the walk."""
+    """Return the variances that one step of the random walk adds."""
     size, place = parameters.size_drift_m2, parameters.position_drift_m2
     return size, size, place, place
 

@@ -111,8 +111,8 @@ class SetStep(NamedTuple):
 
     Attributes:
         time_ns: stamp of the frame.
-        anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if there was
-            none.
+        anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if no set was
+            moved.
         parts: the set; if a frame contradicts it, also the set of that frame.
         headings: interval of the heading.
         growth: factor by which the form L = 8 enlarged the set.

@@ -41,7 +41,7 @@ class Tracks(NamedTuple):
     """Tracks of all runs, with the axes run and place; the first `used` places are occupied.
 
     Attributes:
-        used: (runs,); met: (runs,) number of all tracks so far, which numbers new tracks.
+        used: (runs,); met: (runs,) number of all tracks so far, from which new tracks get their number.
         number, time_ns: (runs, places).
         mean: (runs, places, 4) x, vx, y, vy.
         spread: (runs, places, 3) variance of a position, covariance, variance of a velocity, per axis.

@@ -49,7 +49,7 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """Assumptions about vessels and receivers, which are the same for all of them.
+    """Assumptions about vessels and receivers, common to all vessels and receivers.
 
     Each track has weights for several levels of noise, which are sorted from the smallest.
 

@@ -57,7 +57,8 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
     Args:
         predicted: (runs, vehicles, axes).
-        covariance: (runs, vehicles, axes, axes), of a detection about the prediction of its vehicle.
+        covariance: (runs, vehicles, axes, axes), covariance of a detection about the prediction of its
+            vehicle.
         detections: (runs, detections, axes), padded with NaN.
     """
     axes = predicted.shape[-1]

@@ -321,7 +321,7 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Yield the estimates of every vehicle, those of the pose if it is estimated, and failures.
+    """Yield the estimates of every vehicle and, if estimated, of the sensor's pose, and failures.
 
     Args:
         setup: the bound method.

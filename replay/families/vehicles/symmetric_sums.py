@@ -21,7 +21,7 @@ Numbers = NDArray  # real or complex
 
 
 class Pseudo(NamedTuple):
-    """Pseudo-measurement at p: expectation (..., n), Jacobian by p, and a factor W of its noise.
+    """Pseudo-measurement at p: expectation (..., n), Jacobian for p, and a factor W of its noise.
 
     The Jacobian is (..., n, n) and W is (..., n, terms).
     """

@@ -175,7 +175,7 @@ def collapse(
     """Compute the Gaussian with the moments of the mixture over all associations of an unordered set.
 
     The weights are exact: for a complete set, the weights of all maps are the terms of a permanent. The
-    result is therefore the one to which an exact symmetric measurement equation filter collapses.
+    result is therefore the Gaussian to which an exact symmetric measurement equation filter collapses.
 
     Args:
         joint, rows, innovations, noise, hypotheses: as for `weigh`.

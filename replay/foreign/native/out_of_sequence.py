@@ -94,7 +94,7 @@ def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int
     """Insert a message in the order of stamps and positions in the file, and return its row.
 
     Args:
-        begin: first row of its run.
+        begin: first row of the message's run.
         event: index of the message; all rows before it are in order.
         events: stamps and positions of all messages.
         order: (n,), the event in each row, changed in place.

@@ -106,7 +106,7 @@ def how_ended(code: int) -> str:
 
 
 class Worker:
-    """Process that processes runs with filters of libraries, one after another."""
+    """Worker process for filters of libraries, which handles one run after another."""
 
     def __init__(self) -> None:
         self._process = start_module("fuselog.replay.foreign.processes.worker", stdout=subprocess.PIPE)

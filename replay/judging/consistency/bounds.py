@@ -1,7 +1,7 @@
 """Posterior Cramer-Rao bound of the errors over an ensemble of true trajectories, step by step.
 
 Let F be the transition, Q the process noise and H' R^-1 H the information of the measurements at the
-true states of a step, and let E be the mean over the trajectories, of each product as a whole. Then
+true states of a step, and let E denote the mean of a whole product over the trajectories. Then
 
     J_(k+1) = D22 - D21 (J_k + D11)^-1 D12,  D11 = E F'Q^-1F,  D12 = -E F'Q^-1,  D22 = E Q^-1 + E H'R^-1H
 

@@ -118,7 +118,7 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _least_pivot(left: NDArray[np.float64]) -> float:
-    """Compute the smallest pivot of one matrix (n, n) up to the first that is not positive.
+    """Compute the smallest pivot of one matrix (n, n), up to the first pivot that is not positive.
 
     The matrix is overwritten.
     """

@@ -30,7 +30,7 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
 
 
 def ellipses(means: Array, covariances: Array, probability: float = 0.95, vertices: int = 24) -> Array:
-    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN if not positive definite.
+    """Compute closed outlines (n, vertices + 1, 2) of Gaussians; NaN for invalid covariances.
 
     Args:
         means, covariances: (n, 2), (n, 2, 2).

@@ -140,7 +140,7 @@ def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
 def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
     """Transform Gaussian estimates and their covariances into the frame of the truth.
 
-    The NEES is then that of aligned errors. Positions, velocities, headings and orientations are
+    The NEES is then computed from aligned errors. Positions, velocities, headings and orientations are
     rotated; the covariance of an orientation is in the body's frame and does not change. All other
     components are assumed to be in the body's frame.
 

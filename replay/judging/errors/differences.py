@@ -89,7 +89,7 @@ class Difference(NamedTuple):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Return the numbers by their column names in tables."""
+        """Return the values by column name, for tables."""
         about = {"margin": self.margin, "verdict": str(self.verdict), "sure": self.sure}
         ends = {"difference": self.more.value, "low": self.more.low, "high": self.more.high}
         return {"first_mean": self.first, "second_mean": self.second, **ends, **about, "runs": self.runs}
@@ -103,7 +103,7 @@ def target_of(quantity: str) -> Target:
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """Compute the difference of the second estimator minus the first.
+    """Compute a metric of the second estimator minus that of the first, with interval and verdict.
 
     Args:
         first: (n,) the metric in every run.

@@ -1,9 +1,9 @@
 """Errors of estimates against the truth, and normalised errors that test covariances (NEES, NIS).
 
 The channel of a stream of estimates states its components, their kinds and the topic of the truth. The
-truth is interpolated at the estimate's stamps, but not over a gap; errors are those of the tangent space
-(see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 5.4.
+truth is interpolated at the estimate's stamps, but not over a gap; errors are differences in the tangent
+space (see `fuselog.replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ BOUND = "bound"  # in the metadata of a stream that has lower bounds instead of 
 
 
 class Quantity(NamedTuple):
-    """Quantity of an error figure: name of the RMSE, columns, and scale of the unit."""
+    """Quantity whose error is reported: name of the RMSE, columns, and scale of the unit."""
 
     rmse: str
     columns: list[int]
@@ -145,8 +145,8 @@ class Innovations(NamedTuple):
         accepted: (n,), whether the gate accepted the measurement.
         squared: (n,), normalised innovation squared (NIS).
         degrees: (n,), number of measured components.
-        log_likelihood: (n,), of the measurements; NaN if the estimator does not state it, None for old
-            logs without the field.
+        log_likelihood: (n,), log-likelihood of the measurements; NaN if the estimator does not state it,
+            None for old logs without the field.
     """
 
     estimator: str
@@ -252,7 +252,7 @@ def errors_of(
         first_fixes: origins of the tangent planes of estimates whose channels state no origin.
 
     Raises BadInput if the stream does not state its components, or if a truth states another kind for
-    one of them.
+    one of the components.
     """
     sources = [each.source for each in truths]
     estimates = replace(estimates, stream=in_body_axes(estimates.stream))
@@ -411,8 +411,8 @@ def reference(
 ) -> Floats:
     """Interpolate true states (n, components) at the stamps of the estimates of a run; see `truth_at`.
 
-    If the truth states the origin of a different tangent plane, it is transformed to that of the
-    estimates.
+    If the truth states the origin of a different tangent plane, the truth is transformed to the plane of
+    the estimates.
 
     Raises BadInput if the truth lacks a component.
     """

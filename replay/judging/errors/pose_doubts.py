@@ -1,4 +1,4 @@
-"""Limits of trajectory figures due to a truth without orientations or an imprecise alignment."""
+"""Limits of trajectory metrics due to a truth without orientations or an imprecise alignment."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ def _courses(trajectory: Trajectory) -> Floats:
 
 
 def _angle_rad(course: Floats, direction: Floats) -> float:
-    """Compute the largest angle between directions (k, 3) and one direction (1, 3); zero without any."""
+    """Compute the largest angle between directions (k, 3) and one direction (1, 3); zero if k is 0."""
     cosines = np.clip(np.sum(course * direction, axis=1), -1.0, 1.0)
     return float(np.arccos(cosines).max(initial=0.0))
 

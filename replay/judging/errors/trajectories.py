@@ -1,7 +1,7 @@
 """Comparison of trajectories with the truth: absolute and relative pose errors (APE, RPE).
 
 Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems", IROS
-2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the figures agree
+2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the results agree
 with those of evo.
 """
 
@@ -89,7 +89,7 @@ class Compared(NamedTuple):
         absolute_m, absolute_deg: (n,) APE; degrees are None if a trajectory has no orientations.
         last: (k,) indices of the last poses of the RPE pairs.
         relative_m, relative_deg: (k,) RPE.
-        doubts: sentences on the limits of the figures.
+        doubts: sentences on the limits of these errors.
     """
 
     estimate: Trajectory

@@ -21,7 +21,7 @@ class Uninformed:
     Attributes:
         names: components that are linear or angles.
         still: (names,), whether each is unchanged in all runs.
-        first: by run, the mean and variance (names,) of its first estimate.
+        first: by run, the mean and variance (names,) of the run's first estimate.
         most: largest number of estimates of any run.
     """
 

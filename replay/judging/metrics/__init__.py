@@ -1,1 +1,1 @@
-"""Metrics, which compute numbers from errors, innovations and other outputs; begin with `measuring`."""
+"""Metrics, which compute values from errors, innovations and other outputs; begin with `measuring`."""

@@ -53,7 +53,7 @@ class Metric(Generic[Judged, State]):
         add: add(state, block) -> the state after one more block; it may modify the given state. The
             blocks of a run are in order of time.
         merge: merge(first, second) -> the combined state of two parts, which have no run in common.
-        finish: finish(state) -> numbers by name, as `quantity_unit`; empty if there are none.
+        finish: finish(state) -> values by name, as `quantity_unit`; empty if there are no values.
 
     Most metrics are computed from sums; see `metric_of_sums`.
     """
@@ -66,7 +66,7 @@ class Metric(Generic[Judged, State]):
     finish: Callable[[State], Mapping[str, float]]
 
     def of(self, judged: Judged) -> Mapping[str, float]:
-        """Compute the numbers for `judged` as a single block."""
+        """Compute the values by name for `judged` as a single block."""
         return self.finish(self.add(self.start(), judged))
 
 
@@ -85,7 +85,7 @@ def metric_of_sums(
         summary: one-line description.
         judges: type of the input.
         sums: sums(block) -> sums by name: numbers and arrays are added, sets are united.
-        finish: finish(sums over all blocks) -> the numbers; without any block, the sums are {}.
+        finish: finish(sums over all blocks) -> the values by name; without any block, the sums are {}.
 
     Returns:
         The metric, for registration under a name.

@@ -177,7 +177,7 @@ def innovation(sums: Sums) -> dict[str, float]:
 
 
 def _log_likelihoods(innovations: Innovations) -> Sums:
-    """Sum log-likelihoods; NaN if that of an accepted measurement is not stated."""
+    """Sum log-likelihoods; NaN if the likelihood of an accepted measurement is not stated."""
     stated = innovations.log_likelihood
     accepted_likelihood = np.array([np.nan]) if stated is None else stated[innovations.accepted]
     return {

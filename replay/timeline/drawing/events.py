@@ -100,7 +100,7 @@ def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
 
     Args:
         canvas: a canvas with the run's epoch.
-        time_ns, texts: (n,), n of them.
+        time_ns, texts: n stamps and n texts.
     """
     elapsed_s = ((time_ns - canvas.epoch_ns) * 1e-9).tolist()
     return [f"{at_s:.3f} s, {text}" for at_s, text in zip(elapsed_s, texts, strict=True)]

@@ -86,7 +86,7 @@ def draw_points(
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
-        numbers, places: (n,), and (n, 2) in m.
+        numbers, places: numbers or names (n,), and positions (n, 2) in m.
     """
     is_somewhere = (np.abs(places) <= np.finfo(np.float32).max).all(axis=1)
     numbers, places = numbers[is_somewhere], places[is_somewhere]
@@ -303,7 +303,7 @@ def draw_lines(
     radius_px: float = 0.75,
     interval_ns: float | None = None,
 ) -> None:
-    """Draw the lines of one stamp, which are a scan, together.
+    """Draw all lines of one stamp together, as a scan.
 
     The next scan replaces them; they disappear if it is later than usual.
 
@@ -332,7 +332,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Return times and numbers of objects; a number becomes zero `shown_ns` after the last object."""
+    """Return times and the number of objects at each; it is zero `shown_ns` after the last object."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])

@@ -12,8 +12,7 @@ Draw = Callable[[Canvas, Scene, str], list[Board]]
 def draw_registered(canvas: Canvas, scene: Scene, case: str, streams: Iterable[Stream]) -> list[Board]:
     """Draw a case with the registered `fuselog.drawings` entry points, and return their panels.
 
-    The name of such an entry point is the name of a schema. It is loaded if one of `streams` has the
-    schema.
+    Each entry point has the name of a schema. It is loaded if one of `streams` has this schema.
     """
     found = dict.fromkeys(stream.schema.full_name for stream in streams)
     drawn: list[Board] = []

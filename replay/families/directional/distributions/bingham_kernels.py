@@ -367,7 +367,7 @@ def _predict_one(
 
 
 def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArray:
-    """Apply `predict` to every distribution and its noise; return which of them (n,) converged.
+    """Apply `predict` to every distribution and its noise; return which predictions (n,) converged.
 
     Args:
         axes, z: (n, d, d) and (n, d), changed in place.

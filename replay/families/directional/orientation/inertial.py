@@ -141,7 +141,7 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 
 @cache
 def over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    """Compile a function that processes the samples of one run into a loop over runs."""
+    """Compile a loop over runs that calls a function for the samples of each run."""
     return compile_over_runs(run_once)
 
 

@@ -94,7 +94,7 @@ def _reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Process one sample; skip it if force or rate is not finite, skip its field if only that is not."""
+    """Process one sample; skip it if force or rate is not finite; a field may be missing."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
     if not all_finite(rate, force, force):

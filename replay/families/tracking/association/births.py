@@ -136,7 +136,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> int:
-        """Begin tracks at unassociated detections; return how many of these have no room for a track."""
+        """Begin tracks at unassociated detections; return how many tracks there was no room for."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
             measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])

@@ -27,7 +27,7 @@ class TrackOutputs(NamedTuple):
         turned_away: (scans,), number of detections that could not begin a track because there was no
             room.
         number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
-            `probability` is that of their modes.
+            `probability` has the probabilities of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), their probability.
         white, factor: (runs, rows, 2) and (runs, rows, 2, 2), the whitened innovation of a pair in its
             most likely mode, and the Cholesky factor of the innovation covariance; a bearing is the

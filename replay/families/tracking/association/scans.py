@@ -53,7 +53,7 @@ class Scans(NamedTuple):
         offsets: (runs + 1,).
         time_ns, sensor, kind, number: (scans,), stamp, index of the sensor, index of its kind, and the
             number that the sensor gave the scan.
-        first, end: (scans,), bounds of its detections.
+        first, end: (scans,), bounds of the detections of each scan.
         origin: (scans, 2), position of the sensor.
         detection: (detections, 2), the measurements.
     """

@@ -96,7 +96,7 @@ def _nodes(
 def _motion(
     bound_model: BoundModel, parameters: Settings, mean: Floats, duration_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute the matrices (n, size, size) of a linear motion over each duration, and of its noise."""
+    """Compute transition and noise matrices (n, size, size) of a linear motion over each duration."""
     size, count, state = bound_model.model.size, len(duration_s), tuple(mean.T)
     assert bound_model.motion.noise is not None
     transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))

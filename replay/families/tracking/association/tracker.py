@@ -37,7 +37,7 @@ class Tracker(NamedTuple):
 
     @property
     def sizes(self) -> tuple[int, int, int]:
-        """Return the number of modes, the size of the state, and that of its tangent space."""
+        """Return the number of modes, and the sizes of the state and of its tangent space."""
         return (
             max(1, len(self.bound_model.modes)),
             self.bound_model.model.size,

@@ -67,7 +67,7 @@ def no_tracks(
         shared: (k, k), the initial covariance of the errors that all tracks share.
 
     Returns:
-        The tracks, none of them used.
+        Tracks without any occupied place.
     """
     modes, n, t = sizes
     return Tracks(

@@ -243,7 +243,7 @@ def figures_of_whole_tracks(
     """Compute HOTA and IDF1 with a cutoff of 20 m.
 
     By default, all tracks count. If truths cover only some targets, only tracks that are ever within the
-    cutoff of a target count, and the figures have other names.
+    cutoff of a target count, and the metrics have other names.
 
     Args:
         tracks: the tracks at each of k instants.

@@ -43,7 +43,7 @@ BURN_IN_SHARE = 0.25
 
 
 class TrackBlock(NamedTuple):
-    """Block of the sets of tracks of a tracker: sizes, tracks, and targets of each run."""
+    """A block of a tracker's sets of tracks: their sizes, the tracks, and the targets of each run."""
 
     estimator: str
     case: str

@@ -26,7 +26,7 @@ KEPT_SHARE = 0.95
 
 
 class KeptTracks(NamedTuple):
-    """Number of judged targets, share of targets that kept a track, and mean share of reports in it."""
+    """Number of judged targets, share that kept a track, and mean share of a target's reports in it."""
 
     targets: int
     kept_share: float
@@ -34,12 +34,13 @@ class KeptTracks(NamedTuple):
 
 
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
-    """Make a table with one row per target of reports, most reports first.
+    """Make a table with one row per target, most reports first.
 
-    The columns are `target`; `reports`, the number of its reports; `track`, its own track, or -1;
-    `share`, the share of its reports in that track; `largest_share`, the largest share in any track;
-    `tracks`, the number of tracks with one of its reports; `switches`, the number of successive reports
-    in different tracks; `others`, the number of reports of other targets in its track.
+    The columns are `target`; `reports`, the number of the target's reports; `track`, the track assigned
+    to the target, or -1; `share`, the share of the reports in this track; `largest_share`, the largest
+    share of the reports in any track; `tracks`, the number of tracks that contain a report of the
+    target; `switches`, how often two successive reports are in different tracks; `others`, the number of
+    reports of other targets in the assigned track.
 
     Args:
         targets, tracks: (n,), the numbers of target and track of every report, in order of time.
