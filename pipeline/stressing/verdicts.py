@@ -23,7 +23,7 @@ HARMLESS = 0.1  # upper limit of A
 MARGIN = 0.02  # relative change of a metric that is considered irrelevant, as in compare
 # range of the ratio of an effect to that of half the change, if the effect is proportional
 HALVES = (1.9, 2.1)
-BENT = 1.2  # half the change has less effect, but not half as much: a quarter is tried
+BENT = 1.2  # half the change has less effect, but more than half of it: a quarter is tried
 # upper limit of the ratio for an effect that is quadratic in the change; a larger ratio is a jump
 SQUARED = 4.2
 ONE_SIGMA = 1.0  # for a change without a half: results are different if A is larger than this
@@ -167,7 +167,7 @@ class Stressed:
 
     @property
     def is_per_prediction(self) -> bool:
-        """Test whether noise is added per prediction, so that slightly moved stamps change a covariance."""
+        """Test whether noise is added per prediction, so that a moved stamp changes a covariance."""
         return self.is_recursive and self._jumps
 
     @property

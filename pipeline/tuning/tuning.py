@@ -57,11 +57,11 @@ from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
-# bounds of a positive parameter without bounds: its start value divided by this and times this
+# bounds of a positive parameter without bounds: its start value divided and multiplied by this
 REACH = 1e4
 OPEN = {"gate_probability": 1.0}
 MOVED = 0.5  # change of the log-likelihood above which the noise of the controls matters
-# standard errors from the optimum at which the effect of that noise is evaluated
+# standard errors from the optimum at which the effect of the controls' noise is evaluated
 REACHES = np.array([1.0, 3.0, 10.0])
 NOISY_STEP = 0.2  # step of the differences of a corrected cost, in coordinates: two standard errors
 NOISY_REACH = 5.0  # largest such step in standard errors, if the step is derived from a useful error
