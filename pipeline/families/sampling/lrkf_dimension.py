@@ -6,7 +6,7 @@ known exactly, because
     E exp(i k'x) = exp(-|k|^2 / 2).
 
 The vectors k point in all directions or, as for a sine of the heading, along the axes. The samplings are
-those of the experiment's estimators, which then estimate robots and vehicles.
+those of the experiment's estimators, which then run on drives of robots and vehicles.
 """
 
 from collections.abc import Callable, Mapping
