@@ -26,7 +26,7 @@ from fuselog.replay.judging.verdicts import MATERIAL, Consistency, Squares
 if TYPE_CHECKING:
     import pandas as pd
 
-USUAL_GATE = 0.99  # if it is unknown
+USUAL_GATE = 0.99  # gate probability if it is unknown
 RARE = 0.01  # share of rejected measurements that serves as the unit of excess
 LARGEST = 1e300  # replaces infinity, which JSON does not have
 NIS = "nis_per_component"
@@ -36,7 +36,7 @@ REASONS = {
     Consistency.CONSERVATIVE: "its covariances are too large",
     Consistency.CONSISTENT: f"its covariances are off by less than {MATERIAL:.0%}".replace("%", " %"),
 }
-UNUSED = 0.05  # share of a topic's messages
+UNUSED = 0.05  # share of a topic's messages; if more are unused, there is a warning
 
 
 class _Range(NamedTuple):

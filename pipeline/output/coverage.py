@@ -233,7 +233,7 @@ def rows_of(
 
 
 def _whole(row: Row, left_out: Rejections) -> Row:
-    """Add to the row the messages that were dropped before an estimator received them."""
+    """Add to the row the messages that were dropped before they reached an estimator."""
     if row.topic not in left_out:
         return row
     why = "; ".join(filter(None, (row.why, left_out.sentence(row.topic))))

@@ -190,7 +190,7 @@ class DaskExecutor(Executor):
 
 
 def _on_one_core(work: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Limit the process to one core from now on, and do the work in it."""
+    """Limit this process to one core from now on, and do the work."""
     _use_one_core()
     return work(*args, **kwargs)
 

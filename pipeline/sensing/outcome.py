@@ -103,8 +103,8 @@ class SensorNoise:
         """Return the densities for other programs: N and K of each field, the largest of its axes.
 
         Gauss-Markov noise without a walk is replaced by the walk with the same initial growth: s sqrt(2
-        / T). If no axis has a walk, K is its upper limit, because Kalibr refuses a zero, and a
-        covariance of zero cannot be inverted.
+        / T). If no axis has a walk, K is the upper limit of the walk, because Kalibr refuses a zero, and
+        a covariance of zero cannot be inverted.
         """
         found: dict[str, Density] = {}
         bounds: dict[str, float] = {}

@@ -28,7 +28,7 @@ _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """A grid for the stamps of a topic, with its step and the places (n,) of messages on it."""
+    """A grid for a topic's stamps: its step, and each message's index on the grid and row (n,)."""
 
     step_s: float
     places: Integers
@@ -36,7 +36,7 @@ class Grid(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Return the number of places."""
+        """Return the number of grid points."""
         return int(self.places[-1]) + 1
 
     @property
@@ -46,7 +46,7 @@ class Grid(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """The drift of a column, as a rate and a decaying offset, and its gain in log-likelihood."""
+    """The drift of a column, as a rate and a decaying offset, and the gain in log-likelihood."""
 
     rate: float
     rate_sigma: float
@@ -93,10 +93,10 @@ def grid_of(stream: Stream) -> Grid:
 
 
 def on_grid(values: Floats, grid: Grid) -> Floats:
-    """Arrange samples at their places on the grid.
+    """Arrange samples at their points on the grid.
 
     Args:
-        values: (n,), those of all messages, in the order of the stream.
+        values: (n,), the values of all messages, in the order of the stream.
         grid: the grid of the stream.
 
     Returns:
@@ -141,7 +141,7 @@ def block_means(values: Floats, block: int) -> Floats:
 
     Args:
         values: (n,), NaN where a sample was lost.
-        block: the number of places in a block.
+        block: the number of grid points in a block.
 
     Returns:
         The means (n // block,), NaN if more than half of a block is lost.
@@ -180,7 +180,7 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
         step_s: the grid's step.
 
     Returns:
-        The drift; None if it does not explain the samples significantly better.
+        The drift; None if the samples are not explained significantly better than without drift.
     """
     block = -(-len(values) // _DRIFT_SAMPLES)
     means, step_s = block_means(values, block), step_s * block
@@ -211,8 +211,9 @@ def fewest_block(count: int) -> int:
 def white_block(values: Floats, step_s: float) -> int:
     """Find how many samples to average so that the noise is white apart from drift.
 
-    A sensor that filters its output correlates neighbouring samples. A likelihood of all these samples
-    underestimates the noise. The residuals of white noise and a walk show this.
+    If a sensor filters its output, neighbouring samples are correlated, and a likelihood of all samples
+    underestimates the noise. The correlation appears in the residuals of a fit of white noise and a
+    walk.
 
     Args:
         values: (n,), on a grid, NaN where a sample was lost.
@@ -240,7 +241,8 @@ def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
         step_s: the grid's step.
 
     Returns:
-        Its frequency in Hz and its amplitude in the unit of the samples; None if there is no line.
+        The frequency of the line in Hz and its amplitude in the unit of the samples; None if there is no
+        line.
     """
     part = values[:MOST]
     part = np.where(np.isfinite(part), part - np.nanmean(part), 0.0)

@@ -85,7 +85,7 @@ def _looked_at(seed: int) -> dict[str, Any]:
 def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
     """Draw samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
 
-    The random numbers of a seed are the same for all terms, even if some terms are missing.
+    The random numbers of each term depend only on the seed, not on which other terms are present.
     """
     rng = np.random.Generator(np.random.Philox(key=seed))
     white, walk, markov = (rng.standard_normal(size) for _ in range(3))

@@ -33,9 +33,10 @@ class Terms(NamedTuple):
     def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
         """Compute the autocovariance of second differences, at lags 0, 1, ... below `count`.
 
-        The differences are those of the phases (sums of samples times `step_s`) at a distance of
-        `multiple` samples; the Allan variance is their mean square. Beyond twice that distance only the
-        Gauss-Markov term remains; the result ends where this term has decayed.
+        The second differences are those of the phases (sums of samples times `step_s`) at a distance of
+        `multiple` samples; their mean square is 2 (`multiple` x `step_s`)^2 times the Allan variance. At
+        lags beyond twice this distance only the Gauss-Markov term remains; the result ends where this
+        term has decayed.
         """
         near = np.arange(min(count, 2 * multiple + 2), dtype=float)
         found = self._second_differences(multiple, step_s, near)

@@ -1,6 +1,6 @@
 """Changes of a run that should not matter; each one copies the run with changed topics.
 
-Most changes have a size, 1 or 0.5, to test whether the difference shrinks with the change.
+Most changes have a size, 1, 0.5 or 0.25, to test whether their effect shrinks with the size.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -132,7 +132,7 @@ def _by_an_ulp(column: NDArray[np.float64], rng: np.random.Generator) -> NDArray
 
 
 def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move the start by START_SIGMAS of the prior's sigma along every axis, so that A has this value."""
+    """Move the start by START_SIGMAS sigmas of the prior along every axis, so that A = START_SIGMAS."""
     rng, streams = np.random.default_rng(seed), {}
     for topic in inputs.priors:
         stream = source.streams[topic]
@@ -210,7 +210,7 @@ def inputs_of(source: MemorySource, topics: Collection[str], controls: Collectio
 
 
 def parameters_changed(parameters: Any, size: float, rng: np.random.Generator) -> Any:
-    """Change every number of parameters except integers, 0 and the probability of a gate."""
+    """Change every numeric parameter except integers, zeros and the probability of a gate."""
     if isinstance(parameters, Mapping):
         changed = {name: parameters_changed(each, size, rng) for name, each in parameters.items()}
         return {

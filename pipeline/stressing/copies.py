@@ -1,4 +1,4 @@
-"""Replays of changed copies of a run, and their comparison with it: estimates, metrics, failures."""
+"""Replays of changed copies of a run, compared with the run by estimates, metrics and failures."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -48,7 +48,7 @@ class Replayed:
     """Runs and copies that one estimator has replayed.
 
     trial: the estimator, the runs and the copies.
-    outputs: its outputs, by topic.
+    outputs: outputs of the estimator, by topic.
     how: how they were replayed.
     """
 
@@ -110,11 +110,11 @@ def compared(
 
     Args:
         name: the name of the change.
-        before: the replay that contains the run, in `row`; its estimates are `base`.
-        row: see `before`.
+        before: the replay that contains the unchanged run.
+        row: index of the run in `before`.
         done: the replay that contains the copy.
         run: index of the copy in `done`.
-        base: see `before`.
+        base: estimates of the run in `before`, by topic.
     """
     within_ns = SHIFT_NS if name == "stamps" else 0
     found = partings(base, done.estimates(run), within_ns, has_less=name == DROPPED)
@@ -141,9 +141,10 @@ def compared(
 
 
 def _reach(found: Sequence[Parting], main: str) -> float:
-    """Return the largest possible change of an RMSE: the distance of estimates with common stamps.
+    """Return the largest change of an RMSE that is possible at common stamps: the largest distance.
 
-    If a message is lost, the copy has no estimate at its stamp, so the stamp is in only one RMSE.
+    If a message is lost, the copy has no estimate at its stamp. The RMSEs of run and copy then differ
+    also because they cover different stamps, which must not count as a change.
     """
     unit = main.rpartition("_")[2]
     if unit not in ("m", "deg", "rad"):

@@ -172,14 +172,14 @@ class Undetermined(NamedTuple):
 
 
 def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermined | None:
-    """Find the most uncertain direction among components of one unit, if it is much worse than others.
+    """Find the direction in components of one unit that is much more uncertain than all others.
 
     Components of different units have no common length, so they are not combined.
 
     Args:
         stream: Gaussian estimates.
         row: the index of the estimate.
-        least: the smallest ratio to the standard deviation in the other directions.
+        least: the smallest ratio of its standard deviation to the largest one in the other directions.
     """
     kinds = stream.metadata["kinds"].split(",")
     names = [name for name, _ in tangent_components(stream.metadata["components"].split(","), kinds)]
@@ -208,5 +208,5 @@ def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermi
 
 
 def _last_narrowed(variances: Floats) -> int:
-    """Find the last row with the smallest variance so far."""
+    """Find the last row whose variance is the smallest so far."""
     return int(np.flatnonzero(variances <= variances.min())[-1])

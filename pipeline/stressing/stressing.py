@@ -47,8 +47,8 @@ def stress(
     """Replay under changes that should not matter, and report their effect on the result.
 
     At most twelve replays are made per run and estimator: one without changes, one for each change, one
-    with half of each of the three changes with the largest effect, and one with a quarter if half a
-    change has neither half the effect nor the whole effect.
+    with half of each of the three changes with the largest effect, and one with a quarter of each of
+    these whose half has neither half of the effect nor all of it.
 
     Args:
         logs: paths, opened logs, or recordings.
@@ -207,7 +207,7 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Choose the changes to quarter: their half has less effect, but not half as much.
+    """Choose the changes to quarter: half of the change has less effect, but more than half of it.
 
     A nonlinear effect is proportional if the change is small enough. No run is replayed more than twelve
     times.

@@ -23,7 +23,7 @@ HARMLESS = 0.1  # upper limit of A
 MARGIN = 0.02  # relative change of a metric that is considered irrelevant, as in compare
 # range of the ratio of an effect to that of half the change, if the effect is proportional
 HALVES = (1.9, 2.1)
-BENT = 1.2  # half the change has less effect, but not half as much: a quarter is tried
+BENT = 1.2  # half the change has less effect, but more than half of it: a quarter is tried
 # upper limit of the ratio for an effect that is quadratic in the change; a larger ratio is a jump
 SQUARED = 4.2
 ONE_SIGMA = 1.0  # for a change without a half: results are different if A is larger than this
@@ -39,7 +39,7 @@ class Tried(NamedTuple):
         parting: the distance of the estimate with the largest change; None if no estimate is Gaussian.
         moved: by (case, metric), the change of a metric from the unchanged replay.
         beyond: the change of the main metric, in words; "" within the margin.
-        why: the reason why it was not tried.
+        why: the reason why the change was not tried; "" if it was.
         failed: when and why the copy fails although the unchanged replay does not. For a change that was
             not tried, when and why the unchanged replay fails before its first estimate.
     """
@@ -89,8 +89,9 @@ class Stressed:
     Attributes:
         source: the run.
         estimator: the label.
-        tried: each change at full size.
-        halves, quarters: the changes that were halved, and those of them that were halved again.
+        tried: the effect of each change at full size, by name.
+        halves, quarters: the effects of the changes that were halved, and of those that were also
+            quartered.
         sensors: the stamps of each sensor's topic.
         estimates: the estimates of the unchanged replay, by topic.
         copies: the estimates of each change at full size.
@@ -121,7 +122,8 @@ class Stressed:
     def _is_explained(self, name: str) -> bool:
         """Test whether a change that cannot be halved moves the estimate no further than allowed.
 
-        The limit is a sigma or, for lost messages, the largest distance due to chance.
+        The limit is one sigma or, for lost messages, the largest distance due to chance if that is
+        larger.
         """
         parting = self.tried[name].parting
         if name != DROPPED or parting is None:
@@ -132,7 +134,7 @@ class Stressed:
     def ratio(self, name: str) -> float:
         """Compute the ratio of a change's effect to that of half of it, in A; NaN if it was not halved.
 
-        If half of the change was halved again, the ratio of these two is returned.
+        If the change was also quartered, the ratio of the half's effect to the quarter's is returned.
         """
         half, quarter = self.halves.get(name), self.quarters.get(name)
         more, less = (half, quarter) if half and quarter else (self.tried[name], half)
@@ -165,12 +167,12 @@ class Stressed:
 
     @property
     def is_per_prediction(self) -> bool:
-        """Test whether noise is added per prediction, so that a microsecond changes a covariance."""
+        """Test whether noise is added per prediction, so that a moved stamp changes a covariance."""
         return self.is_recursive and self._jumps
 
     @property
     def _jumps(self) -> bool:
-        """Test whether a microsecond changes a sigma, and half a microsecond changes it as much."""
+        """Test whether stamps moved by a microsecond change a sigma, and half of it as much."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False

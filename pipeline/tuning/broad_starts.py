@@ -2,7 +2,8 @@
 
 Without a prior, a filter begins where the log's first messages put it, with a covariance that depends on
 the parameters. To score the same measurements from the same start, all trials begin at the log's first
-stamp, in equally likely parts, and the likelihood is the mean of those of the parts.
+stamp from a broad start that is divided into equally likely parts; the likelihood is the mean over the
+parts.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,7 @@
 """Confidence in tuned parameters: intervals, correlations, profiles, and undetermined directions.
 
-All of them follow from the curvature of minus the log-likelihood at its minimum, whose inverse is the
-parameters' covariance.
+All of these follow from the curvature of minus the log-likelihood at its minimum. The inverse of the
+curvature is the parameters' covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,8 +29,8 @@ class Confidence(NamedTuple):
     Attributes:
         places: (m,) the indices of these parameters.
         curvature: (m, m) the second derivatives of the cost in coordinates.
-        covariance: (m, m) its inverse; variances are infinite in directions in which the cost does not
-            rise.
+        covariance: (m, m) the inverse of the curvature; variances are infinite in directions in which
+            the cost does not rise.
     """
 
     places: Sequence[int]
@@ -84,7 +84,7 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     """Compute the covariance of parameters from the curvature of the cost.
 
     Args:
-        places: (m,), the indices of these parameters among all k.
+        places: (m,), the indices of the m parameters among all k.
         curvature: (m, m), the second derivatives of the cost in coordinates.
 
     Returns:
@@ -108,7 +108,8 @@ def with_noise(curvature: Floats, noise: Floats) -> Floats:
 
     Args:
         curvature: (m, m), the second derivatives of the cost.
-        noise: (m, m), the covariance of its first derivatives caused by the noise of the controls.
+        noise: (m, m), the covariance of the cost's first derivatives caused by the noise of the
+            controls.
 
     Returns:
         The curvature (m, m), reduced in directions in which the noise exceeds it.
@@ -150,9 +151,9 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
     """Yield unit directions (m,) in which the cost rises too little, with the curvature there.
 
-    They are eigenvectors of the curvature in useful units. The useful unit of a parameter is two useful
-    standard errors or a factor of 2.7; without a useful error, it is `UNIT` standard errors with all
-    others fixed.
+    The directions are eigenvectors of the curvature in useful units. The useful unit is a factor of 2.7
+    for a positive parameter, and two useful standard errors for any other; for a parameter without a
+    useful error, it is `UNIT` standard errors with all others fixed.
     """
     places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]

@@ -1,7 +1,8 @@
 """A study of tuning with unknown noise, in which the values are judged on other vehicles.
 
-The experiment's only estimator is tuned by likelihood on some of the log's vehicles, from its settings
-or from values in the log. Held-out vehicles are replayed with the start values and the tuned values.
+The experiment's only estimator is tuned by likelihood on some of the log's vehicles, starting from its
+settings or from values in the log. Held-out vehicles are replayed with the start values and the tuned
+values.
 """
 
 from collections.abc import Collection

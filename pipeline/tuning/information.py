@@ -1,10 +1,10 @@
 """Information on a calibration in the motion of logs, computed before any search.
 
 With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
-the derivatives by the parameters. In useful units, a direction with an eigenvalue below one is not
-determined. A pseudo-inverse is not used, because it would assign a small standard error to such a
-direction. Yang et al., arXiv 2201.09170, list such directions by kind of motion; Censi et al., IEEE T-RO
-2013, for wheels.
+the derivatives of v with respect to the parameters. In useful units, a direction with an eigenvalue
+below one is not determined. A pseudo-inverse is not used, because it would assign a small standard error
+to such a direction. Yang et al., arXiv 2201.09170, list such directions by kind of motion; Censi et al.,
+IEEE T-RO 2013, for wheels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,7 +33,7 @@ class Undetermined(NamedTuple):
     """Directions of m parameters that the motion does not determine.
 
     Attributes:
-        eigenvalues: (m,) of the information in useful units, in ascending order.
+        eigenvalues: (m,) eigenvalues of the information in useful units, in ascending order.
         directions: (d, m) undetermined directions in useful units, each with few parameters.
         places: indices of the parameters that are involved in these directions.
     """
@@ -122,7 +122,7 @@ def conditions(
     Args:
         scaled: (m, m), the information in useful units.
         places: the indices of these m parameters among the free ones.
-        free: all parameters.
+        free: all free parameters.
         held: the names of the parameters that are fixed at their start.
     """
     names, useful = np.array([(free[place].name, free[place].useful) for place in places], object).T
@@ -152,7 +152,7 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """Compute differences of innovations (n m,), whitened with the covariances in between.
+    """Compute differences of innovations (n m,), ahead minus behind, whitened with the covariances here.
 
     A delay changes the order of messages between topics, but never within one.
     """

@@ -157,8 +157,8 @@ class Criterion(NamedTuple):
     Attributes:
         sums: function that computes the sums over one log's outputs.
         cost: function that computes the cost from the sums; a run without values contributes nothing.
-        is_smooth: whether it uses innovations. The gate is then open, because it could change which
-            innovations are used.
+        is_smooth: whether the criterion uses innovations. The gate is then open, because a gate could
+            change which innovations are used.
         lacks: description of what is missing in a log without such sums.
     """
 
@@ -330,8 +330,9 @@ class Objective:
     def correct(self, values: Floats) -> None:
         """Correct the cost for the noise of the controls; see `fuselog.pipeline.tuning.control_noise`.
 
-        If these noises are themselves searched for, the correction uses their values in `values` (k,).
-        Otherwise, it would remove them from the likelihood from which they are estimated.
+        If the sizes of this noise are themselves searched for, the correction uses their values in
+        `values` (k,). Otherwise, the correction would remove the noise from the likelihood by which it
+        is estimated.
         """
         noises: set[str] = set()
         for run in self.runs:

@@ -132,9 +132,9 @@ class Tuning:
     def whiteness(self) -> pd.DataFrame:
         """Return a table on whiteness, with a row per measured component and set of values.
 
-        The columns are the number of innovations, the mean square of the normalised innovations, their
-        correlation with the next one, the Ljung-Box statistic Q, and the probability of a larger Q if
-        the innovations are white.
+        The columns are the number of innovations, the mean square of the normalised innovations, the
+        correlation of each with the next one, the Ljung-Box statistic Q, and the probability of a larger
+        Q if the innovations are white.
         """
         rows = []
         start = np.array([each.default for each in self.found.coordinates.free])
@@ -286,7 +286,7 @@ class Tuning:
                 )
 
     def _notes_of_truth(self) -> Iterator[str]:
-        """Report large errors that innovations do not show because the state follows them."""
+        """Report large errors, such as a slowly changing bias, that the innovations do not show."""
         for replayed in self.replays:
             metrics = replayed.judge.metrics
             for key, (_, high) in replayed.judge.bounds.items():

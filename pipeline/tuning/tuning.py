@@ -57,11 +57,11 @@ from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
-# bounds of a positive parameter without bounds: its start value divided by this and times this
+# bounds of a positive parameter without bounds: its start value divided and multiplied by this
 REACH = 1e4
 OPEN = {"gate_probability": 1.0}
 MOVED = 0.5  # change of the log-likelihood above which the noise of the controls matters
-# standard errors from the optimum at which the effect of that noise is evaluated
+# standard errors from the optimum at which the effect of the controls' noise is evaluated
 REACHES = np.array([1.0, 3.0, 10.0])
 NOISY_STEP = 0.2  # step of the differences of a corrected cost, in coordinates: two standard errors
 NOISY_REACH = 5.0  # largest such step in standard errors, if the step is derived from a useful error
@@ -203,7 +203,7 @@ def gate_of(bound: Sequence[Bound]) -> float:
 
 
 def _refuse_random(label: str, bound: Sequence[Bound], by: By) -> None:
-    """Raise BadInput if a search would follow the estimator's own random numbers."""
+    """Raise BadInput if a search would fit the random numbers that the estimator draws."""
     if CRITERIA[by].is_smooth and any(isinstance(each, Recursive) and each.is_random for each in bound):
         raise BadInput(
             f"estimator {label}: draws random numbers, so its likelihood changes randomly between "
@@ -336,9 +336,9 @@ def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) ->
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
     """Correct the cost for the noise of the controls if this noise may move the minimum.
 
-    This is the case if, a few standard errors of a parameter away, the noise changes the cost by at
-    least MOVED and by at least half of the cost's rise. One standard error is too close: if stamps are
-    shifted by half a step, the noise gains most, and about equally on both sides.
+    This is the case if, a few standard errors of a parameter away from the minimum, the noise changes
+    the cost by at least MOVED and by at least half of the cost's rise. One standard error is too close:
+    the noise matters most if stamps are shifted by half a step, and about equally on both sides.
     """
     if found.confidence is None:
         return False
@@ -368,9 +368,9 @@ def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> Sear
     """Search until filters begin at the same stamps with the found values as in the search.
 
     Without a prior in the log, the stamp at which a filter begins depends on the values, for example on
-    how much it trusts its path between the first fixes. This stamp is fixed during a search, because
-    likelihoods of different measurements cannot be compared. In the next search, it is determined by the
-    values that the previous search found.
+    how much the filter trusts its own path between the first fixes. This stamp is fixed during a search,
+    because likelihoods of different measurements cannot be compared. In the next search, it is
+    determined by the values that the previous search found.
     """
     start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)
@@ -487,7 +487,7 @@ def _noisy_steps(
 ) -> Floats:
     """Choose the difference steps (m,) for a cost that the noise of the controls makes jagged.
 
-    The cost has an edge, randomly up or down, where shifted stamps coincide with those of a control.
+    The cost jumps, randomly up or down, where shifted stamps coincide with those of a control.
     Differences for calibration parameters are therefore as wide as the useful error, but at most
     NOISY_REACH standard errors.
     """
@@ -513,8 +513,8 @@ def _curvature(
 ) -> Floats:
     """Compute the curvature (m, m), with double steps if the cost is corrected.
 
-    An edge next to the point then has the same effect on the curvature as on differences of slopes over
-    these steps.
+    A jump of the cost next to the point then has the same effect on the curvature as on differences of
+    slopes over these steps.
     """
     times = 2.0 if objective.is_corrected else 1.0
     return curvature(coordinates.over(objective), point, places, times * steps)[1]
@@ -527,10 +527,10 @@ def _levelled(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Move a point to where the costs one step (m,) ahead and behind are equal, if it is near.
+    """Move a point towards one at which the costs one step (m,) ahead and behind are equal.
 
-    The mean of the cost over these steps has its minimum there, and edges of the cost do not attract
-    this point.
+    The mean of the cost over these steps has its minimum there; jumps of the cost do not attract this
+    minimum.
     """
     low, high = coordinates.bounds
     rows = list(places)

@@ -50,7 +50,7 @@ WAYS = {
 # The person scores like an impostor, impostors score like the person, or genuine scores decrease.
 FAULTS = ("misses", "accepts", "drifts")
 FIXED_PROBES = 50  # more probes than any matcher needs
-IMPOSTORS = 100_000  # enough probes for the tail of all impostor scores
+IMPOSTORS = 100_000  # enough probes to cover the tail of all impostor scores
 
 
 class Options(Parameters):
@@ -62,8 +62,8 @@ class Options(Parameters):
         sequences: number of sequences of probes to draw.
         replicates: number of times that users are resampled.
         most_probes: number of probes after which an undecided sequence ends.
-        label_ratio: log-likelihood ratio of the other matchers above which a probe is used to monitor a
-            matcher.
+        label_ratio: absolute sum of the other matchers' log-likelihood ratios from which on a probe is
+            labelled and used to monitor a matcher.
         run_length: specified mean number of labelled probes until a false alarm.
         watched: number of series of probes in which a matcher is monitored.
         watched_probes: probes in a series without a fault.

@@ -98,7 +98,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome(input_sha256=hash_streams([source]))
     dihedrals = np.asarray(source.in_order("/dihedrals", "publish_time")["value"])
     wind = np.asarray(source.in_order("/wind", "publish_time")["value"])[:, 0]
-    with threadpool_limits(1):  # with such small fits, a second core would only spin
+    with threadpool_limits(1):  # the fits are so small that a second core would only wait
         _judge_fits(held_out(dihedrals, options, setting), options, outcome)
     half = len(wind) // 2
     found = {name: most_likely(wind[:half], run) for name, run in FILTERS.items()}

@@ -44,7 +44,7 @@ class CooperativeStressOptions(Parameters):
             for each.
         leaving: number of the robot that is absent in the middle third.
         liar: number of the robot whose prior is wrong.
-        lie_m: error of this prior along x.
+        lie_m: error of this prior along x, in m.
     """
 
     intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)

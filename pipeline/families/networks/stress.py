@@ -32,7 +32,7 @@ class StressOptions(Parameters):
     """The stress on the network.
 
     Attributes:
-        settle_s: time from the beginning after which errors are evaluated.
+        settle_s: time in s from the beginning of a run after which errors are evaluated.
         cases: changes to the scenario's parameters, by the name of a case.
         intervals_s: minimum times in s between two messages of a node, one case for each.
         divergences: differences in nats between a node's estimate and its last message at which the node

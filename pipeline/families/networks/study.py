@@ -37,7 +37,7 @@ class NetworkOptions(Parameters):
     """Additional settings of the study.
 
     Attributes:
-        settle_s: time from the beginning after which errors are evaluated.
+        settle_s: time in s from the beginning of a run after which errors are evaluated.
         losses: probabilities of message loss to try.
         loss_rules: labels of the estimators that are tried at each loss probability.
     """

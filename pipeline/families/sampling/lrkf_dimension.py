@@ -6,7 +6,7 @@ known exactly, because
     E exp(i k'x) = exp(-|k|^2 / 2).
 
 The vectors k point in all directions or, as for a sine of the heading, along the axes. The samplings are
-those of the experiment's estimators, which then estimate robots and vehicles.
+those of the experiment's estimators, which then run on drives of robots and vehicles.
 """
 
 from collections.abc import Callable, Mapping
@@ -173,10 +173,10 @@ def _relative(found: Floats, wanted: Floats) -> float:
 def driven(
     experiment: Experiment, setting: Setting, name: str, drive: Record
 ) -> tuple[list[MemorySource], pd.DataFrame]:
-    """Record a scenario, keep its runs in a folder of its name, and tabulate by estimator and run.
+    """Record the runs of a drive, keep them in a folder with its name, and tabulate estimators and runs.
 
-    A row has the state's dimension, the RMSE of the position, the mean NEES per component, and the CPU
-    time of all cores per second of a run, in ms, averaged over all runs.
+    Each row contains the state's dimension, the position RMSE, the mean NEES per component, and the CPU
+    time in ms of all cores per second of a run, averaged over all runs.
     """
     runner = Runner(experiment.model_copy(update={"record": drive}), setting)
     sources = runner.obtain()

@@ -305,7 +305,7 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
 
 
 def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
-    """Collect metrics of two estimators: their cases begin with the label of the second one."""
+    """Collect metrics of pairs of estimators: the case begins with the label of the second estimator."""
     labels = {split_metric(key)[0] for key in metrics}
     found: dict[str, list[Pair | None]] = {}
     for key, value in metrics.items():

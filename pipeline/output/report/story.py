@@ -36,7 +36,7 @@ from fuselog.replay.judging.intervals import FEWEST_RUNS, Interval
 from fuselog.replay.judging.verdicts import ALIKE, MATERIAL, Comparison, Consistency, Squares
 
 CHEAPER = 0.9  # a run time is mentioned if it is below this share of another's
-TIMED_S = 0.02  # and was measured over at least this time
+TIMED_S = 0.02  # a run time is mentioned only if it was measured over at least this time
 
 NONE_SOUND = "None of the estimators can be trusted with its current settings."
 NONE_SOUND_AT_BEST = "Even at the point with its smallest error, none of the estimators can be trusted."

@@ -1,7 +1,8 @@
 """Artificial outages of a receiver, in which the fixes of a recording are withheld.
 
-A window is a span in which all fixes and velocities are withheld, by the times of the receiver's rows.
-Windows that are far enough apart share a run. Errors are horizontal, at the withheld rows.
+A window is a span in which all fixes and velocities are withheld, selected by the stamps of the
+receiver's rows. Windows that are far enough apart share a run. Errors are horizontal and are computed at
+the withheld rows.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +33,7 @@ class Rows(NamedTuple):
 
     Attributes:
         time_ns: stamps as written by the receiver, (n,).
-        place: positions in m, (n, 2); NaN if they are not accurate enough for a truth.
+        place: positions in m, (n, 2); NaN if they are not accurate enough to serve as truth.
         velocity: velocities in m/s, (n, 2), as written in the row, without correction of a delay.
     """
 
@@ -104,7 +105,7 @@ def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[
 
 
 def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> MemorySource:
-    """Remove the rows of the windows from the recording, and add the topic of its outages."""
+    """Remove the rows of the windows from the recording, and add a topic that lists the outages."""
     gone_ns = np.concatenate([rows.time_ns[:0], *(rows.time_ns[each.rows] for each in windows)])
     streams = dict(source.streams)
     for topic in (FIX, VELOCITY):
@@ -117,14 +118,14 @@ def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> Mem
 
 
 def coasted(rows: Rows, window: Window) -> Floats:
-    """Compute the errors (m, 2) of an extrapolation from the row before, with its recorded velocity."""
+    """Compute the errors (m, 2) of extrapolating the row before the window with its own velocity."""
     before = window.rows[0] - 1
     ahead_s = (rows.since_s[window.rows] - rows.since_s[before])[:, None]
     return rows.place[before] + ahead_s * rows.velocity[before] - rows.place[window.rows]
 
 
 def hermite(rows: Rows, window: Window) -> Floats:
-    """Compute the errors (m, 2) of the cubic through positions and velocities of the rows at both ends.
+    """Compute the errors (m, 2) of the cubic through the positions and velocities at both ends.
 
     This is the smoother for white-noise acceleration.
     """
