@@ -114,7 +114,7 @@ def run_written(path: Path) -> RunMetadata | None:
 
 
 def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
-    """Describe how the settings of a replaced log differ from the new one's; empty if they do not."""
+    """Describe how the settings of a replaced log differ from those of the new log; else empty."""
     if before is None or now is None:
         return ""
     old, new = _settings_of(before), _settings_of(now)

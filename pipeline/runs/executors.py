@@ -61,7 +61,7 @@ PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 def pool_for(
     workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
 ) -> PoolFactory:
-    """Choose the workers for a number of runs by the options, or all cores if this saves time.
+    """Choose the workers for a number of runs: those of the options, else all cores if that saves time.
 
     If an executor is given, it does all the work. Raises BadInput if both options are given.
     """

@@ -78,7 +78,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
-    """Find the best set of several starts, with D / pi^(N/2), covariance eigenvalues, and run time."""
+    """Find the best set of several starts; return its D / pi^(N/2), covariance eigenvalues, run time."""
     begin = process_time()
     points = lcd_samples(dimension, count, np.random.default_rng(seed), starts=starts)
     seconds = process_time() - begin

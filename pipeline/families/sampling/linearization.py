@@ -69,8 +69,8 @@ def ensembles(
 ) -> Iterator[Ensemble]:
     """Record and replay the experiment for every seed; keep the logs of the first seed.
 
-    The `extra` estimators are replayed too, but their estimates are not written; nothing is written
-    unless `written`. Raises BadInput if the reference is not among the estimators.
+    The `extra` estimators are replayed too, but their estimates are not written; nothing is written if
+    `written` is False. Raises BadInput if the reference is not among the estimators.
     """
     if REFERENCE not in experiment.estimators:
         raise BadInput(

@@ -79,7 +79,7 @@ def _set_rows(found: JudgedSets) -> pd.DataFrame:
 
 
 def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
-    """Tabulate one estimator's and robot's last ellipses at the stamps of its sets."""
+    """Tabulate the last ellipse of one estimator and robot at each stamp of the sets."""
     squared_radius = float(chi2.ppf(ELLIPSE, 2))
     place = errors.position
     error, covariance = errors.error[:, place], errors.covariance[:, place][:, :, place]

@@ -47,7 +47,7 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Total errors (20) of every run (runs,), with fixed labels and with the best labels.
+    """Total errors, eq (20), of every run (runs,), with fixed labels and with the best labels.
 
     The arrays by step (runs, steps) are squared errors, and GOSPA in m (cutoff 10 m). `failed` counts
     runs that did not reach the end. Sets have no labels, so their errors with fixed labels are NaN.
@@ -165,7 +165,7 @@ def scores_of(
     labels: Iterable[str],
     others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
-    """Compute the scores of all estimators; for sets, use the scores of the network's fixes."""
+    """Compute the scores of all estimators; those of set estimators are for the case `network`."""
     times_ns, truths = truths_of(sources)
     sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}

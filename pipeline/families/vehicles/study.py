@@ -133,7 +133,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_bytes(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate the bytes that each method sends per step, and those of sending all tracks."""
+    """Tabulate the bytes that each method sends per step, and the bytes needed to send all tracks."""
     rows = [(case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()]
     for case in cases:
         tracks = TRACK_BYTES * _vehicles(case)

@@ -523,7 +523,7 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
 
 
 def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequence[str]) -> list[str]:
-    """List the doubts about a result; `take` is the recommended estimator, `equal` are those as good."""
+    """List the doubts about a result; `take` is the recommended estimator, `equal` ties with it."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),
