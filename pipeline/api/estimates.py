@@ -106,8 +106,7 @@ def judge_estimates(
         if not judge.has_numbers:
             raise BadInput(
                 f"{estimates[0]}: there is nothing to judge, neither estimates with truth nor "
-                f"innovations; "
-                "give the source log with --log"
+                "innovations; give the source log with --log"
             )
         coverage = recounted(opened, sources, estimators, judge.doubts)
         if folder is not None:
@@ -153,8 +152,7 @@ def _compared(
     if "time_offset_s" in comparison:
         raise BadInput(
             "--time-offset works only for trajectory files, because all streams of a log have one "
-            "clock; "
-            "leave it out"
+            "clock; leave it out"
         )
     how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
     compared = compare_logs(estimates, sources, how)

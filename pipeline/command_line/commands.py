@@ -461,8 +461,7 @@ def _view_one(
     if at is not None and screenshot is None and not is_shown:
         raise BadInput(
             f"--at {at}: sets the time cursor of the viewer and of --screenshot; leave it out with "
-            f"--save, "
-            "--connect and --web"
+            "--save, --connect and --web"
         )
     rrd = path / "timeline.rrd" if path.is_dir() else path
     outputs = [(save, TIMELINE), (screenshot, PICTURE)]

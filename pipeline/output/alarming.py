@@ -242,8 +242,7 @@ def _of_costs(judge: Judge) -> Iterator[Finding]:
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
                 f"{numbers / judge.runs:.4g} measured numbers explain at most {high:.4g}: probably a "
-                f"local "
-                "minimum"
+                "local minimum"
             )
             starts = "try other starts, such as --set start=motion"
             yield Finding("minimum", estimator, case, cost / high, words, otherwise=starts)

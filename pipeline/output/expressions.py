@@ -130,8 +130,7 @@ def parse(expression: str) -> ast.expr:
         if type(node) not in _KNOWN:
             raise BadInput(
                 f"'{expression}': only numbers, names, metrics, + - * / **, comparisons, and, or, not "
-                f"and "
-                "functions are allowed; remove the rest"
+                "and functions are allowed; remove the rest"
             )
         if isinstance(node, ast.Call):
             called = getattr(node.func, "id", "")

@@ -250,8 +250,7 @@ def require_ours(found: Path, place: Path) -> None:
     if _digest(values) != result.files.get(RESULT_FILE):
         raise BadInput(
             f"{place / RESULT_FILE}: was changed after fuselog wrote it, or was written by an older "
-            f"version; "
-            "give another folder with --out"
+            "version; give another folder with --out"
         )
     expected = {Path(name): digest for name, digest in result.files.items()}
     parents = {parent for name in expected for parent in name.parents}

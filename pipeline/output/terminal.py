@@ -340,8 +340,7 @@ def print_claims(claims: "Sequence[Claim]") -> None:
     if elsewhere:
         say(
             f"{elsewhere} of {len(claims)} claims are about another recording: their numbers follow, "
-            f"without "
-            "a verdict"
+            "without a verdict"
         )
     for claim in claims:
         say(f"{claim.verdict}: {claim.claim}")

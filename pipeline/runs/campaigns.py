@@ -100,9 +100,8 @@ class Cell:
             return pickle.dumps(done)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise BadInput(
-                f"the sums of a metric cannot be sent to another process ({error}); use numbers, "
-                f"arrays and "
-                "classes defined in a module"
+                f"the sums of a metric cannot be sent to another process ({error}); use numbers, arrays "
+                "and classes defined in a module"
             ) from error
 
 
@@ -229,9 +228,8 @@ def work_off(
                     died[following] += 1
                     if died[following] >= ATTEMPTS:
                         raise BadInput(
-                            f"{checkpoints.folder}: files there are being changed by another program "
-                            f"or a "
-                            "faulty disk; give another --out"
+                            f"{checkpoints.folder}: files there are being changed by another program or "
+                            "a faulty disk; give another --out"
                         )
                     waiting.appendleft(following)
                     continue

@@ -222,8 +222,7 @@ def dask(scheduler: str) -> PoolFactory:
             except (OSError, ValueError) as error:
                 raise BadInput(
                     f"--scheduler {scheduler}: no scheduler answers at this address ({error}); start "
-                    f"one, or "
-                    "give another address"
+                    "one, or give another address"
                 ) from None
             _check_code(scheduler, client)
             if scheduler.startswith("local:"):

@@ -46,8 +46,7 @@ def order_of(
     if found is not None and origins:
         raise BadInput(
             f"--late {late} --start-from {origins[0]}: in order of arrival, a span does not begin at "
-            f"one "
-            "stamp with a known state; use only one of these options"
+            "one stamp with a known state; use only one of these options"
         )
     return "log_time" if arrival_order else "publish_time", found
 
@@ -133,9 +132,8 @@ def start_from(
     label = bound.name.partition("/")[0]
     for topic in bound.priors.keys() - sources[0].topics.keys():
         raise BadInput(
-            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) to replace; "
-            f"leave out "
-            "--start-from, and it begins at the first measurements of the span"
+            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) to replace; leave "
+            "out --start-from, and it begins at the first measurements of the span"
         )
     priors = {
         topic: gather(
@@ -273,8 +271,7 @@ def _components(prior: Stream, name: str) -> dict[str, Any]:
     if not found:
         raise BadInput(
             f"{name}: topic {prior.topic} names no components, so no state can replace it; state them "
-            f"in "
-            "the channel's metadata"
+            "in the channel's metadata"
         )
     return found
 

@@ -103,9 +103,8 @@ def _range(text: str, key: str, parts: Sequence[str]) -> Over:
     numbers = all(isinstance(each, int | float) and math.isfinite(each) for each in (low, high))
     if not numbers or not count.isdecimal() or int(count) < 2 or not low < high or (is_log and low <= 0):
         raise BadInput(
-            f"--over {text}: expected KEY=LOW:HIGH:N with LOW below HIGH and N at least 2, or logN "
-            f"with LOW "
-            "above 0, or a list of values"
+            f"--over {text}: expected KEY=LOW:HIGH:N with LOW below HIGH and N at least 2, or logN with "
+            "LOW above 0, or a list of values"
         )
     space = np.geomspace if is_log else np.linspace
     values = tuple(float(f"{each:.12g}") for each in space(low, high, int(count)))

@@ -159,8 +159,7 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 field,
                 step,
                 f"{stream.topic}: {name} is rounded to {step:.3g}, but its noise is {noise:.2g}: "
-                "smaller "
-                "changes are lost, and its errors are not white",
+                "smaller changes are lost, and its errors are not white",
                 otherwise="write it with more digits, or state a noise of at least "
                 f"{step / np.sqrt(12.0):.2g}",
                 severity="hint",

@@ -76,9 +76,8 @@ def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "specific_force_mps2",
         -1.0 if is_down else float(np.radians(roll or pitch)),
-        f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} "
-        f"of {norm:.4g}, "
-        "but specific force should point up along z",
+        f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} of "
+        f"{norm:.4g}, but specific force should point up along z",
         f"{stream.topic}.specific_force_z_scale=-1" if is_down else "",
         f"mounting_deg = [{roll}, {pitch}, {yaw}] in the mapping",
         "likely" if is_down else "hint",

@@ -63,8 +63,7 @@ def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Strea
             "",
             apart,
             f"{stream.topic}: {int(rows.sum())} of its {len(stream)} stamps are years away from those "
-            "of most "
-            f"messages of the log: the first, of message {row}, is {apart:.3g} years "
+            f"of most messages of the log: the first, of message {row}, is {apart:.3g} years "
             f"{'before' if before_ns > 0 else 'after'} them",
             otherwise="a replay leaves these messages out; correct the clock where the log is written",
             severity="fact",
@@ -112,8 +111,7 @@ def restated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             number,
             float(times),
             f"{stream.topic}: {number} {first} is stated {times} times, at different positions: a "
-            "replay "
-            "uses one of them",
+            "replay uses one of them",
             otherwise="give each point its own number",
             severity="fact",
         )

@@ -58,8 +58,7 @@ def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         "latitude_deg",
         float(np.nanmedian(latitude)),
         f"its fixes are about 0, 0, {np.nanmedian(latitude):.3g} and {np.nanmedian(longitude):.3g} deg "
-        "from it, "
-        "where there is only sea: their unit differs from that in the mapping",
+        "from it, where there is only sea: their unit differs from that in the mapping",
         "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
     )
 
@@ -82,11 +81,9 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             float(fast.sum()),
             f"{int(fast.sum())} of its steps are faster than {FASTEST_MPS:g} m/s, the first by "
             f"{steps_m[first] / 1000:.4g} km in {span_s[first]:.3g} s, "
-            f"{times_s[first] - times_s[0]:.4g} s after its "
-            "first stamp",
+            f"{times_s[first] - times_s[0]:.4g} s after its first stamp",
             "check the unit and the codes of missing values of its positions, whether its rows belong "
-            "to "
-            "several vehicles (`vehicle` in the mapping), and `time`",
+            "to several vehicles (`vehicle` in the mapping), and `time`",
         )
         return
     two_m = np.linalg.norm(places[2:] - places[:-2], axis=1)
@@ -98,8 +95,7 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             float(back.mean()),
             f"its fixes alternate, {np.median(steps_m):.3g} m from one to the next and "
             f"{np.median(two_m):.3g} m to the one after it: they are two sequences of fixes, merged "
-            "into "
-            "one",
+            "into one",
             "`vehicle`, or `order` and `zone` of `time`, in the mapping; remove one recording",
         )
 
@@ -139,8 +135,7 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             "quaternion",
             rate,
             f"its heading turns by {rate:.3g} rad/s, or more half of the time, at {speed:.3g} m/s: that "
-            "is "
-            f"{rate * speed:.3g} m/s^2 sideways",
+            f"is {rate * speed:.3g} m/s^2 sideways",
             "the unit of the angle in the mapping",
         )
 

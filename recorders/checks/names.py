@@ -67,8 +67,7 @@ def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         "",
         0.0,
         f"{stream.topic}: it is alone in its namespace, but {other.topic}, which has the same messages, "
-        f"is with "
-        f"{spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
+        f"is with {spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
         otherwise=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
         f"them; at the import "
         f"""--set 'names={{"{stream.topic}" = "{used}"}}'""",

@@ -95,9 +95,8 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
             stream,
             as_is.spread / other.spread,
             f"latitude and longitude are swapped: after swapping, fixes move {other.value:.4g} m for "
-            "each "
-            f"metre of the wheels (spread {other.spread:.2g}), as recorded {as_is.value:.4g} m (spread "
-            f"{as_is.spread:.2g})",
+            f"each metre of the wheels (spread {other.spread:.2g}), as recorded {as_is.value:.4g} m "
+            f"(spread {as_is.spread:.2g})",
             "in the mapping swap the sources of latitude_deg and longitude_deg",
             is_fact=False,
         )
@@ -195,8 +194,7 @@ def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                     "position_m",
                     -1.0,
                     f"{other.topic}: its z axis points down (NED), but ours up: it falls as the "
-                    "altitude of "
-                    f"{stream.topic} rises (correlation {likeness:.3f})",
+                    f"altitude of {stream.topic} rises (correlation {likeness:.3f})",
                     f"{other.topic}.position_z_scale=-1",
                     "factors.position_m = [1, 1, -1] in the mapping, with north and east swapped",
                 )

@@ -154,8 +154,7 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
             "covariance_m2",
             ratio,
             f"{fixes.topic}: at rest its errors are white and have {ratio:.3g} times the stated "
-            "variance "
-            f"({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
+            f"variance ({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
             f"{fixes.topic}.covariance_scale={digits(ratio)}",
         )
 

@@ -71,8 +71,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         stream,
         10.0**power,
         f"its stamps are {10 ** abs(power):.0e} times too {how}, because of their unit: the rate would "
-        "be "
-        f"{rate_hz:.3g} Hz",
+        f"be {rate_hz:.3g} Hz",
         'time = { unit = "ms" }, or "s", "us", "ns", whichever the column has',
     )
 
@@ -120,8 +119,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             "",
             float(same.sum()),
             f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the same stamp as "
-            "the "
-            f"previous one, the first {since_first(stream, stamps_ns[np.argmax(same)])}: {use}",
+            f"the previous one, the first {since_first(stream, stamps_ns[np.argmax(same)])}: {use}",
             otherwise="remove one of them where the log is written",
             severity="fact",
         )
@@ -160,9 +158,8 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         stream.topic,
         "",
         value,
-        f"{stream.topic}: its stamps are {abs(value):g} s "
-        f"{'ahead of' if value > 0 else 'behind'} the clock "
-        f"of the recorder: {name}{'' if is_alone else ', as are those of all topics'}",
+        f"{stream.topic}: its stamps are {abs(value):g} s {'ahead of' if value > 0 else 'behind'} the "
+        f"clock of the recorder: {name}{'' if is_alone else ', as are those of all topics'}",
         f"{stream.topic}.delay_s={digits(value)}",
         f"time = {{ column = ..., {setting} }} in the mapping",
         "likely" if is_alone else "hint",

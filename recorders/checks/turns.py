@@ -192,8 +192,7 @@ def mounting(motion: BodyMotion) -> Iterator[Finding]:
                 force.field,
                 found.angle_rad,
                 f"{force.topic}: it is mounted rotated about the vertical: its horizontal forces match "
-                "the "
-                f"course if rotated by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
+                f"the course if rotated by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
                 otherwise=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
             )
 

@@ -44,8 +44,7 @@ _TERMS = {
     "tie": Term(
         "Tie",
         "Two estimators that cannot be distinguished with these runs: chance explains the difference, "
-        "or "
-        "it is less than 2 %. Take the simpler one, or make more runs.",
+        "or it is less than 2 %. Take the simpler one, or make more runs.",
         f"{_WIKI}/Paired_difference_test",
     ),
     "likelihood": Term(
@@ -69,8 +68,7 @@ _TERMS = {
     "idf1": Term(
         "IDF1",
         "The share of detections with the correct identity, where missed and false ones count as "
-        "errors; 1 "
-        "is best.",
+        "errors; 1 is best.",
         "https://arxiv.org/abs/1609.01775",
     ),
     "gate": Term(

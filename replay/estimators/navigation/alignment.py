@@ -233,9 +233,8 @@ def _first_place(
     if not len(usable):
         later_s = (time_ns[0] - samples.time_ns[0]) * NS if len(fix) else np.nan
         raise BadInput(
-            f"no message of {fix.topic} is within the time span of {topic}; it starts "
-            f"{later_s:.3g} s later; if their clocks differ, correct them by fix_delay_s or "
-            "inertial_delay_s"
+            f"no message of {fix.topic} is within the time span of {topic}; it starts {later_s:.3g} s "
+            "later; if their clocks differ, correct them by fix_delay_s or inertial_delay_s"
         )
     first = usable[0]
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
@@ -310,9 +309,8 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {motion.topic} starts to move {later_s:.3g} s after the unit; if their clocks differ by "
-        f"the {LEAP_SECONDS} leap seconds between GPS time and UTC, "
-        f"give inertial_delay_s={shift_s:g}"
+        f"; {motion.topic} starts to move {later_s:.3g} s after the unit; if their clocks differ by the "
+        f"{LEAP_SECONDS} leap seconds between GPS time and UTC, give inertial_delay_s={shift_s:g}"
     )
 
 

@@ -70,8 +70,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
         )
         raise BadInput(
             f"{where}: {len(estimate_m)} poses do not determine the {align} alignment, which needs "
-            f"{needed}; add poses, or "
-            "give another alignment"
+            f"{needed}; add poses, or give another alignment"
         )
     scale = 1.0
     if align == "sim3":  # (42): trace(D S) is the scalar product of the truth and the rotated estimate
