@@ -133,7 +133,13 @@ def axes_of(points: Floats) -> Integers:
 
 
 def has_joint_moments(axes: Integers, states: int, values: int) -> bool:
-    """Test whether the covariance of states and values is computed from points on axes."""
+    """Test whether the covariance of states and values is computed from points on axes.
+
+    Args:
+        axes: (L,) indices of the axes, see `axes_of`.
+        states: number of tangent components of the state.
+        values: number of tangent components of the values.
+    """
     return len(axes) > 0 and states * values > REGISTERS
 
 
