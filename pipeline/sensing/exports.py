@@ -52,7 +52,7 @@ def settings(found: Densities) -> str:
 def kalibr(topic: str, force: Density, rate: Density) -> str:
     """Format Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the root of the step itself."""
     return (
-        "# continuous: Kalibr makes them discrete with update_rate; no factor is included\n"
+        "# continuous: Kalibr makes them discrete with update_rate; no safety factor is applied\n"
         f"rostopic: {topic}\n"
         f"update_rate: {1 / force.step_s:.6g}  # Hz\n"
         f"accelerometer_noise_density: {force.white:.6g}  # N, m/s^2/sqrt(Hz)\n"

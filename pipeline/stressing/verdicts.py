@@ -264,8 +264,8 @@ class Stressed:
             )
         elif self._jumps:
             sentences.append(
-                "a microsecond decides what is processed together: messages with one stamp are one "
-                "step, and a later message waits for the next"
+                "a microsecond decides which messages are processed together: those with the same "
+                "stamp form one step, and a later message belongs to the next step"
             )
         if self.is_redrawn:
             sentences.append(

@@ -376,7 +376,7 @@ def test_what_waits_for_a_microsecond_is_no_noise() -> None:
     """Nodes that hear each other at once hear each other a step later."""
     [stressed] = fl.stress(fl.record("ispace", steps=5), "network:naive").stressed
     assert stressed.verdict("stamps") == "discontinuous or chaotic"
-    assert "a microsecond decides what is processed together" in " ".join(stressed.sentences)
+    assert "a microsecond decides which messages are processed together" in " ".join(stressed.sentences)
     assert not stressed.is_per_prediction
 
 

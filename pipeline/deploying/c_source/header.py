@@ -158,7 +158,7 @@ def _predict_comment(made: CFilter) -> str:
 def _between_comment(made: CFilter) -> str:
     control = made.filtering.bound_model.model.control
     assert control is not None
-    note = "Predicts to a time with the mean of the last control and that at this time."
+    note = "Predicts to a time with the mean of the last control and the control at that time."
     if not made.has_gaps:
         return f"/* {note} */"
     after = (
