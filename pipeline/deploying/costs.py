@@ -159,7 +159,8 @@ def _narrowing(sampled: SampledFunction) -> Cost:
     looked = Cost(2 * entries + 3 * turns)
     bounded = Cost(4 * entries + len(rows), len(rows))
     reach = Cost(count * (2 * entries + 2 * len(rows)) + turns, turns)
-    back = Cost(1 + size * (size + 1) // 2 + count * size + sampled.size * (count + 1))
+    factors = size * (size + 1)  # narrowed, and widened again
+    back = Cost(1 + factors + count * size + sampled.size * (count + 1))
     return added(looked, bounded, reach, back)
 
 
