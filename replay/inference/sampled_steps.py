@@ -149,8 +149,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         return {"centre": centre}
 
     def recentre(_: TracedValue, __: TracedValue, shift: TracedValue, value: TracedValue) -> TracedValue:
-        found, again = list[TracedValue](), False
-        found[:] = [value[i] for i in range(values)]
+        found, again = [value[i] for i in range(values)], False
         for kind, _component, first, width in curved_blocks(outputs):
             own = slice(first, first + width)
             still, *found[own] = _recentred(kind)(tuple(value[own]), tuple(shift[own]))

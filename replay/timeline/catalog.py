@@ -9,7 +9,6 @@ import errno
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -72,11 +71,9 @@ class Dataset:
         """Test whether the segments have a layout."""
         return self._entry.default_blueprint() is not None
 
-    def url_of(self, segment: str, at_s: float | None = None) -> str:
-        """Return the address of a segment, at a time in seconds since the run's epoch."""
-        if at_s is None:
-            return self._entry.segment_url(segment)
-        return self._entry.segment_url(segment, "sim_time", timedelta(seconds=at_s))
+    def url_of(self, segment: str) -> str:
+        """Return the address of a segment."""
+        return self._entry.segment_url(segment)
 
 
 @contextmanager

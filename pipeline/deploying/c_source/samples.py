@@ -210,13 +210,13 @@ def samples_text(made: CFilter) -> list[str]:
         "PLACES": max(len(each.centre.outputs) for each in functions),
     }
     listed = ", ".join(f"{name} = {size}" for name, size in sizes.items())
-    # a table has the axes if any function needs them
-    by_axes = sorted(functions, key=lambda each: len(each.axes) > 0)
-    chosen = {each.points.shape[1]: each for each in by_axes}
-    tables = {size: _table(made, chosen[size]) for size in (each.points.shape[1] for each in functions)}
+    tables = {each.points.shape[1]: _table(made, each) for each in functions}
+    on_axes = [] if made.is_root else [each for each in functions if len(each.axes)]
+    axes = {each.points.shape[1]: _axes_table(each) for each in on_axes}
     return [
         f"enum {{ {listed} }};\n",
         *tables.values(),
+        *axes.values(),
         filled(made, TYPE),
         *_narrowing(made, functions[0]),
         *(
@@ -258,9 +258,6 @@ def _table(made: CFilter, sampled: SampledFunction) -> str:
         ", ".join(number(float(each)) for each in sampled.weights[first : first + 4])
         for first in range(0, count, 4)
     )
-    axes = ""
-    if len(sampled.axes) and not made.is_root:
-        axes = f"static const int axes_{size}[{count}] = {{{', '.join(map(str, sampled.axes))}}};\n"
     text = f"""/* Samples of N(0, I) in {size} dimensions, and their weights. */
 static const REAL points_{size}[{count}][{size}] = {{
 {rows}
@@ -268,8 +265,13 @@ static const REAL points_{size}[{count}][{size}] = {{
 static const REAL weights_{size}[{count}] = {{
     {weights}
 }};
-{axes}"""
+"""
     return made.precision.text(text)
+
+
+def _axes_table(sampled: SampledFunction) -> str:
+    count, size = sampled.points.shape
+    return f"static const int axes_{size}[{count}] = {{{', '.join(map(str, sampled.axes))}}};\n"
 
 
 def weighed(sampled: SampledFunction) -> str:

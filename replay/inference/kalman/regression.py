@@ -108,7 +108,7 @@ def sample_memory(
     """
     count_of_sets, count, dimension = sets.points.shape
     values = tangent_size(outputs)
-    axes = axes_of(sets.points[0] if count_of_sets == 1 else np.ones((count, 2)))
+    axes = axes_of(sets.points[0])[: count if count_of_sets == 1 else 0]
     is_on_axes = len(axes) > 0
     return SampleMemory(
         *sets,
