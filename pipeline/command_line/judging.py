@@ -235,7 +235,8 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     """Replay LOG with tiny changes of stamps, order, inputs, start and parameters.
 
     The verdict is printed first: harmless, sensitive (half the change has half the effect), or
-    discontinuous or chaotic (it has not). Each estimator needs at most twelve replays.
+    discontinuous or chaotic (half the change has almost the same effect). Each estimator needs at
+    most twelve replays.
     """
     from fuselog.pipeline.stressing.command import stress_logs
 

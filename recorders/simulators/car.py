@@ -197,8 +197,8 @@ def drive(given: CarParameters, rng: np.random.Generator | None = None) -> Car:
     Raises BadInput if the drive is shorter than a step of a sensor.
     """
     step_s, n = given.odometry_step_s, round(given.duration_s / given.odometry_step_s)
-    first = round(given.first_fix_s / given.fix_step_s)
-    fix_s = given.fix_step_s * np.arange(first, round(given.duration_s / given.fix_step_s) + 1.0)
+    first, last = given.first_fix_s / given.fix_step_s, round(given.duration_s / given.fix_step_s)
+    fix_s = given.fix_step_s * np.arange(first, last + 1e-9)
     compass_s = given.compass_step_s * np.arange(round(given.duration_s / given.compass_step_s) + 1)
     if not n or not len(fix_s):
         raise BadInput(

@@ -45,6 +45,12 @@ OPEN = {"kind": "ekf", "gate_probability": 1.0}
 SEED = 2000
 
 
+def test_a_first_fix_between_two_steps() -> None:
+    """Fixes begin when the scenario says, and none is after the end of the drive."""
+    fix_s = drive(1, duration_s=5.0, first_fix_s=0.3, fix_step_s=0.5).fix_s
+    assert_allclose(fix_s, np.arange(0.3, 5.0, 0.5), rtol=0.0, atol=1e-12)
+
+
 def test_the_likelihood_with_a_compass_is_that_of_the_sheet() -> None:
     likelihood, base = Likelihood(), Trial("ekf", [recorded(drive(1))], OPEN)
     likelihood.begin(base)

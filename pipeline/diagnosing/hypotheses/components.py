@@ -91,11 +91,11 @@ class _Own(NamedTuple):
 
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
     units = mistaken(unit_of(entry.name))
-    specials = {float(np.log(size)): f"{name} are" for name, size in units.items()}
-    specials |= {-at: f"{meaning} that are converted twice" for at, meaning in specials.items()}
+    specials = {float(np.log(size)): f"is in {name}" for name, size in units.items()}
+    specials |= {float(-np.log(size)): f"is converted from {name} twice" for name, size in units.items()}
 
     def words(at: float, low: float, high: float) -> str:
-        more = f", as if {specials[at]}" if at in specials else ""
+        more = f", as if it {specials[at]}" if at in specials else ""
         ends = [0.0, max(abs(low), abs(high))] if low * high <= 0.0 else sorted((abs(low), abs(high)))
         size = "large" if at > 0.0 else "small"
         factor, least, most = (number(np.exp(each), 4) for each in (abs(at), *ends))
