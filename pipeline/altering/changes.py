@@ -30,7 +30,7 @@ ALL_TOPICS = "/*"
 WHATS = {
     "delay_s": "The delay of the stamps, which is subtracted; messages that would be before 1970 "
     "are left out.",
-    "clock_gain": "The clock of the stamps gains this many s per s from the start of the run.",
+    "clock_gain": "The stamps' clock gains this many seconds per second, from the start of the run.",
     "FIELD_scale": "The field is multiplied by this factor; covariance_scale multiplies variances.",
     "FIELD_bias": "The field is too large by this bias, which is subtracted.",
     "FIELD_drift": "The field's bias grows by this much per second from the start of the run, and is "
@@ -38,8 +38,8 @@ WHATS = {
     "FIELD_axes": "The order of the vector's entries: yx if x and y are swapped.",
     "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, such as `fuselog "
     "ellipsoid` finds.",
-    "FIELD_turn": "The vector is rotated about the vertical by this angle (rad); the rotation is "
-    "reversed.",
+    "FIELD_turn": "The angle (rad) by which the vector is rotated about the vertical; it is rotated "
+    "back.",
     "heading_bias": "The heading of orientations, or of a prior, is too large by this angle (rad); "
     "orientations have heading_scale and heading_drift as well.",
     "heading_convention": "north, if the headings of orientations are those of a compass, clockwise "
@@ -373,7 +373,9 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
         if len(fits) == 1:
             return fits[0], fields[fits[0]]
         if fits:
-            raise BadInput(f"--set {given.key}: {name} may be {' or '.join(fits)}; give the full name")
+            raise BadInput(
+                f"--set {given.key}: {name} could mean {' or '.join(fits)}; give the full name"
+            )
     topic = given.key.rpartition(".")[0]
     raise BadInput(f"--set {given.key}: {topic} has no field {name}; {choices(name, list(fields))}")
 
@@ -406,7 +408,7 @@ def _plane(change: Change, given: _Setting) -> Change:
 
 def _covers(change: Change, given: _Setting) -> Change:
     if given.empty.schema.full_name != schemas.TRUTH_STATE.full_name:
-        raise BadInput(f"--set {given.key}: only truths cover targets; remove this setting")
+        raise BadInput(f"--set {given.key}: this setting applies only to truths; remove it")
     if given.value not in ("some", "all"):
         raise given.refused("some or all")
     return replace(change, metadata={**change.metadata, COVERS: f"{given.value} targets"})

@@ -108,11 +108,12 @@ def advice(found: Tuning) -> list[str]:
     widest = max(names, key=lambda name: before[name] / useful[name])
     by_determinant = table.iloc[int(table["nats"].argmax())]
     return [
-        f"next, record {best['manoeuvre']}: among {len(MOTIONS)} manoeuvres of {DURATION_S:g} s it "
-        f"reduces the widest interval most; the standard error of {widest}, now the widest, becomes "
+        f"next, record {best['manoeuvre']}: of {len(MOTIONS)} manoeuvres of {DURATION_S:g} s, it "
+        f"reduces the widest interval most: the standard error of {widest}, now the widest, becomes "
         f"{best[widest]:.3g} ({before[widest]:.3g} without)",
-        f"by the determinant, which counts all parameters together, it is {by_determinant['manoeuvre']} "
-        f"({by_determinant['nats']:.1f} nats; {best['manoeuvre']} {best['nats']:.1f})",
+        "judged by the determinant, which counts all parameters together, the best manoeuvre is "
+        f"{by_determinant['manoeuvre']} ({by_determinant['nats']:.1f} nats; {best['manoeuvre']}: "
+        f"{best['nats']:.1f})",
     ]
 
 

@@ -103,5 +103,5 @@ def compare_candidates(
     for path in written:
         say(str(path))
     if not labels and all(each.is_dir() or each.suffix == ".mcap" for each in given):
-        say(f"to see the runs with all of them: fuselog view {shlex.join(map(str, given))}")
+        say(f"to see each run with all results in one scene: fuselog view {shlex.join(map(str, given))}")
     return not worse

@@ -202,8 +202,8 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         alone = [run for run in own if run not in set(common)]
         if alone:
             yield (
-                f"only {candidate.name} has {count(len(alone), 'run')}, left out: {', '.join(alone[:3])}"
-                + (", ..." if len(alone) > 3 else "")
+                f"left out, because only {candidate.name} has them: {count(len(alone), 'run')}, "
+                f"{', '.join(alone[:3])}" + (", ..." if len(alone) > 3 else "")
             )
     judged = [run for run in common if run in first.truths and run in second.truths]
     apart = [run for run in judged if first.truths[run] != second.truths[run]]

@@ -100,7 +100,7 @@ class Cause(NamedTuple):
     def words(self) -> str:
         """Describe the fault, its size, the alternatives and the gain."""
         or_else = "".join(
-            f"; this log does not determine it; equally likely: {each.statement}"
+            f"; this log does not determine the value; equally likely: {each.statement}"
             if each.hypothesis is self.hypothesis
             else f"; or, indistinguishable in this log, {each.statement}"
             for each in self.others

@@ -400,7 +400,10 @@ def _followed(
         trying = Trying(label, alterations_of(source), is_own=False)
         remedies = [trying.over(Advice.of(each.setting)) for each in mended]
         settings_given = " ".join(f"--set {each.setting}" for each in remedies)
-        note = f"all other findings are about the log with {settings_given}, because without it: {error}"
+        note = (
+            f"all other findings are about the log with {settings_given}, because without these "
+            f"settings: {error}"
+        )
         with suppress(BadInput):
             other = alter(source, {each.key: each.value for each in remedies})
             return replayed(other)._replace(mended=mended, notes=[note])

@@ -127,8 +127,8 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
     """List remarks on a diagnosis: causes in doubt, omitted messages and findings, missing truth."""
     notes = [
-        "in doubt, like everything with a smaller gain, because the parts of the log disagree about the "
-        f"number by more than chance: {each.words}"
+        "in doubt, as is every cause with a smaller gain, because the parts of the log disagree about "
+        f"its value by more than chance: {each.words}"
         for each in in_doubt
     ]
     left_out = Rejections().plus(source.rejections for source in done.logs)

@@ -76,7 +76,7 @@ def _evidence(case: Case) -> str:
     return (
         f"{' and '.join(facts)}, {within}."
         if facts
-        else "The log has neither truth nor innovations to judge it."
+        else "The log has neither a truth nor innovations to judge the estimator by."
     )
 
 

@@ -88,7 +88,8 @@ def cut(
         notes.append(f"copied completely, regardless of the span: {', '.join(once)}")
     if start_s is not None and any(is_prior(log, topic) for topic in once):
         notes.append(
-            f"the prior is older than this part: replay it with --start {start_s:g} --start-from truth, "
+            f"the prior is older than this part of the log: replay the part with --start {start_s:g} "
+            "--start-from truth, "
             "or start from the estimates of an earlier replay"
         )
 

@@ -177,7 +177,7 @@ def _of_errors(
                 more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
                 words += (
                     f"; the truth contains {lacking[0]}{more}, which the estimator does not estimate; "
-                    "if the model supports it, the setting estimate adds them to the state"
+                    "if the model supports it, add them to the state with the setting `estimate`"
                 )
             has_innovations = any(split_topic(each)[0] == estimator for each in judge.innovations)
             why = _why(estimator) if has_innovations else ""

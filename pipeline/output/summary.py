@@ -162,7 +162,7 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
         style: Style = "dashed" if smoothed else "line"
         series = curve(str(mode), rows["elapsed_s"], rows["probability"], style)
         panels[name].series.append(series)
-    dashed = "; dashed: given all data of a run" if modes["smoothed"].any() else ""
+    dashed = "; dashed: from all data of a run" if modes["smoothed"].any() else ""
     title = f"{case or 'modes'}, probability of each mode{dashed}"
     return Chart(title=title, panels=list(panels.values()))
 

@@ -165,7 +165,7 @@ class Runs(NamedTuple):
                 first, last = min(by_name), max(by_name)
                 raise BadInput(
                     f"--runs {text}: {self.path} has no run {name}; its {len(by_name)} runs are "
-                    f"{first} to {last}, and worst:N and all select several"
+                    f"{first} to {last}; to select several, give worst:N or all"
                 )
             found |= {each: by_name[each] for each in own}
         return list(found.values())

@@ -193,7 +193,7 @@ def _analysed(
     }
     if not {"walk", "markov"} & set(fitted.free):
         numbers["walk"] = Interval(0.0, 0.0, walk_below(samples, fitted))
-        notes.append(f"no walk found; K < {numbers['walk'].high:.2g} {unit}/sqrt(s)")
+        notes.append(f"no random walk found; K < {numbers['walk'].high:.2g} {unit}/sqrt(s)")
     if drift is not None and not drift.offset:
         reach = 1.96 * drift.rate_sigma
         numbers["ramp"] = Interval(drift.rate, drift.rate - reach, drift.rate + reach)
@@ -268,7 +268,8 @@ def _least(found: ColumnNoise, unit: str) -> str:
     value = float(found.curve.deviations[least])
     return (
         f"minimum Allan deviation {value:.3g} {unit} at {found.curve.taus_s[least]:.3g} s (as flicker "
-        f"noise, divided by 0.664: {value / 0.664283:.3g}); white noise and a walk have a minimum too"
+        f"noise, divided by 0.664: {value / 0.664283:.3g}); white noise with a random walk has a "
+        "minimum too"
     )
 
 

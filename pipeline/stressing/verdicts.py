@@ -248,7 +248,7 @@ class Stressed:
         share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
         half = f"half the change has {share:.2g} of this effect"
         if name in self.quarters:
-            half += f", and a quarter has {1.0 / ratio:.2g} of that of half"
+            half += f", and a quarter of the change has {1.0 / ratio:.2g} of that of half"
         if self.worst == "sensitive":
             return f"{half}: the effect shrinks faster than the change" if ratio > HALVES[1] else half
         return f"{half}: the effect {'jumps' if ratio > SQUARED else 'does not shrink with the change'}"
@@ -277,7 +277,7 @@ class Stressed:
             since_s = (least.since_ns - self.source.epoch_ns) * 1e-9
             sentences.append(
                 f"from {since_s:.1f} s on, {least.words} is not determined: its sigma is "
-                f"{least.sigma:.3g}, and {least.next_sigma:.3g} across it"
+                f"{least.sigma:.3g}, and {least.next_sigma:.3g} in the next least determined direction"
             )
         return sentences
 

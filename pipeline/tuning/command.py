@@ -104,7 +104,7 @@ def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
     folders = {path.resolve().parent for path in held_out}
     beside = [path for path in logs if path.resolve().parent in folders]
     remedy = (
-        "to hold out several logs, give --validate their folder, or repeat --validate before each log"
+        "to hold out several logs, give their folder to --validate, or repeat --validate for each log"
     )
     for path in logs:
         if path.resolve() in {each.resolve() for each in held_out}:

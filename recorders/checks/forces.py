@@ -40,7 +40,8 @@ def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 float(len(stream)),
                 f"{stream.topic}: its {what} are exactly zero in all {len(stream)} messages: they were "
                 "not measured, but a filter driven by this topic uses them as measurements",
-                otherwise="import only what was measured, a part of a unit as a VectorMeasurement",
+                otherwise="import only what was measured; import a part of a unit as a "
+                "VectorMeasurement",
             )
 
 

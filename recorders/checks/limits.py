@@ -134,8 +134,8 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "quaternion",
             rate,
-            f"its heading turns by {rate:.3g} rad/s, or more half of the time, at {speed:.3g} m/s: that "
-            f"is {rate * speed:.3g} m/s^2 sideways",
+            f"its heading turns by {rate:.3g} rad/s or more for half of the time, at {speed:.3g} m/s: "
+            f"{rate * speed:.3g} m/s^2 sideways",
             "the unit of the angle in the mapping",
         )
 
@@ -180,7 +180,7 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         yield of_stamps(
             stream,
             0.0,
-            f"its stamps are of {len(days)} days, each the {of_month[0]}. of a month, the first on "
+            f"its stamps fall on {len(days)} days, each day {of_month[0]} of a month, the first on "
             f"{days[0]}: day and month are swapped",
             "`format` of `time` in the mapping",
         )

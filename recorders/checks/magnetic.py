@@ -42,7 +42,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         f"{stream.topic}.magnetic_field_scale={digits(factor)}" if given else "",
         f'units.{FIELD} = "{given}" in the mapping'
         if given
-        else "calibrate it: only its direction is usable",
+        else "calibrate it; until then, only its direction is usable",
         "likely" if given else "hint",
     )
 

@@ -90,7 +90,8 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         began_again = not is_late and -steps_ns.min() > AGAIN * usual_ns and count <= FEW_FALLS
         behind_s = 1e-9 * float((np.maximum.accumulate(stamps_ns) - stamps_ns).max())
         how = (
-            "; its clock was restarted, rolled over, or is that of several vehicles"
+            "; its clock was restarted or rolled over, or the stamps are from the clocks of several "
+            "vehicles"
             if began_again
             else f"; messages overtook one another, and are up to {behind_s:.3g} s behind" * is_late
         )

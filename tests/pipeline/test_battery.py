@@ -242,7 +242,7 @@ def test_a_delay_on_equal_laps_is_not_determined() -> None:
     cause = seek(log, "ekf", OPEN, 1).causes[0]
     values = [cause.value, *(each.value for each in cause.others if each.hypothesis is cause.hypothesis)]
     assert sorted(map(abs, values)) == pytest.approx([7.0, 27.0], abs=0.3)
-    assert "this log does not determine it; equally likely: /car/" in cause.words
+    assert "this log does not determine the value; equally likely: /car/" in cause.words
 
 
 def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:

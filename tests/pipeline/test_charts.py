@@ -124,7 +124,7 @@ def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:
     modes = pd.DataFrame(rows, columns=["estimator", "mode", "smoothed", "elapsed_s"])
     modes["probability"] = np.arange(len(modes)) / len(modes)
     chart = mode_chart(modes, "vehicle1")
-    assert chart.title == "vehicle1, probability of each mode; dashed: given all data of a run"
+    assert chart.title == "vehicle1, probability of each mode; dashed: from all data of a run"
     for panel, start in zip(chart.panels, (0, 12), strict=True):
         assert panel.title == ("imm" if start == 0 else "bank")
         drawn = [(each.label, each.style) for each in panel.series]

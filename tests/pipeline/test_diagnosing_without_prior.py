@@ -192,7 +192,7 @@ def test_what_another_number_explains_as_well_is_not_determined(
     tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), 10.0, lambda _, at: at, late, lambda _: None)  # type: ignore[arg-type,return-value]
     [[cause], *_] = find_causes(likelihood, 0.0, [tried], 1)  # type: ignore[arg-type]
     assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
-    other = f"; this log does not determine it; equally likely: {values[-1]:.2f} late;"
+    other = f"; this log does not determine the value; equally likely: {values[-1]:.2f} late;"
     assert (other in cause.words) == (len(values) > 1)
 
 

@@ -241,7 +241,7 @@ def test_the_command_writes_what_others_read(
     )
     assert white == pytest.approx(1e-3, rel=0.05)
     assert sum("times this value" in note for note in said.json["notes"]) == 3
-    none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
+    none_found = [note for note in said.json["notes"] if "no random walk found; K <" in note]
     assert sum("turn_rate" in note for note in none_found) == 3
     lines = Path("noise/px4.params").read_text().splitlines()
     px4 = dict(line.split() for line in lines if not line.startswith("#"))

@@ -427,7 +427,7 @@ def test_logs_that_were_meant_to_be_held_out_are_not_tuned_on(
     assert (leaking.code, leaking.err) == (
         2,
         "fuselog: test/3.mcap: would be tuned on, although test/2.mcap in the same folder is held out; "
-        "to hold out several logs, give --validate their folder, or repeat --validate before each log\n",
+        "to hold out several logs, give their folder to --validate, or repeat --validate for each log\n",
     )
     both = fuselog(*tune, "--validate", "train/1.mcap")
     assert both.code == 2

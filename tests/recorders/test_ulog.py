@@ -609,6 +609,6 @@ def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
     assert not replayed.failures  # the model has them all
     assert notes["EKF2_HDG_GATE"].startswith("test single components")
     assert notes["EKF2_TAU_POS"] == "have no counterpart in the model inertial"
-    assert notes["CAL_ACC0_XOFF"].startswith("had their effect before")
+    assert notes["CAL_ACC0_XOFF"].startswith("were applied before")
     many = carried({f"EKF2_OTHER_{number}": 0.0 for number in range(200)})
     assert list(many) == ["EKF2_OTHER_0, EKF2_OTHER_1, EKF2_OTHER_10 and 197 more"]

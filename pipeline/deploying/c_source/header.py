@@ -119,7 +119,8 @@ def outcomes(made: CFilter) -> dict[str, str]:
     """List what the functions of a filter may return, with the meaning of each outcome."""
     gap = {"NOT_DRIVEN": "the control is silent: the estimate is unknown"} if made.has_gaps else {}
     return {
-        "WELL": "the state is finite, and predicted, updated, or kept if a gate rejected the message",
+        "WELL": "the state is finite: predicted, updated, or unchanged because a gate rejected the "
+        "message",
         "NOTHING_MEASURED": "all measured components are NAN: nothing changed",
         "BAD_INPUT": "a number is infinite, is NAN but not missing, or is a negative variance: "
         "nothing changed",

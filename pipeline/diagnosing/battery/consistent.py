@@ -89,7 +89,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 FALSE_CAUSES = Study(
-    "how often a diagnosis names a cause in a log without a fault, for many ratios of noise",
+    "how often a diagnosis names a cause in a fault-free log, at many noise ratios",
     study,
     FalseCausesOptions,
     runs="logs per noise setting; there are 20 settings unless options give others",

@@ -45,5 +45,5 @@ def mode_chart(metrics: Mapping[str, MetricValue], estimators: Sequence[str]) ->
 
 
 COOPERATIVE = Study(
-    "robots that share their estimates: the cost of each way of fusing", study, is_campaign=True
+    "robots that share their estimates: what each fusion method costs", study, is_campaign=True
 )

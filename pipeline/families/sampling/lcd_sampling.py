@@ -159,5 +159,8 @@ def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) 
 
 
 LCD_SAMPLING = Study(
-    "samplings of N(0, I): their distance to it, and the cost of LCD sets", study, LcdOptions, runs=""
+    "sample sets for N(0, I): their distance from it, and the cost of LCD sets",
+    study,
+    LcdOptions,
+    runs="",
 )

@@ -81,7 +81,7 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
     most = max(map(len, shares.values()), default=1)
     above = Panel(
         x=Axis(label=f"vessels with more than {MANY_REPORTS} reports, best first"),
-        y=Axis(label="share of reports in the own track", limits=(0, 1.02)),
+        y=Axis(label="share of reports in their vessel's track", limits=(0, 1.02)),
         series=[*series, level(f"kept: {KEPT_SHARE:g}", np.arange(most), KEPT_SHARE)],
     )
     [source] = replayed.sources

@@ -374,7 +374,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
     if each.age_s:
         own = scale("s", each.age_s)
         age = f"{own.text(each.age_s)} {own.sign}"
-        notes.append(f"Its estimates are on average {age} old when they are available.")
+        notes.append(f"Its estimates are on average {age} old when they become available.")
     if each.share < LEAST_SHARE:
         notes.append(f"It estimated {number(100 * each.share)} % of the time.")
     return notes
@@ -463,7 +463,7 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
             errs = (
                 f"{near.with_unit(size)} {'larger' if more.value > 0 else 'smaller'} than that of {take}"
             )
-            differences.append(f"The error of {label} is {errs}, in the mean over runs ({ends}).")
+            differences.append(f"The error of {label} is {errs} on average over the runs ({ends}).")
     return draws, differences
 
 

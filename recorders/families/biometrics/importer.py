@@ -86,7 +86,7 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     arrival_s = parameters.probe_interval_s * np.arange(len(first.probes))
     arrival_ns = simulation_stamps_ns(arrival_s)
     scores = np.stack([matrix.scores for matrix in matrices], axis=-1)
-    notes = {"times": f"not in the data: assumed a probe every {parameters.probe_interval_s:g} s"}
+    notes = {"times": f"not in the data; assumed to be a probe every {parameters.probe_interval_s:g} s"}
     return Recording([score_stream(matchers, scores, arrival_ns)], notes=notes)
 
 

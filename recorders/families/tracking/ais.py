@@ -126,7 +126,13 @@ def _reports(path: Path) -> Reports:
     wanted = "a date and time from 1970 to 2261, such as 2016-01-12 13:02:11.218"
     _refuse(path, table, "Time", times.isna() | ~times.dt.year.between(1970, 2261), wanted)
     backwards = times.diff() < pd.Timedelta(0)
-    _refuse(path, table, "Time", backwards, "not before the row above; sort the rows by Time")
+    _refuse(
+        path,
+        table,
+        "Time",
+        backwards,
+        "a time that is not before that of the row above; sort the rows by Time",
+    )
     mmsi, latitude, longitude, course, speed = numbers.to_numpy(float).T
     return Reports(
         times.dt.tz_localize(None).dt.as_unit("ns").to_numpy().astype(np.int64),

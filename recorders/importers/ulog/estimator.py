@@ -344,7 +344,7 @@ def _state(fields: Fields) -> Part:
         fields.rows.time_us,
         {"mean": mean, "covariance": covariance.reshape(len(states), 81)},
         {**state_metadata(_POSE), "truth": TRUTH},
-        {"left out states without a unit quaternion, as of firmware of 2016": int(is_old.sum())},
+        {"left out states without a unit quaternion, as firmware of 2016 wrote them": int(is_old.sum())},
     )
     return part.take(np.flatnonzero(~is_old))
 

@@ -250,7 +250,9 @@ class UlogFile:
                 has_stamp = of.stamps[which] != 0
                 untimed = int((~has_stamp).sum())
                 which = which[of.is_timed[which] | ~has_stamp]
-                self.losses["rows whose stamp is a month from the log's beginning"] += count - len(which)
+                self.losses["rows whose stamp is more than a month from the log's beginning"] += (
+                    count - len(which)
+                )
             key = (subscription.topic, subscription.instance)
             self.rows[key] += len(which)
             if is_wanted(subscription.topic) and len(which):

@@ -25,7 +25,7 @@ _SETTINGS = {
 _LEVERS = {"X": ("lever_x_m", 1.0), "Y": ("lever_y_m", -1.0), "Z": ("lever_z_m", -1.0)}
 # Reasons why parameters are not used, by their names; the first pattern that matches counts.
 _REASONS = {
-    "CAL_*": "had their effect before sensor_combined and vehicle_imu were logged; accelerometer_N, "
+    "CAL_*": "were applied before sensor_combined and vehicle_imu were logged; accelerometer_N, "
     "gyro_N and magnetometer_N are raw sensor readings",
     "EKF2_*_GATE": "test single components; gate_probability tests all components of a message together",
     "EKF2_GPS_?_NOISE": "are lower limits in EKF2; here fixes have the noise that they state",

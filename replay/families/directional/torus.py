@@ -167,7 +167,9 @@ def _run(
     option: float | bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     if measurement.shape != (offsets[-1], 2):
-        raise BadInput(f"heading measurements have shape {measurement.shape}; give ({offsets[-1]}, 2)")
+        raise BadInput(
+            f"heading measurements have shape {measurement.shape}; expected ({offsets[-1]}, 2)"
+        )
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
     rows = HeadingRows(offsets, np.ascontiguousarray(measurement))

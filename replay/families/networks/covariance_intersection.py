@@ -325,8 +325,8 @@ def fuse(
     mean, covariance = np.asarray(means, float), np.asarray(covariances, float)
     if mean.ndim < 2 or covariance.shape != (*mean.shape, mean.shape[-1]) or mean.shape[-2] == 0:
         raise BadInput(
-            f"means have shape {mean.shape} and covariances {covariance.shape}; give (..., K, n) and "
-            "(..., K, n, n) with at least one estimate"
+            f"means have shape {mean.shape} and covariances {covariance.shape}; expected (..., K, n) "
+            "and (..., K, n, n) with at least one estimate"
         )
     known = np.zeros_like(covariance) if independents is None else np.asarray(independents, float)
     if known.shape != covariance.shape:

@@ -434,8 +434,8 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
 
     if changes(1.0) and not changes(TURN):
         raise AssertionError(
-            f"check_model: {name} is declared linear, but nothing changes after a full turn; "
-            "its kind is angle"
+            f"check_model: {name} is declared linear, but a full turn of it changes nothing; declare "
+            "it as an angle"
         )
 
 

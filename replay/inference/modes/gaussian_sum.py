@@ -72,7 +72,9 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
     @classmethod
     def _odd(cls, members: int) -> int:
         if members % 2 == 0:
-            raise ValueError(f"members must be odd, so that no two are opposite; give {members + 1}")
+            raise ValueError(
+                f"the number of members must be odd, so that no two are opposite; give {members + 1}"
+            )
         return members
 
 

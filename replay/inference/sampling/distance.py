@@ -42,7 +42,7 @@ class _Quadrature(NamedTuple):
     rates: Array
     factors: Array
     constant: float
-    """D of a set whose samples are all at the origin."""
+    """The distance D of a set whose samples are all at the origin."""
 
 
 def lcd_distance(points: Array, weights: Array | None = None) -> float:

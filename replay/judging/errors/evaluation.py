@@ -372,7 +372,7 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
         facts.append(f"it has {', '.join(true)}")
     elif position and rest:
         alone, others = ", ".join(position), ", ".join(rest)
-        facts.append(f"position_rmse_m covers only {alone}, and not {others}, which {truth} has")
+        facts.append(f"position_rmse_m covers only {alone}; {truth} also has {others}")
     return f"{what}: {'; '.join(facts)}" if facts else ""
 
 

@@ -157,7 +157,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a state's angle declared linear": (
         replace(VEHICLE_A, state=LINEAR_HEADING),
-        "heading_rad is declared linear, but nothing changes after a full turn",
+        "heading_rad is declared linear, but a full turn of it changes nothing",
     ),
     "a state's angle declared linear, wrapped by its motion": (
         moving(half_wrapped, state=LINEAR_HEADING),

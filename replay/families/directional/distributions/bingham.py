@@ -48,8 +48,8 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
     d = z.shape[-1] if z.ndim else 0
     if d not in (2, 4) or axes.shape[-2:] != (d, d):
         raise BadInput(
-            f"Bingham axes have shape {axes.shape} and concentrations {z.shape}; give (..., d, d) and "
-            "(..., d) with d = 2 or 4"
+            f"Bingham axes have shape {axes.shape} and concentrations {z.shape}; expected (..., d, d) "
+            "and (..., d) with d = 2 or 4"
         )
     if not np.isfinite(z).all():
         raise BadInput("Bingham concentrations must be finite; use 0 for a uniform distribution")

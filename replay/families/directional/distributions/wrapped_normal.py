@@ -61,8 +61,8 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
-            f"a wrapped normal has a mean of shape {mean.shape} and a covariance of shape "
-            f"{covariance.shape}; give (..., 2) and (..., 2, 2)"
+            f"this wrapped normal has a mean of shape {mean.shape} and a covariance of shape "
+            f"{covariance.shape}; expected (..., 2) and (..., 2, 2)"
         )
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
         raise BadInput("the mean and covariance of a wrapped normal must be finite")
