@@ -250,11 +250,8 @@ class Judge:
         step over the runs; innovations are uncorrelated, so the NIS has the interval of the mean of all
         innovations. The intervals contain the metrics with `probability`.
         """
-        found: dict[str, tuple[float, float]] = {}
-        for key, (size, runs, aim) in self._sizes().items():
-            low, high = chi_square_interval(size, runs, probability)
-            found[key] = low / (size / aim), high / (size / aim)
-        return {key: found[key] for key in self.metrics if key in found}
+        sizes = self._sizes()
+        return {key: _interval(*sizes[key], probability) for key in self.metrics if key in sizes}
 
     def _sizes(self) -> dict[str, tuple[int, int, int]]:
         """Return the degrees of freedom, number of values and expected value of NEES and NIS, by key."""
@@ -282,7 +279,8 @@ class Judge:
         if self.runs >= FEWEST_RUNS and quantity in (table := self.runs_table):
             own = table[(table["estimator"] == estimator) & (table["case"] == case)]
             found = mean_interval(own[quantity].dropna())._replace(value=found.value)
-        return Squares(quantity, found, self._sizes()[key][2], self.bounds[key])
+        size, runs, aim = self._sizes()[key]
+        return Squares(quantity, found, aim, _interval(size, runs, aim, 0.95))
 
     @property
     def constants(self) -> dict[tuple[str, str], Constant]:
@@ -402,3 +400,9 @@ class Judge:
     def judged(self) -> dict[str, Errors]:
         """Return, by topic, the last errors of estimates, for the names and kinds of components."""
         return {topic: each.errors for topic, each in self._quantities.items()}
+
+
+def _interval(size: int, runs: int, aim: int, probability: float) -> tuple[float, float]:
+    """Compute the interval of the mean of a consistent filter's squares, whose expected value is `aim`."""
+    low, high = chi_square_interval(size, runs, probability)
+    return low / (size / aim), high / (size / aim)

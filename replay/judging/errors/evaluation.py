@@ -8,6 +8,7 @@ Estimation with Applications to Tracking and Navigation, 5.4.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -165,6 +166,7 @@ def split_topic(topic: str) -> tuple[str, str]:
     return parts[0], "/".join(parts[1:-1])
 
 
+@lru_cache(4096)
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
     """Compute the interval that contains the mean of `runs` chi-square values with this probability.
 
