@@ -403,6 +403,6 @@ class Judge:
 
 
 def _interval(size: int, runs: int, aim: int, probability: float) -> tuple[float, float]:
-    """Compute the interval of the mean of a consistent filter's squares, whose expected value is `aim`."""
+    """Compute the interval of a consistent filter's mean NEES or NIS, whose expected value is `aim`."""
     low, high = chi_square_interval(size, runs, probability)
     return low / (size / aim), high / (size / aim)
