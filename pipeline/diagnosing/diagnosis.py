@@ -285,7 +285,7 @@ def diagnose(
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(
             each
-            for each in unseen_errors(done, label, has_causes=bool(sought.causes))
+            for each in unseen_errors(done, has_causes=bool(sought.causes))
             if each.where not in no_judges
         ),
     ]
@@ -349,7 +349,7 @@ def _of_recorded(
         *filter(is_told, seen),
         *of_each_component(innovations),
         *of_innovations(innovations, None, source.epoch_ns, has_outliers=False),
-        *unseen_errors(done, label, has_causes=False),
+        *unseen_errors(done, has_causes=False),
     ]
     note = (
         f"{label} was recorded, so no fault can be corrected and tried: only its innovations are judged"
