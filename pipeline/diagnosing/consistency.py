@@ -8,8 +8,8 @@ import numpy as np
 from fuselog.pipeline.api.replays import Replay
 from fuselog.pipeline.output.alarming import unseen
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
-from fuselog.pipeline.output.over_time import nis_over_time
 from fuselog.pipeline.output.results import MetricValue, split_metric
+from fuselog.pipeline.output.summary import nis_over_time
 from fuselog.pipeline.output.words import listed
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas

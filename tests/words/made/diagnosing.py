@@ -14,9 +14,8 @@ from fuselog.pipeline.diagnosing.consistency import unnamed, unseen_errors
 from fuselog.pipeline.diagnosing.diagnosis import Diagnosis
 from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.components import of_components
-from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses, of_numbers
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.sentences import notes_of, ranked
 from fuselog.pipeline.runs.trials import Trial
