@@ -455,7 +455,7 @@ def _view_one(
 ) -> None:
     """Show, write or stream the timeline of a log, a result or one of its runs (`segment`)."""
     from fuselog.replay.timeline import viewer
-    from fuselog.replay.timeline.moments import read_moments, worst_at
+    from fuselog.replay.timeline.show import read_moments, worst_at
 
     is_shown = save is None and connect is None and not web
     if at is not None and screenshot is None and not is_shown:

@@ -130,7 +130,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     The page is served to this machine only, at an address that cannot be guessed. The command ends when
     the page is closed, or with Ctrl-C.
     """
-    from fuselog.pipeline.exploring.command import explore_log
+    from fuselog.pipeline.exploring.explore import explore_log
 
     explore_log(log, list(names), **options)
 

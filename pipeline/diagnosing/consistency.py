@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fuselog.pipeline.api.replays import Replay
+from fuselog.pipeline.output.alarming import unseen
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
-from fuselog.pipeline.output.over_time import nis_over_time
 from fuselog.pipeline.output.results import MetricValue, split_metric
+from fuselog.pipeline.output.summary import nis_over_time
 from fuselog.pipeline.output.words import listed
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.log import Stream, schemas
@@ -20,32 +21,18 @@ from fuselog.replay.judging.metrics.measuring import metric_key
 
 # share of messages in which the truth equals the filter's input, so that both are the same data
 SAME = 0.9
-SEEN = 1.5  # NIS per component below which innovations show no error
 # ratio of mean to root mean square of innovations, above which half of their power is a bias
 BIASED = 0.7
 
 
-def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
+def unseen_errors(done: Replay, *, has_causes: bool) -> Iterator[Finding]:
     """Yield errors that innovations do not show; if causes were found, these may explain the errors."""
     remedy = "estimate a bias as a state, or see fuselog observability LOG"
     if has_causes:
         remedy = "fix the causes above first, then check again"
-    metrics = done.judge.metrics
-    for key, (_, high) in done.judge.bounds.items():
-        _, quantity, case = split_metric(key)
-        nis = metrics.get(metric_key(label, "nis_per_component", case), np.inf)
-        value = metrics[key]
-        if quantity == "nees" and isinstance(value, float) and value > high and nis < SEEN:
-            yield Finding(
-                "unseen error",
-                _truth(case),
-                "",
-                value,
-                f"{case or 'the estimate'}: NEES is {value:.3g} (consistent up to {high:.3g}), but NIS "
-                f"is only {nis:.3g} per component: the state follows an error that the innovations do "
-                "not show",
-                otherwise=remedy,
-            )
+    for each in unseen(done.judge):
+        words = f"{each.case or 'the estimate'}: {each.evidence}"
+        yield Finding("unseen error", _truth(each.case), "", each.nees, words, otherwise=remedy)
 
 
 def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) -> dict[str, str]:

@@ -1,12 +1,17 @@
-"""The Python function for `fuselog explore`: a page with sliders for a filter's parameters."""
+"""The page with sliders for a filter's parameters: the Python function, and `fuselog explore`."""
 
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fuselog.pipeline.api.planning import Log, Named
 from fuselog.pipeline.exploring.session import open_session
+from fuselog.pipeline.output.terminal import say
+from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
 from fuselog.recorders.errors import BadInput
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.timeline import viewer
 
 if TYPE_CHECKING:
@@ -51,3 +56,23 @@ def explore(
     if show and not viewer.in_notebook():
         webbrowser.open(explorer.url)
     return explorer
+
+
+def explore_log(
+    log: Path,
+    names: Sequence[str],
+    *,
+    model: str | None,
+    no_browser: bool,
+    recover: bool,
+    gap_limit_s: float,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Serve the page, print its address, and wait until it is closed."""
+    alterations, own = split_texts(settings)
+    chosen = settings_of_estimators(names, own, settings_file, model=model)
+    source = LogSource(open_log(log, recover=recover))
+    explorer = explore(source, chosen, set=alterations, gap_limit_s=gap_limit_s, show=not no_browser)
+    say(f"exploring {log} at {explorer.url}; close the page or press Ctrl-C to end")
+    explorer.wait()

@@ -1,6 +1,8 @@
 """The page with its sliders, plots and texts, connected to a session. Replays run in the background."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -11,8 +13,6 @@ from bokeh.models import Div, Select, Span
 from bokeh.models import Slider as SliderWidget
 
 from fuselog.pipeline.exploring.curves import instant_of, true_path
-from fuselog.pipeline.exploring.markup import MACROS, SIDE, head_html
-from fuselog.pipeline.exploring.newest import NewestFirst
 from fuselog.pipeline.exploring.plots import (
     PINNED,
     QUIET,
@@ -31,9 +31,12 @@ from fuselog.pipeline.exploring.plots import (
 from fuselog.pipeline.exploring.session import Played, Session
 from fuselog.pipeline.exploring.sliders import Slider
 from fuselog.pipeline.exploring.widgets import (
+    MACROS,
     NONE,
+    SIDE,
     buttons,
     filter_choices,
+    head_html,
     tags_of,
     time_range,
     widget_of,
@@ -46,6 +49,8 @@ WRAP = {"flex-wrap": "wrap"}  # contents that do not fit move below, as on a pho
 # The sliders are to the left of the plots, or below them on narrow screens.
 SIDE_LAST = WRAP | {"flex-direction": "row-reverse", "justify-content": "flex-end"}
 GROW = {"flex": "1 1 350px"}
+
+Work = Callable[[Callable[[], bool]], None]
 
 
 class Page:
@@ -406,3 +411,38 @@ class Page:
     def _later(self, act: Callable[[], object]) -> None:
         """Schedule a change of the page on its own thread."""
         self._document.add_next_tick_callback(act)
+
+
+class NewestFirst:
+    """A thread that does the newest task and drops older ones that have not begun.
+
+    A task receives a function that tests whether a newer task is waiting, so that it can give up. `ask`
+    and `end` must be called from a single thread. At exit, Python waits for the current task, because
+    interrupting a thread in NumPy's C++ code aborts the process.
+    """
+
+    def __init__(self, on_error: Callable[[Exception], None]) -> None:
+        self._pool = ThreadPoolExecutor(1, "fuselog explore")
+        self._newest = 0
+        self._on_error = on_error
+
+    def ask(self, work: Work) -> None:
+        """Do this task next instead of the waiting one; do nothing after `end`."""
+        self._newest += 1
+        with suppress(RuntimeError):  # the worker has ended, or Python is ending
+            self._pool.submit(self._do, work, self._newest)
+
+    def end(self) -> None:
+        """Stop, and let the current task end early."""
+        self._newest += 1
+        self._pool.shutdown(wait=False)
+
+    def _do(self, work: Work, number: int) -> None:
+        def is_newer() -> bool:
+            return self._newest > number
+
+        if not is_newer():
+            try:
+                work(is_newer)
+            except Exception as error:
+                self._on_error(error)

@@ -1,4 +1,4 @@
-"""The sliders, buttons, choices and time axis of the page, as Bokeh widgets."""
+"""The sliders, buttons, choices and time axis of the page as Bokeh widgets, and its texts as HTML."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -8,9 +8,12 @@ from bokeh.layouts import row
 from bokeh.models import Button, Range1d, Select
 from bokeh.models import Slider as SliderWidget
 
-from fuselog.pipeline.exploring.markup import SIDE
-from fuselog.pipeline.exploring.plots import COLOURS
-from fuselog.pipeline.exploring.sliders import STEPS, Slider
+from fuselog.pipeline.exploring.curves import LINES, Case
+from fuselog.pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
+from fuselog.pipeline.exploring.session import LIKELIHOOD, Played, Summary, numbers_of
+from fuselog.pipeline.exploring.sliders import STEPS, Slider, in_words
+from fuselog.pipeline.output.pages import templates
+from fuselog.pipeline.output.words import MINUS, number
 from fuselog.recorders.recording import SIMULATION_EPOCH_NS
 
 NONE = "none"
@@ -33,6 +36,9 @@ view.render = function () {
   this.on_change(this.model.properties.tags, say);
 };
 """
+
+SIDE = 300  # the width of the sliders' column, in pixels
+SLOW_S = 1.0  # a replay that takes longer than this, in s, is reported
 
 
 def widget_of(slider: Slider, value: float) -> Any:
@@ -84,3 +90,51 @@ def buttons(acts: Mapping[str, Callable[[], None]]) -> list[Any]:
         button.on_click(act)
         made.append(button)
     return [row(*made[first : first + A_ROW]) for first in range(0, len(made), A_ROW)]
+
+
+def head_html(
+    labels: Iterable[str], played: Mapping[int | str, Played], case: str, estimated: Mapping[str, Slider]
+) -> str:
+    """Write the text above the plots: verdicts, numbers, and estimates of parameters."""
+    return str(MACROS.head(labels, played, case, estimated, SLOW_S))
+
+
+def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
+    """Describe the final estimates of the parameters that are in a filter's state."""
+    found = []
+    for name, slider in estimated.items():
+        if name in case.beside and len(case.time_s):
+            sigma = float(case.sigma[-1, case.components.index(name)])
+            value = slider.words(float(case.beside[name][-1]))
+            found.append(f"Estimated in the state: {slider.title} is {value} at the end, "
+                         f"±{slider.words(1.96 * sigma)} (95 %).")  # fmt: skip
+    return found
+
+
+def _numbers_of(played: Played | None, case: str) -> Mapping[str, tuple[float, str]]:
+    return numbers_of(played.cases[case]) if played and case in played.cases else {}
+
+
+def _with_unit(name: str, value: float, unit: str) -> str:
+    if name == LIKELIHOOD:
+        return f"{value:,.0f}".replace("-", MINUS)
+    return in_words(value, unit) if unit else number(value)
+
+
+_KNOWN = {
+    "width": SIDE - 20,
+    "colours": COLOURS,
+    "quiet": QUIET,
+    "red": RED,
+    "pinned": PINNED,
+    "most": LINES,
+    "no_estimates": Summary("failed", "The filter returned no estimates.", ""),
+}
+
+
+_FILTERS = {"in_the_state": in_the_state, "numbers_of": _numbers_of, "with_unit": _with_unit}
+
+
+MACROS: Any = (
+    templates("fuselog.pipeline.exploring", _FILTERS).get_template("markup.html", None, _KNOWN).module
+)

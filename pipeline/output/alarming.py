@@ -36,6 +36,8 @@ REASONS = {
     Consistency.CONSERVATIVE: "its covariances are too large",
     Consistency.CONSISTENT: f"its covariances are off by less than {MATERIAL:.0%}".replace("%", " %"),
 }
+SEEN = 1.5  # NIS per component from which innovations show an error
+UNSEEN = 2.0  # ratio of normalised squared errors to innovations from which the error is material
 UNUSED = 0.05  # share of a topic's messages; if more are unused, there is a warning
 
 
@@ -63,6 +65,35 @@ class _Range(NamedTuple):
     def reason(self) -> str:
         """Return what the value means for the estimator."""
         return OF_DIVERGENCE if self.of.has_diverged else REASONS[self.of.verdict]
+
+
+class Unseen(NamedTuple):
+    """An error of an estimator, such as a slowly changing bias, that its innovations do not show."""
+
+    estimator: str
+    case: str
+    nees: float
+    evidence: str
+
+    @property
+    def name(self) -> str:
+        """Return the estimator and the case."""
+        return _name(self.estimator, self.case)
+
+
+def unseen(judge: Judge) -> Iterator[Unseen]:
+    """Find errors that innovations do not show: the NEES is too large, also relative to a usual NIS."""
+    for key, (_, high) in judge.bounds.items():
+        estimator, quantity, case = split_metric(key)
+        nees, nis = judge.metrics[key], judge.metrics.get(metric_key(estimator, NIS, case), np.inf)
+        if quantity != "nees" or nees <= high or nis >= SEEN:
+            continue
+        if nees > UNSEEN * nis * judge.squares(estimator, quantity, case).aim:
+            evidence = (
+                f"NEES is {nees:.3g} (consistent up to {high:.3g}), but NIS is only {nis:.3g} per "
+                "component: the state follows an error that the innovations do not show"
+            )
+            yield Unseen(estimator, case, nees, evidence)
 
 
 def alarms_of(

@@ -315,8 +315,10 @@ class Stress:
 
         Raises BadInput if the file cannot be written.
         """
-        from fuselog.replay.timeline.fanning import Fan  # slow to import
-        from fuselog.replay.timeline.show import Drawing
+        from fuselog.replay.timeline.show import (
+            Drawing,
+            Fan,  # slow to import
+        )
 
         check_files([(Path(save), TIMELINE)], {})
         source, outputs, fans = self.stressed[0].source, dict[str, Stream](), list[Fan]()

@@ -1,7 +1,6 @@
 """Presentation of a tuning's result: tables, figures, notes, settings, result folder."""
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,9 +16,10 @@ from fuselog.pipeline.altering.sources import setting_of
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.replays import Replay, replay
 from fuselog.pipeline.optimise import DROP_95, QUANTILE
+from fuselog.pipeline.output.alarming import unseen
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, level
 from fuselog.pipeline.output.outputs import check_folder
-from fuselog.pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
 from fuselog.pipeline.output.summary import summarise, summary_table
 from fuselog.pipeline.output.words import label_of
 from fuselog.pipeline.tuning.confidence import Profile, SearchOutcome, doubts, profiles
@@ -27,7 +27,6 @@ from fuselog.pipeline.tuning.objective import Objective, innovations_in
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
 from fuselog.replay.judging.errors.evaluation import split_topic
-from fuselog.replay.judging.metrics.measuring import metric_key
 from fuselog.replay.judging.tables import joined
 
 Floats = NDArray[np.float64]
@@ -288,22 +287,12 @@ class Tuning:
     def _notes_of_truth(self) -> Iterator[str]:
         """Report large errors, such as a slowly changing bias, that the innovations do not show."""
         for replayed in self.replays:
-            metrics = replayed.judge.metrics
-            for key, (_, high) in replayed.judge.bounds.items():
-                label, quantity, case = split_metric(key)
-                nis = metrics.get(metric_key(label, "nis_per_component", case), math.inf)
-                if (
-                    quantity != "nees"
-                    or label.startswith(START)
-                    or metrics[key] < max(1, 2 * nis) * high
-                ):
-                    continue
-                what = " ".join(filter(None, (label, case)))
-                yield (
-                    f"{what}: NEES is {metrics[key]:.3g} (consistent up to {high:.3g}), but NIS is only "
-                    f"{nis:.3g} per component: innovations do not show slowly changing errors, such as "
-                    "a sensor's bias; estimate such errors as states"
-                )
+            for each in unseen(replayed.judge):
+                if not each.estimator.startswith(START):
+                    yield (
+                        f"{each.name}: {each.evidence}; estimate slowly changing errors, such as a "
+                        "sensor's bias, as states"
+                    )
 
     def _notes_of_others(self) -> Iterator[str]:
         """Report whether the tuned values also explain logs outside the search better."""

@@ -22,12 +22,10 @@ from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.engine.streams.results import failures_by_run
 from fuselog.replay.foreign.description import Description, ForeignParameters
-from fuselog.replay.foreign.files.estimates import read_estimates
-from fuselog.replay.foreign.files.tables import write_tables
+from fuselog.replay.foreign.files.estimates import read_estimates, write_tables
 from fuselog.replay.foreign.filters import bind_all, bind_apart, unspecified
 from fuselog.replay.foreign.naming import split_command, what_runs
-from fuselog.replay.foreign.processes.isolation import Ended, Limits, Ran, in_threads
-from fuselog.replay.foreign.processes.process import Program
+from fuselog.replay.foreign.processes.isolation import Ended, Limits, Program, Ran, in_threads
 from fuselog.replay.foreign.processes.streaming import describe_stream, follow_runs_streaming
 from fuselog.replay.foreign.processes.tasks import RunGiven
 

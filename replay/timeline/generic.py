@@ -5,7 +5,7 @@ fixes, poses, and landmarks with their measurements. The measurements of a senso
 and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to these views.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import cycle
 
@@ -17,7 +17,6 @@ from fuselog.recorders.log import Field, Stream, schemas
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.replay.engine.streams.geodetic import stated_origin
 from fuselog.replay.judging.errors.evaluation import Floats
-from fuselog.replay.timeline.drawing.about import draw_about
 from fuselog.replay.timeline.drawing.canvas import (
     PALETTE,
     Board,
@@ -30,18 +29,22 @@ from fuselog.replay.timeline.drawing.canvas import (
     entity_path,
     thin,
 )
-from fuselog.replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events
+from fuselog.replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events, draw_registered
 from fuselog.replay.timeline.drawing.geodetic import degrees_of, draw_fixes, draw_way, map_view
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_clouds,
     draw_dots,
+    draw_lines,
     draw_path,
     draw_points,
     draw_poses,
+    draw_scans,
+    draw_triads,
     extent_of,
     plane_view,
+    space_view,
     turn_up,
     with_legend,
 )
@@ -56,8 +59,6 @@ from fuselog.replay.timeline.drawing.plots import (
     plot_view,
     shown_unit,
 )
-from fuselog.replay.timeline.drawing.registered import draw_registered
-from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 from fuselog.replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
 from fuselog.replay.timeline.landmarks import (
     ARROW_SHARE,
@@ -72,6 +73,10 @@ FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name
 GEODETIC, ORIENTATION = schemas.GEODETIC_FIX.full_name, schemas.ORIENTATION.full_name
 ANGLES = ("roll", "pitch", "yaw")
+
+# Length of a ray without a range, and number of vertices of a circle.
+RAY_M = 1.0
+CORNERS = 49
 
 
 def draw(canvas: Canvas, scene: Scene) -> Board:
@@ -273,3 +278,47 @@ def _name(stream: Stream, case: str) -> str:
 
 
 TIMELINE = Timeline(draw)
+
+
+def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DView]:
+    """Draw measurements around a sensor, if they have positions in the plane; return the view."""
+    if stream.schema.full_name == schemas.DETECTION.full_name:
+        seen = stream["position_m"][:, :2]
+        if seen.shape[1] == 2:
+            draw_scans(canvas, f"{root}/detections", stream.publish_time_ns, seen, PALETTE[0], 3.0)
+    elif stream.schema.full_name in _SHAPES:
+        shapes = _SHAPES[stream.schema.full_name](stream)
+        good = np.isfinite(shapes).all(axis=(1, 2))
+        colours = np.array([(*colour, 255) for colour in PALETTE], np.uint8)
+        of_target = colours[stream["target_id"] % len(PALETTE)]
+        draw_lines(canvas, f"{root}/seen", stream.publish_time_ns[good], shapes[good], of_target[good])
+        seen = shapes[good].reshape(-1, 2)
+    else:
+        return []
+    if seen.size == 0:
+        return []
+    places = np.concatenate([seen, np.zeros((1, 2))])
+    return [plane_view(canvas, root, [], [], places, name="About the sensor")]
+
+
+def _circles(stream: Stream) -> Floats:
+    """Return the circles (n, corners, 2) of possible target positions at the measured ranges."""
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return stream["range_m"][:, None, None] * around
+
+
+def _rays(angle_rad: Floats, length_m: Floats | float) -> Floats:
+    """Return lines (n, 2, 2) from the sensor at these angles (n,)."""
+    ends = np.stack([length_m * np.cos(angle_rad), length_m * np.sin(angle_rad)], axis=1)
+    return np.stack([np.zeros_like(ends), ends], axis=1)
+
+
+_SHAPES: dict[str, Callable[[Stream], Floats]] = {
+    schemas.RANGE.full_name: _circles,
+    schemas.BEARING.full_name: lambda seen: _rays(seen["bearing_rad"], RAY_M),
+    schemas.RANGE_BEARING.full_name: lambda seen: _rays(seen["bearing_rad"], seen["range_m"]),
+    schemas.LINE_OF_SIGHT.full_name: lambda seen: _rays(
+        seen["azimuth_rad"], RAY_M * np.cos(seen["elevation_rad"])
+    ),
+}

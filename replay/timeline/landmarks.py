@@ -23,7 +23,7 @@ from fuselog.replay.timeline.drawing.canvas import (
     entity_path,
     thin,
 )
-from fuselog.replay.timeline.drawing.events import above_events, draw_events
+from fuselog.replay.timeline.drawing.events import above_events, draw_events, draw_registered
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
     TRUE,
@@ -44,7 +44,6 @@ from fuselog.replay.timeline.drawing.plane import (
     with_legend,
 )
 from fuselog.replay.timeline.drawing.plots import draw_quality
-from fuselog.replay.timeline.drawing.registered import draw_registered
 
 HEADING = "heading_rad"
 # Length of an arrow as a fraction of the scene.

@@ -4,13 +4,15 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun.chunk as rc
 
 from fuselog.recorders.errors import BadInput, choices, printable
 from fuselog.recorders.log import Stream, schemas
@@ -18,18 +20,58 @@ from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.divergence import Divergence, find_divergence
-from fuselog.replay.judging.errors.evaluation import Errors, errors_at
-from fuselog.replay.judging.errors.moments import Moments
-from fuselog.replay.timeline.drawing.canvas import ABOUT, DRAWN_ROWS, Canvas, Scene, Timeline
+from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
+from fuselog.replay.judging.errors.moments import Moment, Moments, worst_of
+from fuselog.replay.timeline.drawing.canvas import (
+    ABOUT,
+    DRAWN_ROWS,
+    PALETTE,
+    Board,
+    Canvas,
+    Scene,
+    Timeline,
+    Times,
+    entity_path,
+)
+from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
-from fuselog.replay.timeline.fanning import Fan, draw_fans
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
-from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
 from fuselog.replay.timeline.sinks import open_recording
 
 # Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
+
+WORST = "worst"
+_ENTITY = "moments"  # of the worst moments, for the cursor of the viewer
+
+
+class Fan(NamedTuple):
+    """Distances between one copy and its estimate.
+
+    Attributes:
+        estimate: the original estimate; the copies of one estimate share a plot.
+        copy: name of the copy.
+        time_ns: (n,) stamps.
+        sigmas: (n,) distance in standard deviations of the estimate.
+    """
+
+    estimate: str
+    copy: str
+    time_ns: Times
+    sigmas: Floats
+
+
+def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
+    """Return the layout with a plot below it for each estimate that has copies."""
+    plots = []
+    for estimate in dict.fromkeys(fan.estimate for fan in fans):
+        plot = entity_path("plots", "stress", estimate)
+        own = [fan for fan in fans if fan.estimate == estimate]
+        for fan, colour in zip(own, cycle(PALETTE), strict=False):
+            draw_curve(canvas, plot, fan.copy, colour, fan.time_ns, fan.sigmas, LINE)
+        plots.append(plot_view(plot, f"{estimate}: distance of each copy", "sigma"))
+    return rrb.Vertical(layout, rrb.Tabs(*plots), row_shares=[4.0, 1.0])
 
 
 class Drawing:
@@ -235,3 +277,39 @@ def _identity(outputs: Mapping[str, Stream]) -> str:
         for column in (stream.publish_time_ns, *stream.columns.values()):
             digest.update(np.ascontiguousarray(column).tobytes())
     return digest.hexdigest()
+
+
+def keep_moments(recording: rr.RecordingStream, moments: Sequence[Moment]) -> None:
+    """Log moments as a table in the timeline, with a column for each field."""
+    if moments:
+        columns: dict[str, Any] = {
+            name: [getattr(each, name) for each in moments] for name in Moment._fields
+        }
+        recording.log(_ENTITY, rr.AnyValues(**columns), static=True, strict=True)
+
+
+def read_moments(rrd: Path) -> list[Moment]:
+    """Read the moments stored in a timeline; empty if the timeline has no errors."""
+    for chunk in rc.RrdReader(str(rrd)).stream().filter(content=f"/{_ENTITY}", is_static=True):
+        batch = chunk.to_record_batch()
+        columns = [batch.column(name).to_pylist()[0] for name in Moment._fields]
+        return [Moment(*row) for row in zip(*columns, strict=True)]
+    return []
+
+
+def worst_at(moments: Sequence[Moment], at: str) -> Moment:
+    """Return the moment that `worst` or `worst:ESTIMATOR` selects.
+
+    Raises BadInput if there are no errors, or no errors of this estimator.
+    """
+    estimator = at.partition(":")[2]
+    if not moments:
+        raise BadInput(
+            f"--at {at}: the timeline has no errors of estimates; give seconds, such as --at 30"
+        )
+    known = list(dict.fromkeys(moment.estimator for moment in moments))
+    if estimator and estimator not in known:
+        raise BadInput(f"--at {at}: no estimator with this name has errors; {choices(estimator, known)}")
+    found = worst_of(each for each in moments if estimator in ("", each.estimator))
+    assert found is not None
+    return found

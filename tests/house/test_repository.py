@@ -229,7 +229,7 @@ def test_processes_are_started_in_known_places() -> None:
         ("recorders/processes.py", "Popen"),
         ("replay/foreign/processes/isolation.py", "start_module"),
         ("replay/foreign/processes/orphans.py", "start_module"),
-        ("replay/foreign/processes/process.py", "Popen"),  # a program that the user names
+        ("replay/foreign/processes/isolation.py", "Popen"),  # a program that the user names
         ("recorders/compiling/trial.py", "start_module"),
         ("replay/timeline/viewer.py", "start_module"),
     }

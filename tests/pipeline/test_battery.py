@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import fuselog as fl
 from fuselog.pipeline.altering.sources import alter
-from fuselog.pipeline.diagnosing import portion
+from fuselog.pipeline.diagnosing import diagnosis
 from fuselog.pipeline.diagnosing.battery import battery, consistent, together
 from fuselog.pipeline.diagnosing.battery import car as battery_car
 from fuselog.pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
@@ -534,7 +534,7 @@ def test_causes_of_a_part_are_tried_on_the_rest(monkeypatch: pytest.MonkeyPatch)
     car = drive(SEED)
     turn = car.turn_radps + np.where(car.odometry_s < 50.0, 0.03, 0.0)
     log = recorded(car._replace(turn_radps=turn), has_compass=False, has_prior=True)
-    monkeypatch.setattr(portion, "MOST_MESSAGES", 600)
+    monkeypatch.setattr(diagnosis, "MOST_MESSAGES", 600)
     found = fl.diagnose(log, "ekf", set={"gate_probability": 1.0})
     words = found.sentences[0].sentence
     assert "turn_radps is too large by 0.0" in words

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from fuselog.pipeline.altering import sources as altering
 from fuselog.pipeline.diagnosing import diagnosis, study
 from fuselog.pipeline.diagnosing import likelihood as trials_of
 from fuselog.pipeline.diagnosing.causes import Sought, find_causes, least_gain
-from fuselog.pipeline.diagnosing.consistency import of_each_component
+from fuselog.pipeline.diagnosing.consistency import of_each_component, unseen_errors
 from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
@@ -27,6 +28,7 @@ from fuselog.pipeline.diagnosing.search import Gains, Peak, peak
 from fuselog.pipeline.diagnosing.sentences import cause_of
 from fuselog.pipeline.optimise import end, side_by_side
 from fuselog.pipeline.runs.trials import Trial
+from fuselog.pipeline.tuning.outcome import Tuning
 from fuselog.recorders.checks.lint import lint
 from fuselog.replay.engine.replaying.estimator import bind
 from tests.claims.pages import stored
@@ -567,6 +569,21 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert any(note.startswith("no truth: errors and NEES are missing") for note in found.notes)
     assert any(note.startswith("there is only one run") for note in fl.diagnose(run, "ekf").notes)
+
+
+@pytest.mark.parametrize(("bias_rad", "sides"), [(0.0, 0), (0.006, 1)])
+def test_diagnose_and_tune_agree_on_errors_that_innovations_do_not_show(
+    bias_rad: float, sides: int
+) -> None:
+    """A small bias, where NEES is 4 times what is expected, and NIS 1.08: both say the same."""
+    seen = {"range_bearing": {"bias_bearing_rad": bias_rad}}
+    done = fl.replay(fl.record("landmarks", seed=7, duration_s=20.0, **seen), {"tuned": {"kind": "ekf"}})
+    made: Any = SimpleNamespace(replays=[done])
+    tuned, told = [*Tuning._notes_of_truth(made)], [*unseen_errors(done, has_causes=False)]
+    assert len(tuned) == len(told) == sides
+    for note, each in zip(tuned, told, strict=True):
+        evidence = each.sentence.removesuffix(f"; {each.otherwise}")
+        assert note.startswith(f"tuned {evidence}; ")
 
 
 def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:

@@ -23,9 +23,8 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.exploring.curves import BIN_S, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.curves import Path as Track
-from fuselog.pipeline.exploring.newest import NewestFirst
-from fuselog.pipeline.exploring.session import Session, open_session
-from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.pipeline.exploring.page import NewestFirst
+from fuselog.pipeline.exploring.session import Session, numbers_of, open_session
 from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.results import Result
 from fuselog.recorders.errors import BadInput
@@ -299,7 +298,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     assert "Overconfident." in page._head.text
     assert "pinned" in page._head.text
     for slow_s, is_said in ((1e9, False), (0.0, True)):
-        monkeypatch.setattr("fuselog.pipeline.exploring.markup.SLOW_S", slow_s)
+        monkeypatch.setattr("fuselog.pipeline.exploring.widgets.SLOW_S", slow_s)
         page._show_head()
         assert ("One replay takes" in page._head.text) == is_said
     assert "--set sigma_range_m=0.03" in page._command.text

@@ -11,9 +11,8 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.diagnosing.hypotheses.parameters import STEPS
 from fuselog.pipeline.exploring.curves import LINES, extremes, fewer, typical_time_s
-from fuselog.pipeline.exploring.session import open_session
+from fuselog.pipeline.exploring.session import open_session, verdict_of
 from fuselog.pipeline.exploring.sliders import FACTOR, REACH, Slider, _slider, in_words, setting_text
-from fuselog.pipeline.exploring.verdict import verdict_of
 from fuselog.pipeline.output.words import quantity
 from fuselog.pipeline.sensing.preparing import _STILL
 from fuselog.recorders.checks.finding import Finding

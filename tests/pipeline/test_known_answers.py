@@ -20,7 +20,7 @@ from scipy.stats import chi2, norm, t
 import fuselog as fl
 from fuselog.pipeline.diagnosing.consistency import nis_charts
 from fuselog.pipeline.exploring.curves import BIN_S, cases_of
-from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.pipeline.exploring.session import numbers_of
 from fuselog.pipeline.output.terminal import print_metrics, print_pose_errors
 from fuselog.recorders.log import RunMetadata
 from fuselog.replay.engine.streams.blocks import gather

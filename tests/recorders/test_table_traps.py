@@ -15,7 +15,7 @@ import pytest
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.tables.files import open_table
-from fuselog.recorders.importers.tables.patterns import fitted, names_in
+from fuselog.recorders.importers.tables.mapping import fitted, names_in
 
 
 @pytest.mark.paper

@@ -13,8 +13,7 @@ from pyulog import ULog
 import fuselog as fl
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.ulog.file import MAGIC, UlogFile
-from fuselog.recorders.importers.ulog.importer import ULOG, UlogParameters
-from fuselog.recorders.importers.ulog.settings import carried, stated_noise
+from fuselog.recorders.importers.ulog.importer import ULOG, UlogParameters, carried, stated_noise
 from fuselog.recorders.models.orientation import rotate
 from tests.goldens import keeping, numbers
 

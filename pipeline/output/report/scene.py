@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, Series, path, thinned
-from fuselog.pipeline.output.over_time import nis_over_time, panel_over_time
 from fuselog.pipeline.output.report.first_run import (
     MOST_RUNS,
     PLANE,
@@ -16,6 +15,7 @@ from fuselog.pipeline.output.report.first_run import (
     Followed,
     innovations_of_runs,
 )
+from fuselog.pipeline.output.summary import nis_over_time, panel_over_time
 from fuselog.pipeline.output.words import count
 from fuselog.recorders.log import open_log, read_streams, schemas, topics_of
 from fuselog.replay.engine import chi2

@@ -33,16 +33,17 @@ from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.importers.tables.blocks import (
     BLOCK_BYTES,
     Chunks,
+    Tagged,
     blocks_of,
     delimited,
     joined,
     lines_of,
+    tagged_of,
     utf8,
     without,
 )
 from fuselog.recorders.importers.tables.layout import Layout, layout_of
 from fuselog.recorders.importers.tables.npz import columns_of
-from fuselog.recorders.importers.tables.tagged import Tagged, tagged_of
 from fuselog.recorders.parsing import DEEPEST
 from fuselog.recorders.trajectories import NO_END, read_trajectory
 

@@ -27,16 +27,18 @@ from fuselog.recorders.importers.tables.columns import (
 )
 from fuselog.recorders.importers.tables.files import Batch
 from fuselog.recorders.importers.tables.layout import MISSING, NUMBER
-from fuselog.recorders.importers.tables.order import Order, is_reversed, rollover_of
 from fuselog.recorders.importers.tables.times import (
     DIGITS,
     ISO,
     OWN_OFFSET,
     ZONED,
+    Order,
     TimeMapping,
     Undecided,
     formats_of,
+    is_reversed,
     offset_of,
+    rollover_of,
     stamps_ns,
     texts_of,
 )

@@ -8,7 +8,10 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps
+from fuselog.recorders.importers.tables.blocks import COMMENTS, lines_of
 from fuselog.recorders.importers.tables.cells import sided
 from fuselog.recorders.importers.tables.column_streams import GUESSES, true_columns, truth_lines
 from fuselog.recorders.importers.tables.columns import (
@@ -24,18 +28,25 @@ from fuselog.recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
     bracketed,
+    known_of,
     names_of,
     parted,
     stream_lines,
     underlined,
     unit_in,
 )
-from fuselog.recorders.importers.tables.devices import of_device
-from fuselog.recorders.importers.tables.exports import export_mapping
-from fuselog.recorders.importers.tables.files import Batch, Table, TextOptions, floats, open_table
-from fuselog.recorders.importers.tables.guessed_folders import Source, sources_of, stamps_in
+from fuselog.recorders.importers.tables.files import (
+    VBOX_UNITS,
+    Batch,
+    Table,
+    TextOptions,
+    floats,
+    open_table,
+    open_text,
+)
 from fuselog.recorders.importers.tables.guessed_places import prepared_lines, without_codes
 from fuselog.recorders.importers.tables.guessed_times import GuessedTime, first_cell, guess_time
+from fuselog.recorders.log import Schema, schemas
 
 # How many rows are read.
 _ROWS = 100_000
@@ -67,6 +78,98 @@ _STAMP = "timestamp"
 _NOT_TAKEN = "# not taken: "
 # Reasons of a guess that leave no doubt.
 _SURE = ("as its name says", "which agrees with the positions")
+
+# The smallest number of one-row files that are treated as one table.
+_FEWEST_ROWS = 3
+_TEXTS = {".txt", ".csv", ".tsv", ".dat"}
+
+# The counter of Xsens, and the sample rates at which it is in us, as in a DOT; otherwise it is in 0.1
+# ms.
+_XSENS, _DOT_RATES_HZ = "SampleTimeFine", np.array([1, 4, 10, 12, 15, 20, 30, 60, 120])
+# Names of columns in tables of a VBOX.
+_VBOX = (
+    {"sats", "time", "lat", "long", "velocity", "heading", "height"},
+    {"satellites", "time", "latitude", "longitude", "velocity", "heading", "height"},
+)
+# An inertial unit of ArduPilot, with axes forward, right, down.
+_ARDUPILOT = ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
+# The largest latitude in deg, and in minutes.
+_LARGEST_LATITUDE = (90.0, 5400.0)
+
+_CLOCKS = ("publish_time_ns", "log_time_ns", "sensor_time_ns")
+_NAMED_VECTORS = ("value", "state", "mean")
+
+
+class Source(NamedTuple):
+    """The files of one table.
+
+    Attributes:
+        path: the first file.
+        name: pattern of the names of all files.
+        more: the files whose rows follow.
+        stamps: the file with the times of the rows, and its name relative to the folder.
+        columns: names of the columns from another file.
+    """
+
+    path: Path
+    name: str
+    more: tuple[Path, ...] = ()
+    stamps: tuple[Path, str] | None = None
+    columns: tuple[str, ...] = ()
+
+
+def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
+    """Group files with their names into tables; the one-row files of a folder are one table."""
+    groups: dict[tuple[Path, str], list[tuple[Path, str]]] = {}
+    for path, name in files:
+        if path.suffix.lower() in _TEXTS and re.fullmatch(r"\D*\d+", path.stem):
+            groups.setdefault((path.parent, path.suffix), []).append((path, name))
+    joined = []
+    taken: set[Path] = set()
+    for (_, suffix), group in groups.items():
+        if len(group) < _FEWEST_ROWS or any(_count(path, 2) != 1 for path, _ in (group[0], group[-1])):
+            continue
+        others = [each for each in files if each not in group and each[0].suffix.lower() in _TEXTS]
+        stamps = next((each for each in others if _count(each[0], len(group) + 1) == len(group)), None)
+        columns, said_by = _columns(group[0][0], [path for path, _ in others])
+        taken |= {path for path, _ in group} | ({stamps[0]} if stamps else set()) | said_by
+        folder = group[0][1].rpartition("/")[0]
+        pattern = f"{folder}/*{suffix}" if folder else f"*{suffix}"
+        more = tuple(path for path, _ in group[1:])
+        joined.append(Source(group[0][0], pattern, more, stamps, columns))
+    return [*joined, *(Source(path, name) for path, name in files if path not in taken)]
+
+
+def stamps_in(path: Path) -> list[str]:
+    """Read the lines of a file of times, except blank ones."""
+    with open_text(path) as file:
+        lines = [line.decode("utf-8", "replace").strip() for line in lines_of(file)]
+    return [line for line in lines if line]
+
+
+def _count(path: Path, most: int) -> int:
+    """Count the rows of a text, up to `most`; 0 if it cannot be read."""
+    try:
+        with open_text(path) as file:
+            rows = (line for line in lines_of(file) if line.strip() and not line.startswith(COMMENTS))
+            return sum(1 for _ in islice(rows, most))
+    except (OSError, ValueError):
+        return 0
+
+
+def _columns(first: Path, others: Sequence[Path]) -> tuple[tuple[str, ...], set[Path]]:
+    """Find a file that lists columns as lines `name: meaning`; return the names and the file."""
+    width = len(stamps_in(first)[0].replace(",", " ").split())
+    for path in others:
+        try:
+            named = [
+                re.match(r"\s*([A-Za-z]\w*)\s*:", line) for line in islice(stamps_in(path), width + 1)
+            ]
+        except (OSError, ValueError, BadInput):
+            continue
+        if len(named) == width and all(named):
+            return tuple(each[1] for each in named if each), {path}
+    return (), set()
 
 
 def guess(paths: Sequence[Path]) -> str:
@@ -446,3 +549,80 @@ def _rest(table: GuessedTable) -> list[str]:
         f"fields.value = {names_of(table.columns)}",
         f'components = "{",".join(names)}"',
     )
+
+
+def of_device(columns: list[GuessedColumn]) -> list[GuessedColumn]:
+    """Add the units and axes of known devices to columns."""
+    units = {}
+    by_name = {column.name: column for column in columns}
+    if by_name.keys() >= {*_ARDUPILOT} and np.nanmedian(by_name[_ARDUPILOT[-1]].values) < 0:
+        columns = [
+            each._replace(frame="ned") if each.name in _ARDUPILOT[1:] else each for each in columns
+        ]
+    for column in columns:
+        if column.name == _XSENS:
+            steps = np.abs(np.diff(known_of(column)))
+            rate_hz = 1e6 / np.median(steps) if steps.any() else 0.0
+            units[column.name] = (
+                "us" if np.isclose(rate_hz, _DOT_RATES_HZ, rtol=0.01).any() else "0.1 ms"
+            )
+    plain = {column.plain: column for column in columns}
+    if any(names <= plain.keys() for names in _VBOX):
+        latitude = plain.get("lat") or plain["latitude"]
+        if _LARGEST_LATITUDE[0] < np.nanmax(np.abs(latitude.values)) <= _LARGEST_LATITUDE[1]:
+            of_vbox = {name: each for name, each in plain.items() if name in VBOX_UNITS}
+            units |= {each.name: each.unit or VBOX_UNITS[name] for name, each in of_vbox.items()}
+    return [each._replace(unit=units.get(each.name, each.unit)) for each in columns]
+
+
+def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str]:
+    """Write the lines of an exported table's mapping after `files`; empty for other tables."""
+    if tuple(columns[:3]) != _CLOCKS:
+        return []
+    fitting = [
+        (schema, fields)
+        for schema in schemas.SCHEMAS.values()
+        if (fields := _fields(schema, columns[3:])) is not None
+    ]
+    if not fitting:
+        return []
+    topic = "/" + unquote(path.name.partition(".")[0]).replace("-", "/")
+    name = topic.replace("_", "").lower()
+    fitting.sort(key=lambda each: (list(each[1].values()).count([]), each[0].name.lower() not in name))
+    schema, fields = fitting[0]
+    times = [f'time = {{ column = "{_CLOCKS[0]}", unit = "ns", order = "any" }}']
+    for name, clock in (("arrival", _CLOCKS[1]), ("sensor", _CLOCKS[2])):
+        if not batch[clock].equals(batch[_CLOCKS[0]]):
+            times.append(f'{name} = {{ column = "{clock}", unit = "ns", order = "any" }}')
+    lines = []
+    for name, given in fields.items():
+        lines.append(f"fields.{name} = {json.dumps(given)}")
+        components = [each.removeprefix(f"{name}_") for each in given] if isinstance(given, list) else []
+        if name in _NAMED_VECTORS and components and not components[0].isdecimal():
+            lines.append(f'components = "{",".join(components)}"')
+            lines.append(f'kinds = "{",".join(map(_kind, components))}"')
+    return [*times, *stream_lines(topic, schema.name, "the columns are those of fuselog export", *lines)]
+
+
+def _fields(schema: Schema, columns: Sequence[str]) -> dict[str, str | list[str]] | None:
+    """Assign columns to the fields of a message; None if a field or a column is left over."""
+    found: dict[str, str | list[str]] = {}
+    left = list(columns)
+    for entry in sorted(list(schema)[1:], key=lambda each: -len(each.name)):
+        if entry.kind == "vector":
+            own = [name for name in left if name.startswith(f"{entry.name}_")]
+            found[entry.name] = own
+        else:
+            own = [name for name in left if name == entry.name]
+            if own:
+                found[entry.name] = own[0]
+        if not own and not entry.may_be_absent and entry.kind != "vector":
+            return None
+        left = [name for name in left if name not in own]
+    return None if left else {entry.name: found[entry.name] for entry in schema if entry.name in found}
+
+
+def _kind(component: str) -> str:
+    if re.fullmatch(r"(.*_)?orientation_[wxyz]", component):
+        return "quaternion"
+    return "angle" if component.endswith("_rad") else "linear"

@@ -39,12 +39,13 @@ from fuselog.recorders.importers.tables.files import (
     open_text,
 )
 from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
-from fuselog.recorders.importers.tables.order import Order, is_reversed
 from fuselog.recorders.importers.tables.plane import Plane
 from fuselog.recorders.importers.tables.times import (
     REMEDY,
+    Order,
     Reading,
     TimeMapping,
+    is_reversed,
     read_counter,
     stamps_ns,
 )

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.importers.ulog.file import Rows
-from fuselog.recorders.importers.ulog.frames import orientations, to_enu
-from fuselog.recorders.importers.ulog.sensors import BODY, Fields, Part
+from fuselog.recorders.importers.ulog.sensors import BODY, Fields, Part, orientations, to_enu
 from fuselog.recorders.log import schemas
 from fuselog.recorders.models.orientation import conjugate, left_matrix, rotate
 from fuselog.recorders.models.states import NAVIGATION, state_metadata

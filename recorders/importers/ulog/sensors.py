@@ -1,4 +1,7 @@
-"""Conversion of the topics of sensors, with one function for each topic."""
+"""Conversion of the topics of sensors, with one function for each topic.
+
+Vectors are rotated from NED to ENU, or in the body from FRD to FLU (forward, left, up).
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -8,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.importers.ulog.file import Rows
-from fuselog.recorders.importers.ulog.frames import to_enu, to_flu
 from fuselog.recorders.log import Schema, schemas
+from fuselog.recorders.models.orientation import compose
 
 Floats = NDArray[np.float64]
 BODY = "/vehicle"
@@ -19,6 +22,11 @@ _FIELD = ("field_x_ut", "field_y_ut", "field_z_ut")
 _INVALID_US = 2**31 - 1
 # The largest difference between heights above the ellipsoid and above the sea.
 FARTHEST_M = 150.0
+
+# The rotation from north, east, down to east, north, up: half a turn about north-east.
+_TO_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+# The rotation from forward, left, up to forward, right, down: half a turn about the forward axis.
+_FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -292,3 +300,18 @@ SENSORS: dict[str, Callable[[Fields], Iterator[Part]]] = {
     "optical_flow": flow,
     "distance_sensor": distance,
 }
+
+
+def to_enu(vectors: Floats) -> Floats:
+    """Convert vectors (n, 3) from north, east, down to east, north, up."""
+    return vectors[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+def to_flu(vectors: Floats) -> Floats:
+    """Convert vectors (n, 3) from forward, right, down to forward, left, up."""
+    return vectors * [1.0, -1.0, -1.0]
+
+
+def orientations(quaternions: Floats) -> Floats:
+    """Convert rotations (n, 4; w, x, y, z) from a body's FRD to NED into those from its FLU to ENU."""
+    return compose(compose(np.broadcast_to(_TO_ENU, quaternions.shape), quaternions), _FROM_FLU)

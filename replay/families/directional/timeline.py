@@ -34,9 +34,8 @@ from fuselog.replay.timeline.drawing.canvas import (
     thin,
 )
 from fuselog.replay.timeline.drawing.events import Happened, above_events, draw_events
-from fuselog.replay.timeline.drawing.plane import GRID, Stroke, with_legend
+from fuselog.replay.timeline.drawing.plane import GRID, Stroke, draw_triads, space_view, with_legend
 from fuselog.replay.timeline.drawing.plots import draw_quality
-from fuselog.replay.timeline.drawing.space import draw_triads, space_view
 
 QUATERNION = COMPONENTS[:4]
 # Images and outlines are large, so fewer of them are drawn.

@@ -1,6 +1,6 @@
-"""Reading of the estimates that a program wrote: MCAP, TUM, or CSV with covariances."""
+"""Tables for a program, and reading of the estimates that it wrote: MCAP, TUM, or CSV."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -131,3 +131,24 @@ def _components(names: list[str], truth: Topic | None) -> Components:
                 f"it has {', '.join(stated)}"
             )
     return {name: stated[name] for name in names}
+
+
+def write_tables(folder: Path, streams: Sequence[Stream]) -> None:
+    """Write each topic to a file such as `robot1-odometry.csv`, with `time_ns` and all fields.
+
+    A vector has a column for each number, `position_m_0` and so on. The metadata of the channel is in
+    `robot1-odometry.json`.
+    """
+    folder.mkdir()
+    for stream in streams:
+        columns = {"time_ns": stream.publish_time_ns}
+        for field in stream.schema:
+            values = stream[field.name]
+            if values.ndim == 1:
+                columns[field.name] = values
+            else:
+                columns |= {f"{field.name}_{place}": column for place, column in enumerate(values.T)}
+        name = stream.topic.strip("/").replace("/", "-")
+        pd.DataFrame(columns).to_csv(folder / f"{name}.csv", index=False)
+        stated = pd.Series(dict(stream.metadata), dtype=object)
+        (folder / f"{name}.json").write_text(stated.to_json(), encoding="utf-8")

@@ -20,8 +20,9 @@ from fuselog.replay.engine.arrays import Integers, varying
 from fuselog.replay.engine.streams.blocks import Ragged, join
 from fuselog.replay.engine.streams.results import ALL_WELL
 from fuselog.replay.foreign.description import Description
-from fuselog.replay.foreign.native.calls import COPY, DESTROY
 from fuselog.replay.foreign.native.following import (
+    COPY,
+    DESTROY,
     NOBODY,
     NOT_COPIED,
     Filters,

@@ -43,12 +43,12 @@ from fuselog.replay.foreign.processes.isolation import (
     STARTS_S,
     Ended,
     Limits,
+    Program,
     Ran,
     Watch,
     failure_at,
     in_threads,
 )
-from fuselog.replay.foreign.processes.process import Program
 from fuselog.replay.foreign.processes.tasks import RunGiven, sizes_of
 from fuselog.replay.foreign.results import Results, begun, fill_squares, results
 

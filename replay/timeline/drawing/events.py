@@ -1,6 +1,6 @@
 """Event log of a run: worst moments, rejected and out-of-sequence measurements, failures, gaps."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,10 +8,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fuselog.recorders.log import Stream, schemas
+from fuselog.recorders.registry import available, load
 from fuselog.replay.engine.replaying.usage import CONTROLS
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.judging.errors.moments import Moment
 from fuselog.replay.timeline.drawing.canvas import (
+    Board,
     Canvas,
     Scene,
     Times,
@@ -46,6 +48,8 @@ STATES: Mapping[str, Mapping[float, str]] = {
     "standing": {0: "moves", 1: "stationary: zero velocity"},
     "rolling": {0: "may slip", 1: "rolls: zero lateral and vertical velocity"},
 }
+
+Draw = Callable[[Canvas, Scene, str], list[Board]]
 
 
 class Happened(NamedTuple):
@@ -244,3 +248,16 @@ def _gaps(stream: Stream) -> Times:
 def _spans(sensor: str, what: str, spans: Times) -> Happened:
     texts = [f"{what} {seconds:.1f} s" for seconds in (np.diff(spans)[:, 0] * 1e-9).tolist()]
     return Happened(sensor, "WARN", spans[:, 0], texts)
+
+
+def draw_registered(canvas: Canvas, scene: Scene, case: str, streams: Iterable[Stream]) -> list[Board]:
+    """Draw a case with the registered `fuselog.drawings` entry points, and return their panels.
+
+    Each entry point has the name of a schema. It is loaded if one of `streams` has this schema.
+    """
+    found = dict.fromkeys(stream.schema.full_name for stream in streams)
+    drawn: list[Board] = []
+    for name in [each for each in found if each in available("drawings")]:
+        draw: Draw = load("drawings", name)
+        drawn += draw(canvas, scene, case)
+    return drawn

@@ -446,3 +446,41 @@ def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: f
     radii = rr.Radius.ui_points(0.5)
     strips = rr.LineStrips2D(np.concatenate(lines), colors=[GRID], radii=radii, draw_order=-1.0)
     canvas.fix(entity, strips)
+
+
+def draw_triads(
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    quaternions: Floats,
+    colours: Sequence[Colour],
+    length: float,
+    radius: float,
+) -> None:
+    """Draw the rotated axes x, y and z at each time.
+
+    Args:
+        canvas, entity: the canvas, and the path of the entity.
+        time_ns: (n,).
+        quaternions: (n, 4), w first.
+        colours: colours of x, y and z.
+        length, radius: length and radius of the axes, in the unit of the scene.
+    """
+    turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
+    canvas.send(entity, time_ns, turned)
+    labels = [f"{entity.rpartition('/')[2]} {axis}" for axis in "xyz"]
+    arrows = rr.Arrows3D(
+        vectors=length * np.eye(3), colors=colours, radii=radius, labels=labels, show_labels=False
+    )
+    canvas.fix(f"{entity}/axes", arrows)
+
+
+def space_view(root: str, name: str) -> rrb.Spatial3DView:
+    """Return a view of triads around one origin, with x towards the camera."""
+    return rrb.Spatial3DView(
+        origin=escaped(root),
+        name=name,
+        eye_controls=rrb.EyeControls3D(
+            position=(2.4, 1.4, 1.2), look_target=(0, 0, 0), eye_up=(0, 0, 1)
+        ),
+    )

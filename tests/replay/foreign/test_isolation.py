@@ -82,7 +82,7 @@ def test_a_program_ends_when_we_are_killed() -> None:
         f"print(child.pid, flush=True); {deaf}"
     )
     ours = (
-        "import sys, time; from fuselog.replay.foreign.processes.process import Program; "
+        "import sys, time; from fuselog.replay.foreign.processes.isolation import Program; "
         f"program = Program([sys.executable, '-c', {starts!r}]); "
         "print(program.process.pid, int(program.process.stdout.readline()), flush=True); time.sleep(600)"
     )

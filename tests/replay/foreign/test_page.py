@@ -13,8 +13,7 @@ import pytest
 import fuselog as fl
 from fuselog import BadInput
 from fuselog.pipeline.command_line.process import main
-from fuselog.pipeline.exploring.session import open_session
-from fuselog.pipeline.exploring.verdict import numbers_of
+from fuselog.pipeline.exploring.session import numbers_of, open_session
 from tests.docs.test_worked_pages import DOCS, blocks_of
 from tests.replay.foreign.conftest import EXAMPLES, HEADER, Compile
 

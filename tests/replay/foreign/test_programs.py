@@ -24,7 +24,7 @@ from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.foreign.description import TopicRead
 from fuselog.replay.foreign.files.estimates import read_estimates
 from fuselog.replay.foreign.naming import Allowed
-from fuselog.replay.foreign.processes.process import Program
+from fuselog.replay.foreign.processes.isolation import Program
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 

@@ -41,8 +41,7 @@ from fuselog.replay.judging.errors.evaluation import Errors, chi_square_interval
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
 from fuselog.replay.timeline.landmarks import GATED
-from fuselog.replay.timeline.moments import read_moments, worst_at
-from fuselog.replay.timeline.show import Drawing, show
+from fuselog.replay.timeline.show import Drawing, read_moments, show, worst_at
 from fuselog.replay.timeline.sinks import open_recording
 from fuselog.replay.timeline.viewer import Listener, listen, screenshot, view
 

@@ -14,9 +14,8 @@ from fuselog.pipeline.diagnosing.consistency import unnamed, unseen_errors
 from fuselog.pipeline.diagnosing.diagnosis import Diagnosis
 from fuselog.pipeline.diagnosing.findings import of_estimates, of_innovations
 from fuselog.pipeline.diagnosing.hypotheses.components import of_components
-from fuselog.pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
-from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
+from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses, of_numbers
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.sentences import notes_of, ranked
 from fuselog.pipeline.runs.trials import Trial
@@ -24,6 +23,8 @@ from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.checks.lint import lint
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.replay.engine.replaying.estimator import bind
+from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Squares
 
 TRYING = Trying("ekf", {}, is_own=False)
 SECOND_NS = 1_000_000_000
@@ -208,13 +209,12 @@ def unexplained() -> Iterator[str]:
             metrics={"ekf.nees.robot1": nees, "ekf.nis_per_component.robot1": nis},
             bounds={"ekf.nees.robot1": (2.0, 4.0)},
             intervals=lambda _: {"ekf.nees.robot1": (2.0, 4.0)},
+            squares=lambda *_, nees=nees: Squares("nees", Interval(nees), 1.0, (2.0, 4.0)),
         )
         done: Any = SimpleNamespace(judge=judge)
         yield f"NEES {nees:g}, NIS {nis:g}:"
         for has_causes in (False, True):
-            yield from (
-                f"  {each.sentence}" for each in unseen_errors(done, "ekf", has_causes=has_causes)
-            )
+            yield from (f"  {each.sentence}" for each in unseen_errors(done, has_causes=has_causes))
         stream = _innovations(np.full(400, nis), np.ones(400), np.full(400, 7))
         for tried in (28, 0):
             yield from (

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 from fuselog.pipeline.api.api import record
-from fuselog.pipeline.exploring.newest import NewestFirst
+from fuselog.pipeline.exploring.page import NewestFirst
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.recorders.errors import BadInput
 
@@ -19,7 +19,7 @@ def pressed() -> Iterator[str]:
         return
     from bokeh.document import Document
 
-    from fuselog.pipeline.exploring import markup
+    from fuselog.pipeline.exploring import widgets
     from fuselog.pipeline.exploring.page import Page
 
     source = record("landmarks", seed=3, duration_s=2.0, landmarks=4)
@@ -27,7 +27,7 @@ def pressed() -> Iterator[str]:
     with (
         patch.object(NewestFirst, "ask", lambda _, work: work(lambda: False)),
         patch.object(document, "add_next_tick_callback", lambda act: act()),
-        patch.object(markup, "SLOW_S", 1e9),
+        patch.object(widgets, "SLOW_S", 1e9),
     ):
         page = Page(open_session(source, ["ekf", "ukf"]), document)
         said = {"said": page._sentences, "saved": page._saved, "head": page._head}

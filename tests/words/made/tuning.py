@@ -11,6 +11,8 @@ from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence, doubts
 from fuselog.pipeline.tuning.outcome import Tuning
 from fuselog.pipeline.tuning.search import Coordinates
 from fuselog.recorders.parameters import Parameter
+from fuselog.replay.judging.intervals import Interval
+from fuselog.replay.judging.verdicts import Squares
 
 NAMES = ("sigma_range_m", "sigma_bearing_rad", "density")
 FREE = [Parameter(name, 1.0, low=0.01, high=100.0, is_log=True) for name in NAMES]
@@ -83,11 +85,12 @@ def whiteness() -> Iterator[str]:
 
 def truth() -> Iterator[str]:
     """NEES that innovations do not explain."""
-    for nees, nis in ((3.9, 1.0), (4.1, 1.0), (12.1, 1.5), (11.9, 1.5)):
+    for nees, nis in ((3.9, 1.0), (4.1, 1.0), (5.7, 1.4), (5.5, 1.4), (12.1, 1.5)):
         metrics = {f"{label}.nees.robot1": nees for label in ("start", "tuned")}
         metrics["tuned.nis_per_component.robot1"] = nis
         bounds = dict.fromkeys([key for key in metrics if "nees" in key], (2.0, 4.0))
-        judge = SimpleNamespace(metrics=metrics, bounds=bounds)
+        squares = Squares("nees", Interval(nees), 2.0, (2.0, 4.0))
+        judge = SimpleNamespace(metrics=metrics, bounds=bounds, squares=lambda *_, own=squares: own)
         made = _made(replays=[SimpleNamespace(judge=judge)])
         yield f"NEES {nees:g}, NIS {nis:g}: {' / '.join(Tuning._notes_of_truth(made)) or 'nothing'}"
 
