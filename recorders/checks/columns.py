@@ -214,8 +214,8 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             f"{since_first(stream, first_ns)}",
             otherwise="set the sensor to a larger range"
             if is_range
-            else "if this is the end of the sensor's range, set it to a larger range; if it is a limit of "
-            "the vehicle, nothing is wrong",
+            else "if this is the end of the sensor's range, set it to a larger range; if it is a limit "
+            "of the vehicle, nothing is wrong",
             severity=severity,
             time_ns=first_ns,
         )
