@@ -189,8 +189,8 @@ cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
 It runs over the first messages of {log} from the filter's start, with an outlier for every gate. It
 fails if there are no estimates or no accepted measurements. It prints how many measurements of each
 sensor were accepted and rejected, which sensors and gates the log does not test, and the largest
-difference from fuselog's own filter. The difference is zero with the same libm, in double precision and without fused
-multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
+difference from fuselog's own filter. The difference is zero with the same libm, in double precision
+and without fused multiply-adds, which `-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi,
 libnewlib-arm-none-eabi and qemu-system-arm, the test also runs on an emulated Cortex-M4F and prints the
 number of instructions per message. QEMU does not count cycles.
 
