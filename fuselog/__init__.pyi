@@ -29,6 +29,7 @@ from fuselog.pipeline.deploying.deploying import deploy as deploy
 from fuselog.pipeline.diagnosing.diagnosis import Diagnosis as Diagnosis
 from fuselog.pipeline.diagnosing.diagnosis import diagnose as diagnose
 from fuselog.pipeline.exploring.explore import explore as explore
+from fuselog.pipeline.logs.cataloguing import catalog as catalog
 from fuselog.pipeline.logs.edit import constrain as constrain
 from fuselog.pipeline.logs.edit import cut as cut
 from fuselog.pipeline.logs.edit import merge as merge

@@ -9,9 +9,9 @@ import numpy as np
 
 from fuselog.pipeline.calibrating.calibrating import calibrate
 from fuselog.pipeline.calibrating.ellipsoid import ellipsoid
-from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.terminal import print_json, print_table, say
+from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.pipeline.tuning.command import tune_logs
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource

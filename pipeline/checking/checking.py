@@ -9,10 +9,10 @@ from fuselog.pipeline.altering.sources import NOTE, alter
 from fuselog.pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
 from fuselog.pipeline.checking.golden import Replayed, Tolerances, make
 from fuselog.pipeline.checking.stored import SUFFIX, Golden, read, write
-from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.outputs import Kind, check_files
 from fuselog.pipeline.output.results import RESULT_FILE, read_result
 from fuselog.pipeline.runs.ensemble import Settings
+from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.api.planning import plan_replay
-from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.output.alarms import as_alarm
 from fuselog.pipeline.output.coverage import sentences
@@ -48,6 +47,7 @@ from fuselog.pipeline.runs.ensemble import judge_logs
 from fuselog.pipeline.runs.estimates import source_of_estimates
 from fuselog.pipeline.runs.initial_states import span_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
+from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.recorders.atomic import scratch_folder, whole_file
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput

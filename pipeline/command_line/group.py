@@ -18,7 +18,7 @@ SECTIONS = {
         experiments.run,
         experiments.report,
     ),
-    "Check sensors and logs": (logs.lint, logs.noise, replaying.calibrate, logs.ellipsoid),
+    "Check sensors and logs": (logs.catalog, logs.lint, logs.noise, replaying.calibrate, logs.ellipsoid),
     "Judge estimators": (
         judging.evaluate,
         replaying.explore,

@@ -9,6 +9,7 @@ import click
 from fuselog.pipeline.command_line.help import command
 from fuselog.pipeline.command_line.options import (
     ANY_PATH,
+    CATALOG,
     LOG_OR_FOLDER,
     PICTURE,
     RESULT,
@@ -19,7 +20,10 @@ from fuselog.pipeline.command_line.options import (
     json_option,
     out_log_option,
     recover_option,
+    scheduler_option,
     set_option,
+    where_option,
+    workers_option,
 )
 from fuselog.pipeline.command_line.recording import say_written
 from fuselog.recorders.errors import printable
@@ -44,6 +48,34 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     from fuselog.pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
+
+
+@command(
+    "List the logs in folders, with what each contains.",
+    "fuselog catalog drives -o logs.parquet",
+    "fuselog catalog logs.parquet --where 'fix_rate_hz > 4 and duration_s > 60'",
+)
+@click.argument("folders", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-o", "--out", type=CATALOG, help="The catalog to write or to update (.parquet).")
+@click.option(
+    "--deep",
+    is_flag=True,
+    help="Also read the messages: gaps, findings of lint, a hash of the file.",
+)
+@where_option
+@workers_option
+@scheduler_option
+@json_option
+def catalog(folders: tuple[Path, ...], **options: Any) -> None:
+    """List the logs in FOLDERS and in the folders in them, or the logs of one catalog.
+
+    A catalog has a row for each log: its topics, rates, span, run and the models that fit, read from its
+    summary. An existing catalog is updated: only new and changed logs are read. A log that cannot be
+    read has a row with the reason.
+    """
+    from fuselog.pipeline.logs.cataloguing import show_catalog
+
+    show_catalog(folders, **options)
 
 
 @command(

@@ -114,7 +114,7 @@ SCENARIO, EXPERIMENT = (Name(kind, or_file=True) for kind in ("scenarios", "expe
 RESULT = Output(file_okay=False)
 LOG_OR_FOLDER, TIMELINE_OR_FOLDER = Output(".mcap"), Output(".rrd")
 LOG, TIMELINE, PICTURE, PAGE = map(OutputFile, (".mcap", ".rrd", ".png", ".html"))
-GOLDEN, JUNIT = map(OutputFile, (".xz", ".xml"))
+GOLDEN, JUNIT, CATALOG = map(OutputFile, (".xz", ".xml", ".parquet"))
 ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
@@ -155,6 +155,37 @@ scheduler_option = click.option(
     metavar="ADDRESS|local:N",
     help="Share the work among the workers of a Dask scheduler, or among N local workers.",
 )
+where_option = click.option(
+    "--where",
+    metavar="CONDITION",
+    help="Only logs whose columns in the catalog meet this condition, such as "
+    "'fix_rate_hz > 4 and duration_s > 60'.",
+)
+group_option = click.option(
+    "--group",
+    metavar="COLUMN",
+    help="The column of the catalog that names the unit of intervals, such as the robot [default: the "
+    "log].",
+)
+
+
+def selection_options(function: Callable[..., None]) -> Callable[..., None]:
+    """Add the options for commands that process a selection of logs one by one."""
+    return where_option(group_option(workers_option(scheduler_option(function))))
+
+
+def selecting(paths: Sequence[Path], options: dict[str, Any]) -> dict[str, Any] | None:
+    """Move the options of a selection out of the options of a command.
+
+    Returns None if there is no selection: the paths are logs and folders, and no option is given.
+    """
+    from fuselog.pipeline.selecting.catalog import is_catalog
+
+    found = {name: options.pop(name) for name in ("where", "group", "workers", "scheduler")}
+    is_given = any(map(is_catalog, paths)) or any(value is not None for value in found.values())
+    return {"paths": paths, **found} if is_given else None
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 model_option = click.option("--model", type=MODEL, help="The model to use, if several fit the logs.")
 parameters_option = click.option(

@@ -26,6 +26,8 @@ from fuselog.pipeline.command_line.options import (
     recover_option,
     replay_options,
     scheduler_option,
+    selecting,
+    selection_options,
     set_option,
     settings_option,
     workers_option,
@@ -53,6 +55,7 @@ folds_option = click.option(
     "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
     "fuselog replay run.mcap -e ekf --set sigma_range_m=0.3",
     "fuselog replay run.mcap -e ekf --arrival-order --late rewind:0.5",
+    "fuselog replay logs.parquet --where 'duration_s > 60' -e ekf --workers 4",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @estimator_option("names", "An estimator (repeatable).", many=True, required=True)
@@ -60,8 +63,10 @@ folds_option = click.option(
     "-o",
     "--out",
     type=LOG_OR_FOLDER,
-    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log].",
+    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log]; "
+    "for a catalog, the result folder [default: out/replay].",
 )
+@selection_options
 @model_option
 @click.option(
     "--every",
@@ -100,14 +105,22 @@ folds_option = click.option(
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
 
-    LOGS are logs or folders of logs. The exit code is 1 if an estimator failed in every run.
+    LOGS are logs or folders of logs. The exit code is 1 if an estimator failed in every run. With a
+    catalog, or with --where, --group, --workers or --scheduler, each log is replayed by itself, and a
+    result folder has a row for each log and estimator.
     --set gate_probability=1 sets a parameter of all estimators that have it, and
     --set ekf.gate_probability=1 a parameter of one. --set /fix.delay_s=0.3 changes the topic /fix as it
     is read, also in run, tune, diagnose and compare; --set /fix=? lists what can be set.
     """
-    from fuselog.pipeline.command_line.commands import replay_logs
+    if selection := selecting(logs, options):
+        from fuselog.pipeline.command_line.selections import replay_selection
 
-    if not replay_logs(list(logs), list(names), **options):
+        is_good = replay_selection(selection, names, **options)
+    else:
+        from fuselog.pipeline.command_line.commands import replay_logs
+
+        is_good = replay_logs(list(logs), list(names), **options)
+    if not is_good:
         click.get_current_context().exit(1)
 
 

@@ -17,11 +17,11 @@ from fuselog.pipeline.comparing.candidates import (
     of_result,
     of_trajectory,
 )
-from fuselog.pipeline.logs.folders import recordings_in
 from fuselog.pipeline.output.results import RESULT_FILE
 from fuselog.pipeline.output.words import count
 from fuselog.pipeline.runs.ensemble import Progress
 from fuselog.pipeline.runs.estimates import labels_of, recorded_estimators
+from fuselog.pipeline.selecting.catalog import recordings_in
 from fuselog.recorders.errors import BadInput, choices, some_of
 from fuselog.recorders.log import NotMcap, RunMetadata, open_log, schemas, topics_of
 from fuselog.recorders.trajectories import read_trajectory

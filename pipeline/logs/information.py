@@ -63,7 +63,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     if as_json:
         print_json(_as_json(log))
         return
-    main_ns = _main_span(log)
+    main_ns = main_span(log)
     first_ns, last_ns = main_ns or read_span(log, "log_time")
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
@@ -77,7 +77,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
             topic.name,
             topic.schema_name,
             topic.messages,
-            None if main_ns else _rate(topic.messages, duration_s),
+            None if main_ns else rate(topic.messages, duration_s),
         ]
         for topic in log.topics.values()
     ]
@@ -97,7 +97,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
         warn(log.loss_statement)
 
 
-def _main_span(log: Log) -> tuple[int, int] | None:
+def main_span(log: Log) -> tuple[int, int] | None:
     """Find the first and last stamp of most messages if others are years away; otherwise return None."""
     try:
         return LogSource(log).main_span
@@ -276,7 +276,8 @@ def _as_json(log: Log) -> dict[str, Any]:
     }
 
 
-def _rate(messages: int, duration_s: float) -> float | None:
+def rate(messages: int, duration_s: float) -> float | None:
+    """Return the messages per second of a topic; None without a duration."""
     return messages / duration_s if messages > 1 and duration_s > 0 else None
 
 

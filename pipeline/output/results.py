@@ -43,7 +43,19 @@ TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
 # The commands that make results; the report's opening depends on them.
-Kind = Literal["run", "sweep", "compare", "tune", "diagnose", "replay", "evaluate", "noise", "ellipsoid"]
+Kind = Literal[
+    "run",
+    "sweep",
+    "compare",
+    "tune",
+    "diagnose",
+    "replay",
+    "evaluate",
+    "noise",
+    "ellipsoid",
+    "lint",
+    "check",
+]
 
 
 @dataclass

@@ -18,7 +18,7 @@ from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol
 
 from fuselog.pipeline.runs.checkpoints import Checkpoints
 from fuselog.pipeline.runs.ensemble import Pass, parts_of
@@ -40,6 +40,33 @@ from fuselog.replay.foreign.naming import program_files
 # A cell is abandoned after its workers have died this many times.
 ATTEMPTS = 3
 _LOG = logging.getLogger("fuselog")
+
+
+class Work(Protocol):
+    """A part of a campaign: the runs from `first` to `end` (exclusive)."""
+
+    @property
+    def first(self) -> int:
+        """Return the number of the first run."""
+
+    @property
+    def end(self) -> int:
+        """Return the number of the run after the last."""
+
+    @property
+    def runs(self) -> int:
+        """Return the number of runs."""
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Return the logs that it reads."""
+
+    @property
+    def key(self) -> str:
+        """Return a hash of everything that determines the result."""
+
+    def packed(self, folder: Path) -> bytes:
+        """Do the work, write files to the folder, and pickle the result."""
 
 
 @dataclass(frozen=True)
@@ -114,18 +141,23 @@ class Pace:
         done: number of runs in merged cells.
         worked_off: number of runs in the cells that this command, not an earlier one, computed.
         workers: number of workers.
+        doing: what is done with the runs.
+        what: what the runs are.
     """
 
     runs: int
     done: int = 0
     worked_off: int = 0
     workers: int = 0
+    doing: str = "replaying"
+    what: str = "runs"
     _begun_s: float = field(default_factory=perf_counter)
 
     def __str__(self) -> str:
         rate = self.worked_off / (perf_counter() - self._begun_s)
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
-        return f"replaying: {self.done} of {self.runs} runs, {rate:.0f} runs/s, {workers}; cells"
+        done = f"{self.done} of {self.runs} {self.what}, {rate:.0f} {self.what}/s"
+        return f"{self.doing}: {done}, {workers}; cells"
 
 
 def judge(experiment: Experiment, setting: Setting) -> Pass:
@@ -187,8 +219,8 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
 
 
 def work_off(
-    cells: Sequence[Cell], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
-) -> Iterator[Pass]:
+    cells: Sequence[Work], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
+) -> Iterator[Any]:
     """Yield the results of cells in order; cells that are already done are not computed again.
 
     Memory holds the cells in progress. Raises BadInput if the workers of a cell died repeatedly.
@@ -251,6 +283,6 @@ def work_off(
                 if times >= ATTEMPTS:
                     cell = cells[number]
                     raise BadInput(
-                        f"runs {cell.first} to {cell.end - 1}: the process that computed them died "
-                        f"{times} times ({lost}); try fewer workers, or --workers 1 to see why"
+                        f"{pace.what} {cell.first} to {cell.end - 1}: the process that computed them "
+                        f"died {times} times ({lost}); try fewer workers, or --workers 1 to see why"
                     )

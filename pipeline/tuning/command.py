@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fuselog.pipeline.logs.folders import logs_in
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators, split_texts
+from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.pipeline.tuning.objective import Best, By
 from fuselog.pipeline.tuning.outcome import SETTINGS, Tuning
 from fuselog.pipeline.tuning.tuning import tune

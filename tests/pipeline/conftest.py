@@ -53,6 +53,7 @@ WRITERS = (
 ABOUT_OTHERS = (
     "bad_input",
     "campaigns",
+    "catalog",
     "checkpoints",
     "faults",
     "impossible",

@@ -1,0 +1,314 @@
+"""Commands over selections of logs: each log by itself, the worst first, and verdicts over all of them.
+
+A selection is divided among workers and resumed after an interruption; see
+`fuselog.pipeline.runs.batches`. The result is a folder with the table `logs`, which has a row for each
+log and estimator, also for a log that could not be read or replayed, with the reason.
+"""
+
+import hashlib
+import math
+import os
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from fuselog.pipeline.api.planning import plan_replay
+from fuselog.pipeline.logs.cataloguing import Selection
+from fuselog.pipeline.output.alarming import alarms_of
+from fuselog.pipeline.output.outputs import check_outputs
+from fuselog.pipeline.output.results import (
+    Kind,
+    Outcome,
+    hash_of,
+    result_folder,
+    split_metric,
+    write_outcome,
+)
+from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next
+from fuselog.pipeline.output.words import count, is_error
+from fuselog.pipeline.runs.batches import Row, Task, batches_of, over_logs
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.ensemble import Pass, Progress, Settings, no_progress
+from fuselog.pipeline.runs.executors import PoolFactory
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.log import open_log
+from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.intervals import (
+    FEWEST_RUNS,
+    Floats,
+    Interval,
+    mean_interval,
+    rms_interval,
+    root_mean_square,
+    too_few,
+)
+from fuselog.replay.judging.verdicts import Squares
+
+NEES, NIS, COMPONENTS, FAULTS = "nees", "nis_per_component", "components", "faults"
+# Columns that identify a row, and columns with texts; all others are metrics.
+KEYS, TEXTS = (
+    ("log", "group", "estimator", "case"),
+    ("problem", "doubt", "finding", "estimates", "sha256"),
+)
+OTHERS = (*KEYS, *TEXTS, COMPONENTS)
+PRINTED = (NEES, NIS, FAULTS, "problem", "finding", "doubt")
+MOST_ROWS, MOST_OPENED = 10, 5  # largest numbers of rows and of commands that are printed
+
+
+@dataclass(frozen=True)
+class Replaying:
+    """The replay of a log by estimators: a row per estimator and case, with its metrics.
+
+    Attributes:
+        estimators: settings by label.
+        options: other arguments of `plan_replay`.
+        recover: whether the readable part of a damaged log is used.
+        place: the result folder, to which estimates are written; None to write none.
+        programs: sizes and modification times of the programs that the estimators run.
+    """
+
+    estimators: Settings
+    options: Mapping[str, Any]
+    recover: bool = False
+    place: Path | None = None
+    programs: Sequence[Any] = ()
+    doing: ClassVar[str] = "replaying"
+
+    @without_warnings_of_numbers()
+    def __call__(self, log: Path, number: int, folder: Path) -> list[Row]:
+        """Return the rows of a log, and write its estimates."""
+        name = Path("estimates", f"{number:04d}-{log.stem}.estimates.mcap")
+        refused: dict[str, str] = {}
+        try:
+            done = self._replay(log, self.estimators, folder / name)
+        except BadInput:
+            refused = {label: why for label in self.estimators if (why := self._refusal(log, label))}
+            others = {label: of for label, of in self.estimators.items() if label not in refused}
+            if not others:
+                return [{"estimator": label, "problem": why} for label, why in refused.items()]
+            done = self._replay(log, others, folder / name)
+        rows = [*_rows_of(done), *({"estimator": of, "problem": why} for of, why in refused.items())]
+        written = None if self.place is None else name.as_posix()
+        return [row | {"sha256": hash_of(log), "estimates": written} for row in rows]
+
+    def _refusal(self, log: Path, label: str) -> str:
+        """Return why an estimator cannot replay a log; empty if it can."""
+        try:
+            replace(self, place=None)._replay(log, {label: self.estimators[label]}, Path())
+        except BadInput as error:
+            return str(error).removeprefix(f"{log}: ")
+        return ""
+
+    def _replay(self, log: Path, estimators: Settings, path: Path) -> Pass:
+        source = LogSource(open_log(log, recover=self.recover))
+        plan = plan_replay([source], estimators, **self.options)
+        places = []
+        if self.place is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            there = (self.place / "estimates").resolve()
+            places = [(path, path.parent / os.path.relpath(log.resolve(), there))]
+        return plan.replay(places)
+
+
+def _rows_of(done: Pass) -> list[Row]:
+    """Return the metrics of a replay of one log, with a row per estimator and case."""
+    rows: dict[tuple[str, str], Row] = {}
+    for key, value in done.judge.metrics.items():
+        label, quantity, case = split_metric(key)
+        rows.setdefault((label, case), {"estimator": label, "case": case})[quantity] = value
+    for errors in done.judge.judged.values():
+        if (errors.estimator, errors.case) in rows and not errors.is_bound:
+            rows[errors.estimator, errors.case][COMPONENTS] = len(errors.components)
+    doubts = {}
+    for alarm in reversed(alarms_of(done.judge, done.parameters, done.coverage)):
+        doubts[alarm.where, alarm.part] = alarm.sentence
+    failures = [sentence for _, sentence in done.judge.failed_runs]
+    for (label, case), row in rows.items():
+        row["doubt"] = doubts.get((label, case))
+        own = [each for each in failures if each.startswith(" ".join(filter(None, (label, case))))]
+        row["problem"] = "; ".join(own) or None
+    return list(rows.values())
+
+
+class OverLogs(NamedTuple):
+    """The findings of a command in each log of a selection.
+
+    Attributes:
+        table: a row per log and estimator, those of the worst log first.
+        verdicts: a row per estimator, case and metric, with its interval over logs or groups.
+        folder: the result folder.
+    """
+
+    table: pd.DataFrame
+    verdicts: pd.DataFrame
+    folder: Path
+
+
+def run_over_logs(
+    task: Task,
+    selection: Selection,
+    out: Path,
+    kind: Kind,
+    settings: Mapping[str, Any],
+    open_pool: PoolFactory,
+    progress: Progress = no_progress,
+) -> OverLogs:
+    """Run a task over a selection of logs, and write rows and verdicts to the result folder `out`."""
+    check_outputs(out, None, {"log": selection.logs})
+    with checkpoints_of(out) as checkpoints, result_folder(out) as part:
+        batches = batches_of(task, selection.logs)
+        found = list(over_logs(batches, open_pool, checkpoints, progress))
+        checkpoints.hand_over([batch.key for batch in batches], part)
+        table = worst_first(_table_of(selection, found))
+        outcome = Outcome(tables={"logs": table}, kind=kind)
+        verdicts = pd.DataFrame(_measured(table, outcome))
+        if len(verdicts):
+            outcome.tables["verdicts"] = verdicts
+        if "sha256" in table:
+            digests = table["sha256"].fillna("").groupby(table["log"]).first()
+            outcome.input_sha256 = hashlib.sha256("".join(digests).encode()).hexdigest()
+        stated = {"title": f"{kind} of {count(table['log'].nunique(), 'log')}", **settings}
+        write_outcome(part, kind, stated, outcome)
+    return OverLogs(table, verdicts, out)
+
+
+def _table_of(selection: Selection, found: Sequence[Sequence[Row]]) -> pd.DataFrame:
+    """Make a table of the rows of all logs, and of the logs that cannot be read."""
+    groups: Sequence[str | None] = selection.groups or [None] * len(selection.logs)
+    rows = [
+        {"log": str(log), "group": group, "estimator": None, "case": None, **row}
+        for log, group, of_log in zip(selection.logs, groups, found, strict=True)
+        for row in of_log
+    ]
+    rows += [{"log": str(log), "problem": why} for log, why in selection.unreadable.items()]
+    table = pd.DataFrame(rows)
+    texts = [name for name in TEXTS if name in table]
+    table = table[[*table.columns.drop(texts), *texts]].dropna(axis="columns", how="all")
+    return table.assign(problem=table.get("problem"))
+
+
+def worst_first(table: pd.DataFrame) -> pd.DataFrame:
+    """Sort the rows of logs: those with a problem, then by the error of the most accurate estimator.
+
+    Without errors, the order is that of the faults in the logs, or of the distance of NIS from its aim.
+    """
+    logs = table["log"]
+    by = next((name for name in map(str, table) if is_error(name) and table[name].notna().any()), None)
+    badness = pd.Series(0.0, table.index)
+    if by is not None:
+        own = table[table[COMPONENTS].notna()] if COMPONENTS in table else table  # no bounds
+        best = own.groupby("estimator")[by].mean().idxmin()
+        badness = table[by].where(table["estimator"] == best)
+    elif FAULTS in table:
+        badness = table[FAULTS]
+    elif NIS in table:
+        badness = np.log(table[NIS]).abs()
+    failed = table["problem"].notna()
+    keys = pd.DataFrame({"failed": failed, "badness": badness.fillna(0.0)}).groupby(logs).max()
+    keys = keys.reset_index().sort_values(["failed", "badness", "log"], ascending=[False, False, True])
+    place = {log: number for number, log in enumerate(keys["log"])}
+    return table.iloc[np.argsort(logs.map(place).to_numpy(), kind="stable")].reset_index(drop=True)
+
+
+def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
+    """Add each metric over the logs to the outcome, and yield its row.
+
+    The unit of an interval is the log, or the group of logs; see docs/judge.md.
+    """
+    if "estimator" not in table:
+        return
+    metrics = [str(name) for name in table if name not in OTHERS]
+    keys = ["estimator", "case"] if "case" in table else ["estimator"]
+    for what, rows in table.fillna({"case": ""}).groupby(keys, sort=False):
+        label, case = (*map(str, what), "")[:2]
+        aims = {NIS: 1.0}
+        if COMPONENTS in rows and len(sizes := {*rows[COMPONENTS].dropna()}) == 1:
+            aims[NEES] = float(sizes.pop())
+        for name in metrics:
+            known = rows[rows[name].notna()]
+            units = known["group"] if "group" in known else known["log"]
+            number = over_units(known[name].to_numpy(float), units.to_numpy(), is_rms="rmse" in name)
+            if not len(known):
+                continue
+            outcome.measure(".".join(filter(None, (label, name, case))), number)
+            squares = Squares(name, number, aims.get(name, math.nan), (-math.inf, math.inf))
+            is_judged = name in aims and number.is_bounded
+            yield {
+                "estimator": label,
+                "case": case,
+                "quantity": name,
+                "value": number.value,
+                "low": number.low,
+                "high": number.high,
+                "aim": squares.aim,
+                "verdict": str(squares.verdict) if is_judged else None,
+                "logs": known["log"].nunique(),
+                "units": units.nunique(),
+            }
+
+
+def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval:
+    """Compute the mean or root mean square of the units' values, with its 95 % interval over units.
+
+    The value of a unit, such as a robot, is the mean or root mean square of its logs.
+
+    Args:
+        values: (n,) one value per log.
+        units: (n,) the unit of each log.
+        is_rms: whether the values are root mean squares.
+    """
+    of_unit = root_mean_square if is_rms else np.mean
+    own = [of_unit(values[units == unit]) for unit in dict.fromkeys(units.tolist())]
+    return rms_interval(own) if is_rms else mean_interval(own)
+
+
+def show_over_logs(found: OverLogs, *, as_json: bool) -> bool:
+    """Print the worst logs, the commands that open them, and the verdicts over all logs.
+
+    Returns whether every estimator, or the command itself, succeeded on at least one log.
+    """
+    table, verdicts = (each.replace({np.nan: None}) for each in found[:2])
+    failed = table["problem"].notna()
+    by = table["estimator"].dropna() if "estimator" in table else table["log"]
+    is_good = bool((~failed).groupby(by).any().all()) if "estimator" in table else not failed.all()
+    if as_json:
+        of_logs, over_all = (each.to_dict("records") for each in (table, verdicts))
+        print_json({"logs": of_logs, "verdicts": over_all, "written": [str(found.folder)]})
+        return is_good
+    errors = [name for name in map(str, table) if is_error(name)][:1]
+    columns = [
+        name for name in (*KEYS, *errors, *PRINTED) if name in table and table[name].notna().any()
+    ]
+    print_table(columns, table[columns].head(MOST_ROWS).to_numpy().tolist())
+    if len(table) > MOST_ROWS:
+        say(f"the worst {MOST_ROWS} of {len(table)} rows; all are in {found.folder}/tables")
+    for log, own in list(table.groupby("log", sort=False))[:MOST_OPENED]:
+        known = own["estimates"].dropna().tolist() if "estimates" in own else []
+        words = ["view", str(found.folder / known[0]), "--at", "worst"] if known else ["info", str(log)]
+        say(shlex.join(["fuselog", *words]))
+    rows = [
+        [
+            each["estimator"],
+            each["case"] or None,
+            each["quantity"],
+            str(Interval(each["value"], each["low"], each["high"])),
+            *(each[name] for name in ("aim", "verdict", "logs", "units")),
+        ]
+        for each in found.verdicts.to_dict("records")
+        if each["quantity"] in (*errors, NEES, NIS)
+    ]
+    if rows:
+        columns = ["estimator", "case", "metric", "value", "aim", "verdict", "logs", "units"]
+        print_table(columns, rows)
+    if rows and (few := min(row[-1] for row in rows)) < FEWEST_RUNS:
+        say(f"units, each a run or a group of runs: {too_few(few)}")
+    bad = table["log"][failed].nunique()
+    say(f"{bad} of {count(table['log'].nunique(), 'log')} failed; {found.folder}: tables, result.json")
+    say_next("report", str(found.folder))
+    return is_good

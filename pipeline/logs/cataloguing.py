@@ -1,0 +1,305 @@
+"""The rows of catalogs, from the summaries of logs, and the logs that a command selects."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from fuselog.pipeline.logs.information import fitting_of, main_span, rate
+from fuselog.pipeline.output import terminal
+from fuselog.pipeline.output.outputs import Kind, check_files
+from fuselog.pipeline.output.results import hash_of
+from fuselog.pipeline.runs.batches import Row, batches_of, over_logs, rows_of
+from fuselog.pipeline.runs.checkpoints import checkpoints_of
+from fuselog.pipeline.runs.ensemble import Progress, no_progress
+from fuselog.pipeline.runs.executors import pool_for
+from fuselog.pipeline.selecting.catalog import (
+    SUFFIX,
+    State,
+    is_catalog,
+    is_written,
+    logs_under,
+    read_catalog,
+    require_unchanged,
+    rows_in,
+    schema,
+    state_of,
+    table_of,
+    with_columns,
+    write_catalog,
+)
+from fuselog.pipeline.selecting.where import rows_where
+from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.log import open_log, read_span
+from fuselog.recorders.log.impossible import YEAR_NS
+from fuselog.replay.engine.streams.linting import lint_source
+from fuselog.replay.engine.streams.sources import LogSource
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_ROWS = 40  # largest number of rows that are printed
+CATALOG = Kind(SUFFIX, "a catalog of fuselog", is_written)
+
+
+@dataclass(frozen=True)
+class Describing:
+    """The description of a log for its row in a catalog.
+
+    Attributes:
+        deep: whether the messages are read as well, for gaps, findings and the hash.
+    """
+
+    deep: bool
+    doing: ClassVar[str] = "cataloguing"
+
+    def __call__(self, log: Path, number: int, folder: Path) -> list[Row]:  # noqa: ARG002
+        """Return the row of a log, without its path and state."""
+        opened = open_log(log)
+        own, run = opened.container.regions, opened.run
+        begin_ns, end_ns = read_span(opened, "log_time")
+        main = main_span(opened) if end_ns - begin_ns > YEAR_NS else None
+        begin_ns, end_ns = main or (begin_ns, end_ns)
+        duration_s = (end_ns - begin_ns) * 1e-9
+        is_noted = run is not None or all("publish_time" in each.spans for each in own)
+        published = read_span(opened, "publish_time") if is_noted else (None, None)
+        topics = [
+            {
+                "topic": topic.name,
+                "schema": topic.schema_name,
+                "encoding": topic.encoding,
+                "messages": topic.messages,
+                "rate_hz": None if main else rate(topic.messages, duration_s),
+            }
+            for topic in opened.topics.values()
+        ]
+        row: Row = {
+            "begin_ns": begin_ns,
+            "end_ns": end_ns,
+            "duration_s": duration_s,
+            "publish_begin_ns": published[0],
+            "publish_end_ns": published[1],
+            "messages": sum(each.messages for each in opened.topics.values()),
+            "topics": topics,
+            "models": [name for name, each in fitting_of(opened.topics).items() if each.methods],
+        }
+        if run is not None:
+            row |= {name: getattr(run, name) for name in ("scenario", "seed", "run", "epoch_ns")}
+            row |= {name: json.dumps(getattr(run, name)) for name in ("parameters", "notes")}
+        return [row | (_deep(log, LogSource(opened)) if self.deep else {})]
+
+
+def _deep(log: Path, source: LogSource) -> Row:
+    """Return what only the messages of a log show."""
+    found = lint_source(source)
+    gaps = [each.value for each in found if each.kind == "gap"]
+    findings = [
+        {name: getattr(each, name) for name in ("kind", "where", "severity", "sentence")}
+        for each in found
+    ]
+    faults = sum(each.severity != "hint" for each in found)
+    longest = {"gaps": len(gaps), "longest_gap_s": max(gaps, default=0.0)}
+    return longest | {"faults": faults, "findings": findings, "sha256": hash_of(log)}
+
+
+@dataclass(frozen=True)
+class Catalogued:
+    """The rows of logs, and how many of them are new, read again, unchanged or gone."""
+
+    table: "pd.DataFrame"
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@without_warnings_of_numbers()
+def catalogued(
+    paths: Sequence[Path],
+    out: Path | None = None,
+    *,
+    deep: bool = False,
+    workers: int | None = 1,
+    scheduler: str | None = None,
+    progress: Progress = no_progress,
+) -> Catalogued:
+    """Describe the logs in folders, and write or update the catalog `out`; see `catalog`."""
+    if out is None and len(paths) == 1 and is_catalog(paths[0]):
+        return Catalogued(read_catalog(paths[0]))
+    logs = _logs_of(paths)
+    if not logs:
+        raise BadInput(f"{paths[0]}: has no logs (*.mcap) to catalogue; give a folder with logs")
+    if out is None:
+        return Catalogued(_rows(logs, deep=deep))
+    check_files([(out, CATALOG)], {"log": map(Path, logs)})
+    with checkpoints_of(out) as checkpoints:
+        known = {row["log"]: row for row in rows_in(read_catalog(out))} if out.exists() else {}
+        states = {log: state_of(log) for log in logs}
+        current = {
+            log
+            for log, row in known.items()
+            if states.get(log) == (row["size_bytes"], row["modified_ns"]) and row["is_deep"] >= deep
+        }
+        asked = [log for log in logs if log not in current]
+        batches = batches_of(Describing(deep), list(map(Path, asked)))
+        pool = pool_for(workers, scheduler, len(asked))
+        found = over_logs(batches, pool, checkpoints, progress)
+        counts = Counter("read again" if log in known else "new" for log in asked)
+        counts |= {"unchanged": len(current & {*logs}), "gone": len(known.keys() - {*logs})}
+        for log, rows in zip(asked, found, strict=True):
+            own = {name: of for name, of in known.get(log, {}).items() if name not in schema().names}
+            known[log] = own | _row(log, rows[0], states[log], deep)
+        table = table_of([known[log] for log in logs])
+        if asked or counts["gone"] or not out.exists():
+            write_catalog(out, table)
+    return Catalogued(table, counts)
+
+
+def catalog(
+    *paths: str | Path,
+    out: str | Path | None = None,
+    deep: bool = False,
+    where: str | None = None,
+    workers: int | None = 1,
+    scheduler: str | None = None,
+    progress: Progress = no_progress,
+) -> "pd.DataFrame":
+    """Describe logs in a table with a row per log, from their summaries.
+
+    Args:
+        paths: folders of logs, which are searched with the folders in them; logs; or one catalog.
+        out: the catalog to write, a Parquet file; if it exists, only new and changed logs are read.
+        deep: also read the messages, for gaps, the findings of `lint` and a hash of the file.
+        where: a condition on columns, such as "fix_rate_hz > 4 and duration_s > 60".
+        workers: as for `run`, if a catalog is written.
+        scheduler: as for `run`.
+        progress: as for `run`.
+
+    Returns:
+        A row per log, also for one that cannot be read, with the reason as its `problem`. Columns for
+        each topic, model, parameter and note are added, such as `fix_rate_hz` for the topic /fix.
+
+    Raises BadInput if there are no logs, or the condition or the catalog is invalid.
+
+    >>> from fuselog.pipeline.api.api import record, write
+    >>> write("drives/a.mcap", record("landmarks", seed=7, duration_s=2.0))
+    >>> catalog("drives", where="robot1_odometry_rate_hz > 10")["messages"].tolist()
+    [204]
+    """
+    place = None if out is None else Path(out)
+    found = catalogued(
+        list(map(Path, paths)), place, deep=deep, workers=workers, scheduler=scheduler, progress=progress
+    )
+    table = with_columns(found.table)
+    return table if where is None else rows_where(table, where)
+
+
+def _logs_of(paths: Sequence[Path]) -> list[str]:
+    """List the logs in folders, and the logs that are given directly, without duplicates."""
+    found = (logs_under(path) if path.is_dir() else [str(path)] for path in paths)
+    return list(dict.fromkeys(log for logs in found for log in logs))
+
+
+def _rows(logs: Sequence[str], *, deep: bool = False) -> "pd.DataFrame":
+    """Describe logs in this process."""
+    task = Describing(deep)
+    return table_of(
+        [_row(log, rows_of(task, Path(log), 0, Path())[0], state_of(log), deep) for log in logs]
+    )
+
+
+def _row(log: str, found: Row, state: State, deep: bool) -> Row:
+    own = {"log": log, "folder": Path(log).absolute().parent.name, "is_deep": deep}
+    return own | dict(zip(("size_bytes", "modified_ns"), state, strict=True)) | found
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The logs that the paths of a command mean.
+
+    Attributes:
+        logs: the logs that can be read.
+        groups: the group of each log, such as its robot; empty if no column is named.
+        unreadable: why other logs cannot be read.
+    """
+
+    logs: Sequence[Path]
+    groups: Sequence[str] = ()
+    unreadable: Mapping[Path, str] = field(default_factory=dict)
+
+
+def select(paths: Sequence[Path], where: str | None = None, group: str | None = None) -> Selection:
+    """Find the logs of folders and catalogs, and single logs, that meet a condition.
+
+    Folders are searched with the folders in them, as by `catalog`.
+
+    Args:
+        paths: logs, folders of logs, and catalogs.
+        where: a condition on the columns of the catalogs.
+        group: the column that names the group of each log.
+
+    Raises BadInput if no log meets the condition, or a log changed after it was catalogued.
+    """
+    tables = []
+    for path in paths:
+        if is_catalog(path):
+            tables.append(table := read_catalog(path))
+            require_unchanged(table, path)
+        elif (where, group) == (None, None):
+            tables.append(table_of([{"log": log} for log in _logs_of([path])]))
+        else:
+            tables.append(_rows(_logs_of([path])))
+    table = with_columns(table_of([row for table in tables for row in rows_in(table)]))
+    if where is not None:
+        table = rows_where(table, where)
+    if table.empty:
+        condition = "" if where is None else f" meets --where {where}"
+        raise BadInput(f"{paths[0]}: no log{condition}; fuselog catalog shows the rows")
+    if group is not None and group not in table:
+        raise BadInput(
+            f"--group: no column '{group}' in the catalog; {choices(group, [*map(str, table)])}"
+        )
+    bad = table["problem"].notna()
+    logs = [Path(log) for log in table["log"][~bad]]
+    groups = [] if group is None else table[group][~bad].astype(str).tolist()
+    why = {Path(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)}
+    return Selection(logs, groups, why)
+
+
+def show_catalog(
+    paths: Sequence[Path],
+    *,
+    out: Path | None,
+    deep: bool,
+    where: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+) -> None:
+    """Describe logs, write the catalog, and print the rows that meet a condition."""
+    found = catalogued(
+        paths, out, deep=deep, workers=workers, scheduler=scheduler, progress=terminal.progress
+    )
+    table = found.table
+    if where is not None:
+        table = rows_where(with_columns(table), where)
+    rows = rows_in(table)
+    if as_json:
+        terminal.print_json({"logs": rows, **found.counts})
+        return
+    shown = ("log", "MB", "duration (s)", "messages", "topics", "models", "problem")
+    if rows:
+        terminal.print_table(shown, map(_shown, rows[:MOST_ROWS]))
+    if len(rows) > MOST_ROWS:
+        terminal.say(f"and {len(rows) - MOST_ROWS} more; --where selects, --json prints all")
+    of_all = "" if where is None else f" of {len(found.table)}"
+    counts = ", ".join(f"{number} {what}" for what, number in found.counts.items() if number)
+    terminal.say(f"{len(rows)}{of_all} logs" + (f"; {out}: {counts}" if out else ""))
+    if out is not None:
+        terminal.say_next("replay", str(out), "-e", "ekf")
+
+
+def _shown(row: Row) -> list[object]:
+    """Return the cells of a printed row."""
+    topics, models = (row[name] or () for name in ("topics", "models"))
+    size = [row["log"], row["size_bytes"] * 1e-6, row["duration_s"], row["messages"], len(topics)]
+    return [*size, ", ".join(models), row["problem"]]

@@ -1,0 +1,1 @@
+"""Folders and catalogs of logs, and the logs that a command selects; begin with `catalog`."""

@@ -1,0 +1,293 @@
+"""Catalogs of logs, conditions on them, and commands over the logs that they select."""
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import fuselog as fl
+from fuselog.pipeline.api.over_logs import over_units
+from fuselog.pipeline.logs import cataloguing
+from fuselog.pipeline.runs.batches import Batch
+from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, write_catalog
+from fuselog.pipeline.selecting.where import rows_where
+from fuselog.recorders.errors import BadInput
+from tests.pipeline.conftest import Said
+from tests.pipeline.test_campaigns import contents
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six logs of two robots in two folders, one of which was cut off."""
+    folder = tmp_path_factory.mktemp("catalog")
+    for seed in range(6):
+        log = fl.record("landmarks", seed=seed, duration_s=1.0 + seed / 2)
+        fl.write(folder / "drives" / f"robot{seed % 2}" / f"drive{seed}.mcap", log)
+    whole = (folder / "drives/robot1/drive5.mcap").read_bytes()
+    (folder / "drives/robot1/drive5.mcap").write_bytes(whole[: len(whole) // 2])
+    (folder / "drives/robot0/notes.txt").write_text("not a log")
+    return folder
+
+
+@pytest.fixture
+def drives(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of these logs, in a working directory of its own."""
+    shutil.copytree(recorded / "drives", tmp_path / "drives")
+    monkeypatch.chdir(tmp_path)
+    return Path("drives")
+
+
+@pytest.fixture
+def described(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the logs that are read for a catalog."""
+    names: list[str] = []
+    read = cataloguing.Describing.__call__
+
+    def describe(task: cataloguing.Describing, log: Path, number: int, folder: Path) -> list[dict]:
+        names.append(log.name)
+        return read(task, log, number, folder)
+
+    monkeypatch.setattr(cataloguing.Describing, "__call__", describe)
+    return names
+
+
+def test_a_row_states_what_the_log_holds(drives: Path) -> None:
+    table = fl.catalog(drives).set_index("log")
+    path = drives / "robot0" / "drive2.mcap"
+    log, row = fl.open(path), table.loc[str(path)]
+    assert len(table) == 6
+    assert row["duration_s"] == pytest.approx(2.0)
+    assert row["messages"] == sum(topic.messages for topic in log.topics.values())
+    assert row["robot1_odometry_rate_hz"] == log.topics["/robot1/odometry"].messages / 2.0
+    assert (row["seed"], row["scenario"], row["folder"]) == (2, "landmarks", "robot0")
+    assert row["run_duration_s"] == 2.0
+    assert row["fits_robot"]
+    assert row["size_bytes"] == path.stat().st_size
+    assert [each["topic"] for each in row["topics"]] == list(log.topics)
+    cut = table.loc[str(drives / "robot1" / "drive5.mcap")]
+    assert "was cut off" in cut["problem"]
+    assert not cut["fits_robot"]
+    assert table["problem"].notna().sum() == 1
+
+
+def test_only_new_and_changed_logs_are_read_again(drives: Path, described: list[str]) -> None:
+    place = Path("logs.parquet")
+    fl.catalog(drives, out=place)
+    assert len(described) == 6
+    table = read_catalog(place)
+    write_catalog(place, table.assign(site=[f"site {number}" for number in range(6)]))
+    fl.write(drives / "robot0" / "drive0.mcap", fl.record("landmarks", seed=9, duration_s=1.0))
+    (drives / "robot1" / "drive1.mcap").unlink()
+    shutil.copy(drives / "robot0" / "drive2.mcap", drives / "new.mcap")
+    described.clear()
+    again = fl.catalog(drives, out=place).set_index("log")
+    assert sorted(described) == ["drive0.mcap", "new.mcap"]
+    assert len(again) == 6
+    assert again.loc["drives/robot0/drive0.mcap", ["seed", "site"]].tolist() == [9, "site 0"]
+    assert pd.isna(again.loc["drives/new.mcap", "site"])
+    described.clear()
+    deep = fl.catalog(drives, out=place, deep=True)
+    assert len(described) == 6
+    assert deep["sha256"].notna().sum() == 5
+    assert deep["faults"].dropna().tolist() == [0] * 5
+    described.clear()
+    assert rows_in(fl.catalog(drives, out=place)[deep.columns]) == rows_in(deep)
+    assert not described
+
+
+def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
+    fl.catalog(drives, out="logs.parquet")
+    Path("moved").mkdir()
+    for each in (drives, Path("logs.parquet")):
+        shutil.move(each, "moved")
+    found = cataloguing.select([Path("moved/logs.parquet")], "seed == 2")
+    assert found.logs == [Path("moved/drives/robot0/drive2.mcap")]
+
+
+def test_conditions_select_rows() -> None:
+    table = pd.DataFrame(
+        {
+            "log": ["a", "b", "c"],
+            "seed": pd.array([1, None, 3], "Int64"),
+            "rate_hz": [4.0, np.nan, 6.0],
+            "is_deep": [True, False, True],
+            "problem": [None, None, None],
+        }
+    )
+    for condition, logs in {
+        "rate_hz > 4": "c",
+        "not rate_hz > 4": "ab",
+        "3 < rate_hz <= 4 or seed == 3": "ac",
+        "seed / 2 + 1 >= 2.5": "c",
+        "log in ['a', 'c'] and rate_hz < 5": "a",
+        "log not in ('a', '@`c')": "bc",
+        "is_deep": "ac",
+        "rate_hz == rate_hz": "ac",
+        "-rate_hz < -5": "c",
+    }.items():
+        assert "".join(rows_where(table, condition)["log"]) == logs, condition
+    table["problem"] = [None, "cannot be read", None]
+    assert "".join(rows_where(table, "rate_hz > 4")["log"]) == "bc"
+    assert "".join(rows_where(table, "log != 'b'")["log"]) == "ac"
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ("rate_h > 4", "did you mean 'rate_hz'?"),
+        ("rate_hz >> 4", "RShift is not allowed"),
+        ("rate_hz >", "cannot be parsed"),
+        ("@seed > 4", "cannot be parsed"),
+        ("`log` == 'a'", "cannot be parsed"),
+        ("__import__('os').system('true')", "Call is not allowed"),
+        ("log.__class__ == 'a'", "Attribute is not allowed"),
+        ("log[0] == 'a'", "Subscript is not allowed"),
+        ("(lambda: 1)() == 1", "Call is not allowed"),
+        ("[log for log in 'a'] == 1", "ListComp is not allowed"),
+        ("f'{log}' == 'a'", "JoinedStr is not allowed"),
+        ("(seed := 1) == 1", "NamedExpr is not allowed"),
+        ("9 ** 9 ** 9 ** 9 > 1", "Pow is not allowed"),
+        ("'a' * 1000000000 == log", "'a' is not a number"),
+        ("log * 1000000000 == 'a'", "log is not a number"),
+        ("__class__ == 1", "no column '__class__'"),
+        ("1 < 2", "is not a comparison"),
+        ("rate_hz", "is not a comparison"),
+        ("log > 3", "cannot be compared"),
+        ("topics == 3", "has lists"),
+        ("(" * 300 + "1" + ")" * 300, "cannot be parsed"),
+        ("1 < " * 9000 + "1", "longer than"),
+    ],
+)
+def test_a_condition_is_only_a_comparison(condition: str, words: str) -> None:
+    table = pd.DataFrame({"log": ["a"], "seed": [1], "rate_hz": [4.0], "topics": [["/fix"]]})
+    table["problem"] = None
+    with pytest.raises(BadInput) as caught:
+        rows_where(table, condition)
+    assert words in str(caught.value)
+
+
+def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callable[..., Said]) -> None:
+    fl.catalog(drives, out="logs.parquet")
+    pd.read_parquet("logs.parquet").to_parquet("table.parquet")
+    Path("text.parquet").write_text("log")
+    Path("empty").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fuselog.pipeline.selecting.catalog.FORMAT", 2)
+        fl.catalog(drives, out="newer.parquet")
+    fl.write(drives / "robot0" / "drive0.mcap", fl.record("landmarks", seed=9, duration_s=1.0))
+    for line, words in {
+        "catalog table.parquet": "is not a catalog",
+        "catalog drives -o table.parquet": "exists and is not a catalog of fuselog",
+        "catalog newer.parquet": "a newer version of fuselog wrote it",
+        "catalog text.parquet": "is not a Parquet file",
+        "catalog no.parquet": "no.parquet: cannot be read",
+        "catalog empty": "has no logs",
+        "replay logs.parquet -e ekf": "drive0.mcap: changed after it was catalogued",
+        "replay drives/robot0 -e ekf --group foldr": "did you mean 'folder'?",
+        "replay drives/robot0 -e ekf --where seed>70": "--where seed>70",
+        "replay drives/robot0 -e ekf --workers 1 --save a.rrd": "--save",
+        "replay drives/robot0 -e ekf --workers 1 -o a.mcap": "a selection has a result folder",
+    }.items():
+        said = fuselog(*line.split())
+        assert (said.code, said.err.count("\n")) == (2, 1), line
+        assert words in said.err, line
+    assert not Path("out").exists()
+
+
+def test_each_log_of_a_selection_has_a_row(drives: Path, fuselog: Callable[..., Said]) -> None:
+    """Each row has the numbers of a replay of its log alone; the logs that failed come first."""
+    fl.write(drives / "still.mcap", fl.record("axis"))
+    fuselog("catalog", drives, "-o", "logs.parquet")
+    said = fuselog(
+        "replay", "logs.parquet", "-e", "ekf", "-e", "bound", "--where", "seed != 4", "--json"
+    )
+    assert said.code == 0, said.err
+    rows = pd.DataFrame(said.json["logs"])
+    logs = list(dict.fromkeys(rows["log"]))
+    assert [Path(log).stem for log in logs[:2]] == ["drive5", "still"]
+    assert rows.groupby("log")["problem"].first().notna().sum() == 2
+    for log in logs[2:]:
+        own = rows[rows["log"] == log].set_index("estimator")
+        metrics = fl.replay(log, ["ekf", "bound"]).metrics
+        for label, quantity, value in metrics[["estimator", "quantity", "value"]].to_numpy():
+            assert own.loc[label, quantity] == value
+        assert fl.open(f"out/replay/{own.loc['ekf', 'estimates']}").run.notes["log"].endswith(log)
+    errors = rows[rows["estimator"] == "ekf"]["position_rmse_m"].dropna().tolist()
+    assert errors == sorted(errors, reverse=True)
+    assert len(errors) == 4
+    shown = fuselog("replay", "logs.parquet", "-e", "ekf", "--group", "folder", "--out", "out/other").out
+    assert "fuselog info drives/robot1/drive5.mcap" in shown
+    assert "there are only 2" in shown
+
+
+def test_the_unit_of_an_interval_is_the_group() -> None:
+    units = np.repeat(["a", "b", "c", "d", "e"], 4)
+    values = np.repeat([1.0, 2.0, 3.0, 4.0, 5.0], 4) + np.tile([-0.1, 0.1], 10)
+    found = over_units(values, units, is_rms=False)
+    assert found[:3] == pytest.approx((3.0, 3.0 - 1.963243, 3.0 + 1.963243), abs=1e-6)  # t of 4
+    alone = over_units(values, np.arange(20), is_rms=False)
+    assert alone.high - alone.low < 0.7 * (found.high - found.low)
+    assert over_units(values, units, is_rms=True).value == pytest.approx(np.sqrt(np.mean(values**2)))
+    assert np.isnan(over_units(values[:16], units[:16], is_rms=False).low)
+
+
+def test_an_interrupted_selection_is_resumed(
+    drives: Path, monkeypatch: pytest.MonkeyPatch, fuselog: Callable[..., Said]
+) -> None:
+    line = ("replay", "drives", "-e", "ekf", "--workers", "1", "--out", "out")
+    whole = contents_of(line, fuselog)
+    packed: list[str] = []
+    pack = Batch.packed
+
+    def stopped(batch: Batch, folder: Path) -> bytes:
+        if len(packed) == 3:
+            packed.append("stopped")
+            raise KeyboardInterrupt
+        packed.append(batch.logs[0].stem)
+        return pack(batch, folder)
+
+    monkeypatch.setattr(Batch, "packed", stopped)
+    assert fuselog(*line).code == 130
+    assert not Path("out").exists()
+    assert contents_of(line, fuselog) == whole
+    assert packed == ["drive0", "drive2", "drive4", "stopped", "drive1", "drive3", "drive5"]
+
+
+@pytest.mark.paper
+def test_a_killed_worker_changes_no_byte(drives: Path, fuselog: Callable[..., Said]) -> None:
+    for number in range(40):
+        shutil.copy(drives / "robot0" / "drive4.mcap", drives / f"copy{number}.mcap")
+    line = ("replay", "drives", "-e", "ekf", "--group", "folder", "--out", "out")
+    whole = contents_of((*line, "--workers", "1"), fuselog)
+    killed: list[BaseProcess] = []
+
+    def kill() -> None:
+        while not list(Path("out.unfinished").glob("*.bin")):
+            time.sleep(0.002)
+        killed.extend(active_children()[:1])
+        killed[0].kill()
+
+    thread = Thread(target=kill)
+    thread.start()
+    found = contents_of((*line, "--workers", "2"), fuselog)
+    thread.join()
+    assert killed[0].exitcode == -9
+    assert found == whole
+
+
+def contents_of(line: Sequence[str], fuselog: Callable[..., Said]) -> dict[str, bytes]:
+    """Run a command, and take its result away."""
+    said = fuselog(*line)
+    assert said.code == 0, said.err
+    found = contents(Path("out"))
+    shutil.rmtree("out")
+    return found
