@@ -12,7 +12,7 @@ import pandas as pd
 from pydantic import NonNegativeInt
 
 from fuselog.pipeline.calibrating.calibrating import calibrate
-from fuselog.pipeline.calibrating.car import NAMES, OURS, TRUTH, WIDE, drive, recorded
+from fuselog.pipeline.calibrating.manoeuvres import NAMES, OURS, TRUTH, WIDE, drive, recorded
 from fuselog.pipeline.output.charts import coverage
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.estimates import hash_streams

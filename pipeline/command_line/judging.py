@@ -25,6 +25,8 @@ from fuselog.pipeline.command_line.options import (
 )
 from fuselog.recorders.errors import BadInput
 
+_OF_COMPARISON = ("align", "delta", "delta_unit", "association", "max_difference_s", "time_offset_s")
+
 
 @command(
     "Judge estimates against the truth.",
@@ -101,12 +103,6 @@ def evaluate(
     truth: Path | None,
     format: str | None,  # noqa: A002
     truth_format: str | None,
-    align: str | None,
-    delta: float | None,
-    delta_unit: str | None,
-    association: str | None,
-    max_difference_s: float | None,
-    time_offset_s: float | str | None,
     **options: Any,
 ) -> None:
     """Judge ESTIMATES logs against the truth in the logs they were replayed from.
@@ -117,14 +113,7 @@ def evaluate(
     """
     from fuselog.pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
 
-    given = {
-        "align": align,
-        "delta": delta,
-        "delta_unit": delta_unit,
-        "association": association,
-        "max_difference_s": max_difference_s,
-        "time_offset_s": time_offset_s,
-    }
+    given = {name: options.pop(name) for name in _OF_COMPARISON}
     comparison = {name: value for name, value in given.items() if value is not None}
     formats = {"format": format, "truth_format": truth_format}
     if truth is not None:

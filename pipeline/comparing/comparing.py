@@ -23,7 +23,6 @@ from fuselog.pipeline.comparing.groups import (
     with_logs_of_folders,
 )
 from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
-from fuselog.pipeline.comparing.scenes import scene_of, side_by_side
 from fuselog.pipeline.output import words
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from fuselog.pipeline.output.coverage import coverage_table, sentences
@@ -36,9 +35,9 @@ from fuselog.pipeline.stressing.stressing import stress as stress_logs
 from fuselog.pipeline.stressing.sums import verdicts_of
 from fuselog.pipeline.stressing.verdicts import Stress
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
-from fuselog.recorders.log import open_log
+from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.replay.engine.replaying.usage import Row
-from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.differences import (
     NATS,
     Difference,
@@ -443,3 +442,30 @@ def _where(
     stretches = list(zip(edges[::2], edges[1::2], strict=True))
     begin, end = max(stretches, key=lambda each: float(own["difference"][slice(*each)].abs().sum()))
     return float(own["from_s"][begin]), float(own["to_s"][end - 1])
+
+
+def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, MemorySource]:
+    """Return the log of a run, and the estimates of all candidates under their names."""
+    source = candidates[0].pairs[run][0]
+    streams = {
+        topic: stream
+        for own in (candidate.estimates(run) for candidate in candidates)
+        for topic, stream in own.read([*own.topics]).items()
+    }
+    about = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    return source, MemorySource(streams, about, source.name)
+
+
+def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
+    """Draw a run from above, and enlarge one second of it if the ellipses are too small to be seen.
+
+    The result is empty if the truth or the estimates have no horizontal positions.
+    """
+    from fuselog.pipeline.output.report.first_run import seen_from_above  # slow to import
+    from fuselog.pipeline.output.report.scene import lens, plan
+
+    found = seen_from_above(*side_by_side(candidates, run), gap_limit_s)
+    if found is None:
+        return {}
+    near = lens(found, [candidate.name for candidate in candidates])
+    return {"scene": plan(found)} | ({"lens": near} if near else {})

@@ -34,17 +34,6 @@ WORTH = 10.0  # a fault is not counted if its removal increases the log-likeliho
 FIRST = 0.8  # share of the counted faults that should be named first
 SIZED = ("R", "Q", "delay")  # kinds of faults whose size should be in its interval
 DEGREE = np.pi / 180.0
-QUANTITIES = (
-    "worth",
-    "counted",
-    "first",
-    "first_two",
-    "first_share",
-    "first_two_share",
-    "covered_share",
-    "named_share",
-    "nothing_share",
-)
 CLEAN_RUN = "none"
 
 
@@ -225,8 +214,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome(tables={"faults": faults, "diagnosed": runs}, figures={"faults": _chart(faults)})
     for summary in faults.to_dict("records"):
         case = f"{summary['scenario']}-{summary['fault']}"
-        for quantity in QUANTITIES:
-            outcome.metrics[f"diagnosis.{quantity}.{case}"] = summary[quantity]
+        outcome.metrics |= {f"diagnosis.{each}.{case}": summary[each] for each in [*summary][2:]}
     outcome.metrics |= {f"diagnosis.{name}": share for name, share in _overall(runs).items()}
     if seeds := battery_seeds(setting.options, experiment.runs):
         tables, metrics = battery.results(seeds, setting.progress)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from fuselog.replay.judging.errors.evaluation import (
     nis_by_bin,
     split_topic,
 )
+from fuselog.replay.timeline.drawing import canvas
 
 Floats = NDArray[np.float64]
 BIN_S = 1.0  # time in s over which NIS is averaged for its curve
@@ -185,12 +185,8 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
     if count <= most:
         return np.arange(count)
     edges = np.linspace(0, count, most // 2 + 1).astype(np.int64)
-    safe = np.where(np.isfinite(values), values, 0.0)
-    pairs = [
-        (low + np.argmin(safe[low:high]), low + np.argmax(safe[low:high]))
-        for low, high in pairwise(edges.tolist())
-    ]
-    return np.unique(np.array(pairs))
+    of_span = np.searchsorted(edges, np.arange(count), "right") - 1
+    return canvas.extremes(of_span, np.where(np.isfinite(values), values, 0.0))
 
 
 def typical_time_s(case: Case) -> float | None:

@@ -9,6 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from statistics import median
 from typing import Any, Literal
 
 from fuselog.recorders.errors import BadInput
@@ -162,11 +163,6 @@ def _mean(numbers: Sequence[float]) -> float:
     return sum(numbers) / len(numbers)
 
 
-def _median(numbers: Sequence[float]) -> float:
-    ordered = sorted(numbers)
-    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
-
-
 def _deviation(numbers: Sequence[float]) -> float:
     """Compute the standard deviation of a sample."""
     mean = _mean(numbers)
@@ -244,7 +240,7 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
     "low": lambda values: by_entry(lambda each: exactly(each.low, each.name), values),
     "max": _of_all(max),
     "mean": _of_all(_mean),
-    "median": _of_all(_median),
+    "median": _of_all(median),
     "min": _of_all(min),
     "plus_minus": _plus_minus,
     "sqrt": _rising(math.sqrt),

@@ -259,21 +259,24 @@ def tables_of(
 
 def _over_cases(tables: "Sequence[MetricTable]") -> PrintedTable:
     """Make a table of the median, minimum and maximum over cases, with a row per quantity."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for table in tables:
-        for quantity, values in table.quantities.items():
-            of = found.setdefault(quantity, {})
-            for estimator, measured in values.items():
-                if isinstance(measured.value, int | float) and math.isfinite(measured.value):
-                    of.setdefault(estimator, []).append(measured.value)
     estimators = tables[0].estimators
     rows = [
         [quantity, *(_spread(of.get(estimator, [])) for estimator in estimators)]
-        for quantity, of in found.items()
-        if of
+        for quantity, of in over_cases(tables).items()
     ]
     title = f"{len(tables)} cases: median over the cases that have the metric (minimum to maximum)"
     return PrintedTable(title, ["", *estimators], rows)
+
+
+def over_cases(tables: "Sequence[MetricTable]") -> dict[str, dict[str, list[float]]]:
+    """Collect the finite numbers of all tables, by quantity and estimator."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for table in tables:
+        for quantity, values in table.quantities.items():
+            for estimator, each in values.items():
+                if isinstance(each.value, int | float) and math.isfinite(each.value):
+                    found.setdefault(quantity, {}).setdefault(estimator, []).append(float(each.value))
+    return found
 
 
 def _spread(values: Sequence[float]) -> str | None:

@@ -2,17 +2,14 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, create_model
 
 from fuselog.recorders.atomic import scratch_folder
-from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import RunMetadata, Stream, Topic, schemas, write_log
 from fuselog.recorders.parameters import build, has_role
@@ -25,7 +22,7 @@ from fuselog.replay.foreign.description import Description, ForeignParameters
 from fuselog.replay.foreign.files.estimates import read_estimates, write_tables
 from fuselog.replay.foreign.filters import bind_all, bind_apart, unspecified
 from fuselog.replay.foreign.naming import split_command, what_runs
-from fuselog.replay.foreign.processes.isolation import Ended, Limits, Program, Ran, in_threads
+from fuselog.replay.foreign.processes.isolation import Ended, Limits, Program, Ran, in_threads, state_of
 from fuselog.replay.foreign.processes.streaming import describe_stream, follow_runs_streaming
 from fuselog.replay.foreign.processes.tasks import RunGiven
 
@@ -89,7 +86,7 @@ EXEC = _OfPrograms(
 
 
 def _of_stream(words: tuple[str, ...], limits: Limits) -> Estimator[Any]:
-    description = _described(words, _state_of(words), limits)
+    description = _described(words, tuple(map(state_of, words)), limits)
 
     def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
         return follow_runs_streaming(words, runs, description, limits)
@@ -109,16 +106,6 @@ def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
         f"estimator {label}: --late rewind: a program cannot be copied, unlike a filter of a library "
         "(lib:); give --late drop or --late wait:SECONDS"
     )
-
-
-def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return sizes and modification times of the files in a command, for the key of its cache."""
-    found = []
-    for word in words:
-        with suppress(OSError, ValueError):
-            state = Path(word).stat()
-            found.append((state.st_size, state.st_mtime_ns))
-    return tuple(found)
 
 
 @lru_cache(maxsize=64)
@@ -230,11 +217,7 @@ def _solve(
         except (Ended, BadInput) as error:
             return Failure(max(stamps), str(error))
 
-    def stop() -> None:
-        for each in started:
-            each.end()
-
-    made = in_threads(one, range(runs), max(1, min(core_count(), runs)), stop)
+    made = in_threads(one, range(runs), started)
     failures = {run: each for run, each in enumerate(made) if isinstance(each, Failure)}
     if len(failures) == runs == 1:
         raise BadInput(f"estimator {label}: {failures[0].reason}")

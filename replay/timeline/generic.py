@@ -29,7 +29,13 @@ from fuselog.replay.timeline.drawing.canvas import (
     entity_path,
     thin,
 )
-from fuselog.replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events, draw_registered
+from fuselog.replay.timeline.drawing.events import (
+    NOT_SENSED,
+    above_events,
+    draw_events,
+    draw_registered,
+    within,
+)
 from fuselog.replay.timeline.drawing.geodetic import degrees_of, draw_fixes, draw_way, map_view
 from fuselog.replay.timeline.drawing.plane import (
     ROOT,
@@ -67,12 +73,11 @@ from fuselog.replay.timeline.landmarks import (
     landmarks_of,
     tracks_of,
 )
-from fuselog.replay.timeline.navigation import draw_navigation
+from fuselog.replay.timeline.navigation import ANGLES, draw_navigation, euler_deg
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name
 GEODETIC, ORIENTATION = schemas.GEODETIC_FIX.full_name, schemas.ORIENTATION.full_name
-ANGLES = ("roll", "pitch", "yaw")
 
 # Length of a ray without a range, and number of vertices of a circle.
 RAY_M = 1.0
@@ -168,16 +173,16 @@ def _draw_plane(
         named = {track.name: track.stroke.colour for track in tracks}
         named |= draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
     for stream, colour in zip(sensed, scene.spare_colours, strict=False):
-        entity, stroke = f"{root}/{_name(stream, case)}", Stroke(colour)
+        entity, stroke = f"{root}/{within(stream.topic, case)}", Stroke(colour)
         if stream.schema.full_name != LANDMARK:  # landmarks have numbers instead
-            named[_name(stream, case)] = colour
+            named[within(stream.topic, case)] = colour
         rows = thin(stream.publish_time_ns)
         time_ns, places = stream.publish_time_ns[rows], stream["position_m"][rows, :2]
         if stream.schema.full_name == LANDMARK:
             places = stream["position_m"][:, :2]
             draw_points(canvas, entity, stream["landmark_id"], places)
         elif stream.schema.full_name == POSE:
-            yaw = _euler_deg(stream["quaternion"][rows])[:, 2:]
+            yaw = euler_deg(stream["quaternion"][rows])[:, 2:]
             poses = np.concatenate([places, np.radians(yaw)], axis=1)
             known = np.isfinite(poses).all(axis=1)
             length_m = ARROW_SHARE * extent_of(places)
@@ -207,7 +212,7 @@ def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]
             known = way[np.isfinite(way).all(axis=1)]
             draw_way(canvas, f"{root}/{estimator}", known, scene.colour(estimator))
     for stream, colour in zip(fixes, cycle(PALETTE), strict=False):
-        draw_fixes(canvas, f"{root}/{_name(stream, case)}", stream, colour)
+        draw_fixes(canvas, f"{root}/{within(stream.topic, case)}", stream, colour)
     degrees = [degrees_of(stream) for stream in fixes]
     return [map_view(canvas, root, np.concatenate(degrees))] if fixes else []
 
@@ -219,7 +224,7 @@ def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb
         rows = thin(stream.publish_time_ns)
         rows = rows[np.isfinite(stream["quaternion"][rows]).all(axis=1)]
         turned = (stream.publish_time_ns[rows], stream["quaternion"][rows])
-        draw_triads(canvas, f"{root}/{_name(stream, case)}", *turned, [colour] * 3, 1.0, 0.02)
+        draw_triads(canvas, f"{root}/{within(stream.topic, case)}", *turned, [colour] * 3, 1.0, 0.02)
     return [space_view(root, "Orientation")] if sensed else []
 
 
@@ -228,7 +233,7 @@ def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[r
     for stream in sensed:
         if stream.schema.full_name in NOT_SENSED:
             continue
-        name = _name(stream, case)
+        name = within(stream.topic, case)
         plots = {
             field.name: _draw_field(canvas, case, stream, field, curves)
             for field, curves in curves_of(stream)
@@ -246,12 +251,12 @@ def _draw_field(
 ) -> rrb.TimeSeriesView:
     """Plot the curves (curves, n) of a field; rotations are shown as angles."""
     quantity, unit, scale = shown_unit(field.name)
-    plot = entity_path("plots", case, _name(stream, case), field.name)
+    plot = entity_path("plots", case, within(stream.topic, case), field.name)
     named: Sequence[str] = [str(element) for element in range(len(curves))]
     if field.kind == "real":
         named = [field.name]
     elif field.name == "quaternion":
-        quantity, unit, named, curves = "orientation", "deg", ANGLES, _euler_deg(curves.T).T
+        quantity, unit, named, curves = "orientation", "deg", ANGLES, euler_deg(curves.T).T
     elif len(stream.components) == len(curves):
         named = stream.components
     for curve, values, colour in zip(named, scale * curves, cycle(PALETTE), strict=False):
@@ -259,22 +264,6 @@ def _draw_field(
     is_legend = len(curves) > 1
     extent = below_legend(list(scale * curves)) if is_legend else None
     return plot_view(plot, quantity.capitalize(), unit, extent, legend=is_legend, zoom_lock=False)
-
-
-def _euler_deg(quaternions: Floats) -> Floats:
-    """Convert quaternions to roll, pitch and yaw (n, 3) in deg (about x, y and z); NaN if invalid."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    angles = np.full((len(quaternions), 3), np.nan)
-    known = np.linalg.norm(quaternions, axis=1) > 0.0
-    turned = Rotation.from_quat(quaternions[known], scalar_first=True)
-    angles[known] = turned.as_euler("ZYX", degrees=True)[:, ::-1]
-    return angles
-
-
-def _name(stream: Stream, case: str) -> str:
-    """Return the name of a topic within its case."""
-    return stream.topic.removeprefix(f"/{case}").removeprefix("/")
 
 
 TIMELINE = Timeline(draw)

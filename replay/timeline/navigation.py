@@ -29,11 +29,11 @@ from fuselog.replay.timeline.drawing.canvas import (
     Times,
     entity_path,
     escaped,
-    gap_limit_ns,
     nice,
     thin,
     thin_curve,
 )
+from fuselog.replay.timeline.drawing.events import gaps
 from fuselog.replay.timeline.drawing.geodetic import POOR, QUALITIES, by_deviation
 from fuselog.replay.timeline.drawing.plane import with_legend
 from fuselog.replay.timeline.drawing.plots import LINE, SIGMAS, draw_curve, plot_view, shown_unit
@@ -88,7 +88,7 @@ def draw_navigation(
     if all(body.deviations is None for body in bodies):
         return []
     fixes = list(_fixes_of(sensed))
-    silent = [spans for _, stream in fixes for spans in [_silent(stream, canvas.end_ns)] if len(spans)]
+    silent = [spans for _, stream in fixes for spans in [gaps(stream, canvas.end_ns)] if len(spans)]
     outages = np.concatenate([np.empty((0, 2), np.int64), *silent])
     root = entity_path("navigation", case)
     for name, stream in fixes:
@@ -153,13 +153,6 @@ def _fixes_of(sensed: Sequence[Stream]) -> Iterator[tuple[str, Stream]]:
         elif schema == schemas.GEODETIC_FIX.full_name and "origin_latitude_deg" in stream.metadata:
             fixes = gather([stream])
             yield name, in_plane(fixes, origins_of(fixes)).stream
-
-
-def _silent(stream: Stream, end_ns: int) -> Times:
-    """Find spans (n, 2) in which fixes are missing, including the one after the last fix."""
-    times = np.append(stream.publish_time_ns, end_ns)
-    long = np.diff(times) > gap_limit_ns(stream.publish_time_ns)
-    return np.stack([times[:-1][long], times[1:][long]], axis=1)
 
 
 def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
@@ -301,11 +294,7 @@ def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
     if component in ANGLES:
         if not set(ORIENTATION) <= set(body.names):
             return None
-        from scipy.spatial.transform import Rotation
-
-        turned = Rotation.from_quat(body.columns(ORIENTATION), scalar_first=True)
-        angles = turned.as_euler("ZYX", degrees=True)[:, ::-1]
-        return angles[:, ANGLES.index(component)], None
+        return euler_deg(body.columns(ORIENTATION))[:, ANGLES.index(component)], None
     if component not in body.names:
         return None
     scale = shown_unit(component)[2]
@@ -313,6 +302,17 @@ def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
     if body.deviations is None:
         return values, None
     return values, scale * body.deviations[:, body.tangent.index(component)]
+
+
+def euler_deg(quaternions: Floats) -> Floats:
+    """Convert quaternions to roll, pitch and yaw (n, 3) in deg (about x, y and z); NaN if invalid."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    angles = np.full((len(quaternions), 3), np.nan)
+    known = np.linalg.norm(quaternions, axis=1) > 0.0
+    turned = Rotation.from_quat(quaternions[known], scalar_first=True)
+    angles[known] = turned.as_euler("ZYX", degrees=True)[:, ::-1]
+    return angles
 
 
 def _draw_band(

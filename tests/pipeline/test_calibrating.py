@@ -13,16 +13,18 @@ from scipy.stats import binom
 import fuselog as fl
 from fuselog.pipeline.altering.alterations import delayed
 from fuselog.pipeline.calibrating import study
-from fuselog.pipeline.calibrating.car import (
+from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
+from fuselog.pipeline.calibrating.manoeuvres import (
     NAMES,
     OURS,
     TRUTH,
     WIDE,
+    _simulated,
+    advice,
     drive,
+    gain,
     recorded,
 )
-from fuselog.pipeline.calibrating.kalibr import FILE, kalibr_yaml
-from fuselog.pipeline.calibrating.manoeuvres import _simulated, advice, gain
 from fuselog.pipeline.diagnosing.battery.car import drive as battery_drive
 from fuselog.pipeline.diagnosing.battery.car import late
 from fuselog.pipeline.diagnosing.battery.car import recorded as battery_recorded

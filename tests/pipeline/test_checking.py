@@ -12,9 +12,9 @@ import pytest
 
 import fuselog as fl
 from fuselog.pipeline.checking.checking import Checked
+from fuselog.pipeline.checking.command import write_junit
 from fuselog.pipeline.checking.discrepancies import Discrepancy, discrepancies
 from fuselog.pipeline.checking.golden import Replayed, checksums
-from fuselog.pipeline.checking.junit import write_junit
 from fuselog.pipeline.checking.stored import read, write
 from fuselog.recorders.log import LogWriter
 from fuselog.testing import _require, assert_golden

@@ -31,60 +31,43 @@ UNIT_RUNS = 5  # runs of each fault of the unit per run of a cell; they take a t
 
 
 class Right(NamedTuple):
-    """The correct diagnosis, with kind, topic, component, and the value if there is one."""
+    """The correct diagnosis, with kind, topic, component, and the value if there is one.
+
+    `spreads` are the standard deviations of the reference implementation's values over runs, with and
+    without a compass. For noise, the value is the logarithm of a ratio of standard deviations.
+    """
 
     kind: Kind
     topic: str
     part: str = ""
-    value: float | None = None
+    value: float = np.nan
+    spreads: tuple[float, float] = (np.nan, np.nan)
 
 
-_MIRROR = (
-    Right("factor or sign", ODOMETRY, "turn_radps", -1.0),
-    Right("exchanged axes", FIX, "position_m"),
-)
-RIGHT: dict[str, Sequence[Right]] = {
-    "nothing": (),
-    "fixes .3 s late": (Right("delay", FIX, "", 0.3),),
-    "turn rate's sign": _MIRROR[:1],
-    "speed x 3.6": (Right("factor or sign", ODOMETRY, "forward_mps", 3.6),),
-    "speed / 3.6": (Right("factor or sign", ODOMETRY, "forward_mps", 1.0 / 3.6),),
-    "speed x .3048": (Right("factor or sign", ODOMETRY, "forward_mps", 0.3048),),
-    "lever (2, .6) m": (Right("parameter", "lever_x_m", "lever_x_m", 2.0),),
-    "fix variance x 4": (Right("measurement noise", FIX, "", -np.log(2.0)),),
-    "fix variance / 16": (Right("measurement noise", FIX, "", np.log(4.0)),),
-    "sd written as variance": (Right("measurement noise", FIX, "", -0.5 * np.log(2.0)),),
-    "E, N exchanged": _MIRROR[1:],
-    "degrees as radians": (Right("factor or sign", ODOMETRY, "turn_radps", 180.0 / np.pi),),
-    "gyro bias .02": (Right("bias or turned frame", ODOMETRY, "turn_radps", 0.02),),
-    "gyro bias .0004 t": (Right("drifting bias", ODOMETRY, "turn_radps", 0.0004),),
-    "odometry clock 6 % fast": (Right("clock drift", ODOMETRY, "", 0.06),),
-    "fixes 18 s late": (Right("delay", FIX, "", 18.0),),
-    "half of the odometry lost": (Right("lost messages", ODOMETRY),),
-    "gyro density / 5": (Right("process noise", "turn_noise_density", "", np.log(5.0)),),
-    "compass + 4.5 deg": (Right("bias or turned frame", HEADING, "heading_rad", np.radians(4.5)),),
-    "compass clockwise from north": (Right("convention", HEADING, "heading_rad"),),
-}
-
-# Standard deviations of the reference implementation's estimates over runs, with and without a compass;
-# for noise, those of the logarithm of a standard deviation.
-SPREADS: dict[str, tuple[float, float]] = {
-    "fixes .3 s late": (0.00685, 0.0113),
-    "turn rate's sign": (0.0056, 0.00616),
-    "speed x 3.6": (0.00394, 0.00438),
-    "speed / 3.6": (0.000301, 0.000335),
-    "speed x .3048": (0.000335, 0.000381),
-    "lever (2, .6) m": (0.0592, 0.133),
-    "fix variance x 4": (0.0359, 0.0363),
-    "fix variance / 16": (0.0359, 0.0363),
-    "sd written as variance": (0.0359, 0.0363),
-    "degrees as radians": (0.321, 0.353),
-    "gyro bias .02": (0.000998, 0.00112),
-    "gyro bias .0004 t": (3.41e-5, 4.49e-5),
-    "odometry clock 6 % fast": (0.000133, 0.000175),
-    "fixes 18 s late": (0.00741, 0.028),
-    "gyro density / 5": (0.1885, 0.2255),
-    "compass + 4.5 deg": (0.00165, np.nan),
+_FACTOR: Kind = "factor or sign"
+_BIAS: Kind = "bias or turned frame"
+_NOISE: Kind = "measurement noise"
+_OF_FIXES = (0.0359, 0.0363)
+RIGHT: dict[str, Right] = {
+    "fixes .3 s late": Right("delay", FIX, "", 0.3, (0.00685, 0.0113)),
+    "turn rate's sign": Right(_FACTOR, ODOMETRY, "turn_radps", -1.0, (0.0056, 0.00616)),
+    "speed x 3.6": Right(_FACTOR, ODOMETRY, "forward_mps", 3.6, (0.00394, 0.00438)),
+    "speed / 3.6": Right(_FACTOR, ODOMETRY, "forward_mps", 1.0 / 3.6, (0.000301, 0.000335)),
+    "speed x .3048": Right(_FACTOR, ODOMETRY, "forward_mps", 0.3048, (0.000335, 0.000381)),
+    "lever (2, .6) m": Right("parameter", "lever_x_m", "lever_x_m", 2.0, (0.0592, 0.133)),
+    "fix variance x 4": Right(_NOISE, FIX, "", -np.log(2.0), _OF_FIXES),
+    "fix variance / 16": Right(_NOISE, FIX, "", np.log(4.0), _OF_FIXES),
+    "sd written as variance": Right(_NOISE, FIX, "", -0.5 * np.log(2.0), _OF_FIXES),
+    "E, N exchanged": Right("exchanged axes", FIX, "position_m"),
+    "degrees as radians": Right(_FACTOR, ODOMETRY, "turn_radps", 180.0 / np.pi, (0.321, 0.353)),
+    "gyro bias .02": Right(_BIAS, ODOMETRY, "turn_radps", 0.02, (0.000998, 0.00112)),
+    "gyro bias .0004 t": Right("drifting bias", ODOMETRY, "turn_radps", 0.0004, (3.41e-5, 4.49e-5)),
+    "odometry clock 6 % fast": Right("clock drift", ODOMETRY, "", 0.06, (0.000133, 0.000175)),
+    "fixes 18 s late": Right("delay", FIX, "", 18.0, (0.00741, 0.028)),
+    "half of the odometry lost": Right("lost messages", ODOMETRY),
+    "gyro density / 5": Right("process noise", "turn_noise_density", "", np.log(5.0), (0.1885, 0.2255)),
+    "compass + 4.5 deg": Right(_BIAS, HEADING, "heading_rad", np.radians(4.5), (0.00165, np.nan)),
+    "compass clockwise from north": Right("convention", HEADING, "heading_rad"),
 }
 # Expected finding for each fault of the unit: kind, topic and number.
 UNIT_RIGHT: dict[str, tuple[Kind, str, float] | None] = {
@@ -142,18 +125,17 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     lost = [[Right(each.kind, each.where)] for each in seen if each.kind in FIRST]
     others = [each for each in seen if each.kind not in FIRST and each.where not in known]
     named = [*lost, *causes, *([Right(each.kind, each.where)] for each in others)]
-    right = [each[:3] for each in RIGHT[cell.fault]]
-    places = [any(one[:3] in right for one in each) for each in named]
-    value, gain = np.nan, np.nan
+    right = RIGHT.get(cell.fault)
+    wanted = right[:3] if right else None
+    places = [any(one[:3] == wanted for one in each) for each in named]
+    value, gain, within = np.nan, np.nan, np.nan
     for cause in found.causes[:1] if any(places) else ():
-        values = [one.value for one in named_by(cause) if one[:3] in right]
-        value = values[0] if values and values[0] is not None else np.nan
+        value = next((one.value for one in named_by(cause) if one[:3] == wanted), np.nan)
         gain = cause.gain
     remedies = [cause.hypothesis.remedy(cause.value) for cause in found.causes[:1]]
-    planted, within = RIGHT[cell.fault], np.nan
-    if planted and planted[0].value is not None:
-        spread = SPREADS[cell.fault][0 if cell.has_compass else 1]
-        within = float(abs(value - planted[0].value) < 4.0 * spread)
+    if right and np.isfinite(right.value):
+        spread = right.spreads[0 if cell.has_compass else 1]
+        within = float(abs(value - right.value) < 4.0 * spread)
     return {
         **cell._asdict(),
         "cell": cell.name,
@@ -192,7 +174,7 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
         "faults": " + ".join(faults),
         "has_prior": has_prior,
         "seed": seed,
-        "are_named": all(any(one[:3] in named for one in RIGHT[fault]) for fault in faults),
+        "are_named": all(RIGHT[fault][:3] in named for fault in faults),
         "first": " ".join(filter(None, next(named_by(found.causes[0]))[:3])) if found.causes else "",
     }
 

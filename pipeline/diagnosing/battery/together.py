@@ -89,12 +89,12 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
     """Plant faults, and test whether causes name them with intervals that cover the true values."""
     log = recorded(faulty(seed, *faults), has_prior=True)
     causes = seek(log, "ekf", OPEN, MOST_SENTENCES).causes
-    planted = [RIGHT[name][0] for name in faults]
+    planted = [RIGHT[name] for name in faults]
     found = [_estimate(causes, right) for right in planted]
     values = [
         each.low <= right.value <= each.high
         for each, right in zip(found, planted, strict=True)
-        if each is not None and right.value is not None and each.low != each.high
+        if each is not None and np.isfinite(right.value) and each.low != each.high
     ]
     first = causes[0].hypothesis.kind if causes else ""
     return {

@@ -1,5 +1,6 @@
 """The glossary at the end of a page, with two sentences and a link for each word."""
 
+import re
 from typing import NamedTuple
 
 from fuselog.replay.judging.intervals import FEWEST_RUNS
@@ -14,6 +15,7 @@ class Term(NamedTuple):
 
 
 _WIKI = "https://en.wikipedia.org/wiki"
+# By a pattern of the quantities that need the word.
 _TERMS = {
     "rmse": Term(
         "RMS error",
@@ -28,14 +30,14 @@ _TERMS = {
         "means overconfident, a smaller one conservative.",
         f"{_WIKI}/Mahalanobis_distance",
     ),
-    "nis": Term(
+    "^nis": Term(
         "NIS",
         "Normalised innovation squared: the squared difference between measured and predicted values, "
         "normalised by the covariance that the filter predicts. It needs no truth; 1 per component is "
         "ideal.",
         f"{_WIKI}/Innovation_(signal_processing)",
     ),
-    "interval": Term(
+    "": Term(
         "95 % from ... to ...",
         "The range that contains the true value with 95 % confidence. The unit is a run, because errors "
         f"within a run are correlated. Fewer than {FEWEST_RUNS} runs give no interval.",
@@ -47,7 +49,7 @@ _TERMS = {
         "or it is less than 2 %. Take the simpler one, or make more runs.",
         f"{_WIKI}/Paired_difference_test",
     ),
-    "likelihood": Term(
+    "^log_likelihood$": Term(
         "Log-likelihood",
         "The logarithm of the probability density that the filter assigned to the measurements before "
         "using them. Higher is better; its absolute value has no meaning.",
@@ -71,7 +73,7 @@ _TERMS = {
         "errors; 1 is best.",
         "https://arxiv.org/abs/1609.01775",
     ),
-    "gate": Term(
+    "^gated_share$": Term(
         "Gate",
         "A filter rejects measurements that are too unlikely. A few rejections are expected; many mean "
         "that the measurement noise is understated or the measurements are wrong.",
@@ -82,16 +84,8 @@ _TERMS = {
 
 def glossary(keys: set[str], *, draws: bool) -> list[Term]:
     """Select the entries for a page with these quantities; `draws` adds the entry on ties."""
-    needed = {
-        "rmse": any("rmse" in key for key in keys),
-        "nees": any("nees" in key for key in keys),
-        "nis": any(key.startswith("nis") for key in keys),
-        "interval": bool(keys),
-        "tie": draws,
-        "likelihood": "log_likelihood" in keys,
-        "gospa": any("gospa" in key for key in keys),
-        "hota": any("hota" in key for key in keys),
-        "idf1": any("idf1" in key for key in keys),
-        "gate": "gated_share" in keys,
-    }
-    return [term for name, term in _TERMS.items() if needed[name]]
+    return [
+        term
+        for pattern, term in _TERMS.items()
+        if (draws if pattern == "tie" else any(re.search(pattern, key) for key in keys))
+    ]

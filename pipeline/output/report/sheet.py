@@ -11,6 +11,7 @@ import pandas as pd
 from fuselog.pipeline.output.report.evidence import MARGIN, Findings
 from fuselog.pipeline.output.report.story import choice_of
 from fuselog.pipeline.output.results import Measured, MetricTable
+from fuselog.pipeline.output.terminal import over_cases
 from fuselog.pipeline.output.words import (
     ACCURACY,
     CONSISTENCY,
@@ -104,7 +105,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
 def _medians(tables: list[MetricTable]) -> MetricTable:
     """Compute the median over the cases that have a value."""
     quantities: dict[str, dict[str, Measured]] = {}
-    for key, of in _numbers(tables).items():
+    for key, of in over_cases(tables).items():
         quantities[key] = {label: Measured(float(median(values))) for label, values in of.items()}
     return MetricTable("", tables[0].estimators, quantities)
 
@@ -112,18 +113,8 @@ def _medians(tables: list[MetricTable]) -> MetricTable:
 def _spreads(tables: list[MetricTable]) -> dict[str, dict[str, tuple[float, float]]]:
     return {
         key: {label: (min(values), max(values)) for label, values in of.items()}
-        for key, of in _numbers(tables).items()
+        for key, of in over_cases(tables).items()
     }
-
-
-def _numbers(tables: list[MetricTable]) -> dict[str, dict[str, list[float]]]:
-    found: dict[str, dict[str, list[float]]] = {}
-    for table in tables:
-        for key, values in table.quantities.items():
-            for label, each in values.items():
-                if isinstance(each.value, int | float) and math.isfinite(each.value):
-                    found.setdefault(key, {}).setdefault(label, []).append(float(each.value))
-    return found
 
 
 def _sheet(

@@ -87,19 +87,26 @@ class Sweep:
 
     def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
         """Collect findings for estimators at one point each, as for the estimators of an experiment."""
-        metrics, bounds, rows = {}, {}, []
+        found, rows = {}, []
         for name, (label, point) in places.items():
             own = self.table[(self.table["estimator"] == label) & (self.table["point"] == point)]
             for row in own.to_dict("records"):
-                key = ".".join(filter(None, (name, row["quantity"], row["case"])))
-                metrics[key] = row["value"]
-                if math.isfinite(row.get("bound_low", math.nan)):
-                    bounds[key] = (row["bound_low"], row["bound_high"])
+                found[".".join(filter(None, (name, row["quantity"], row["case"])))] = row
             if len(self.rows):
                 is_here = (self.rows["estimator"] == label) & (self.rows["point"] == point)
                 rows.append(self.rows[is_here].assign(estimator=name))
+        return self._findings(found, {"runs": pd.concat(rows)} if rows else {})
+
+    def _findings(self, rows: Mapping[str, Mapping[Any, Any]], tables: Tables) -> Findings:
+        """Collect findings on rows of the table, by the key of the metric."""
+        metrics = {key: row["value"] for key, row in rows.items()}
+        bounds = {
+            key: (row["bound_low"], row["bound_high"])
+            for key, row in rows.items()
+            if math.isfinite(row.get("bound_low", math.nan))
+        }
         here = self.result.model_copy(update={"metrics": metrics, "bounds": bounds})
-        return findings(here, {"runs": pd.concat(rows)} if rows else {})
+        return findings(here, tables)
 
     @property
     def of_world(self) -> bool:
@@ -112,15 +119,11 @@ class Sweep:
 
     def everywhere(self) -> Findings:
         """Collect findings over all points, as if each point were a case of an experiment."""
-        metrics, bounds = {}, {}
+        found = {}
         for row in self.table.to_dict("records"):
             case = ", ".join(filter(None, (self.where(int(row["point"]), brief=True), row["case"])))
-            key = f"{row['estimator']}.{row['quantity']}.{case}"
-            metrics[key] = row["value"]
-            if math.isfinite(row.get("bound_low", math.nan)):
-                bounds[key] = (row["bound_low"], row["bound_high"])
-        here = self.result.model_copy(update={"metrics": metrics, "bounds": bounds})
-        return findings(here, {"runs": self.rows})
+            found[f"{row['estimator']}.{row['quantity']}.{case}"] = row
+        return self._findings(found, {"runs": self.rows})
 
     def where(self, point: int, *, brief: bool = False) -> str:
         """Describe a point by its values, with their names or, if `brief`, without."""

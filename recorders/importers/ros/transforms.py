@@ -52,13 +52,7 @@ class Transforms:
 
     def take(self, rows: NDArray | slice) -> "Transforms":
         """Select some of the transforms."""
-        return Transforms(
-            self.stamp_ns[rows],
-            self.log_time_ns[rows],
-            self.rows[rows],
-            self.position_m[rows],
-            self.quaternion[rows],
-        )
+        return Transforms(*(each[rows] for each in vars(self).values()))
 
 
 def transforms_of(
@@ -115,13 +109,8 @@ def _frame(name: bytes) -> str:
 
 def join(parts: Sequence[Transforms]) -> Transforms:
     """Join transforms in the order of their stamps."""
-    joined = Transforms(
-        np.concatenate([part.stamp_ns for part in parts]),
-        np.concatenate([part.log_time_ns for part in parts]),
-        np.concatenate([part.rows for part in parts]),
-        np.concatenate([part.position_m for part in parts]),
-        np.concatenate([part.quaternion for part in parts]),
-    )
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    joined = Transforms(*map(np.concatenate, columns))
     return joined.take(np.argsort(joined.stamp_ns, kind="stable"))
 
 

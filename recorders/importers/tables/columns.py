@@ -162,34 +162,32 @@ _WORDS = {
 }  # fmt: skip
 _UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 # Units at the end of names.
+_SPELT = {
+    "kmh": "km/h", "kph": "km/h", "mph": "mi/h", "kts": "kn", "knots": "kn", "dps": "deg/s",
+    "feet": "ft", "meters": "m", "metres": "m", "degrees": "deg", "cdeg": "0.01 deg",
+    "microdeg": "1e-6 deg", "microdegrees": "1e-6 deg", "udeg": "1e-6 deg",
+    "semicircles": "semicircle", "sec": "s", "seconds": "s", "msec": "ms", "usec": "us", "nsec": "ns",
+}  # fmt: skip
+# Units at the end of names; the first that fits counts.
 _ENDINGS = {
-    "mps": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "km_h": "km/h", "mph": "mi/h",
-    "fps": "ft/s", "ft_s": "ft/s", "kn": "kn", "kts": "kn", "knots": "kn",
-    "radps": "rad/s", "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "dps": "deg/s",
+    "mps": "m/s", "m_s": "m/s", "km_h": "km/h", "fps": "ft/s", "ft_s": "ft/s", "kn": "kn",
+    "radps": "rad/s", "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s",
     "mps2": "m/s^2", "m_s2": "m/s^2", "ut": "uT", "rad": "rad", "deg": "deg", "m": "m",
-    "ft": "ft", "feet": "ft", "ns": "ns", "us": "us", "ms": "ms", "s": "s",
-    "mm": "mm", "cm": "cm", "mm_s": "mm/s", "cm_s": "cm/s", "cdeg": "0.01 deg",
-    "semicircles": "semicircle",
-    "1e7": "1e-7 deg", "e7": "1e-7 deg", "e6": "1e-6 deg", "e5": "1e-5 deg", "microdeg": "1e-6 deg",
-    "micro_degrees": "1e-6 deg", "microdegrees": "1e-6 deg", "udeg": "1e-6 deg", "usec": "us",
-    "msec": "ms",
-    "nsec": "ns", "sec": "s", "secs": "s", "seconds": "s", "nanoseconds": "ns", "microseconds": "us",
-    "milliseconds": "ms", "degrees": "deg", "meters": "m", "metres": "m", "km": "km",
+    "ft": "ft", "ns": "ns", "us": "us", "ms": "ms", "s": "s",
+    "mm": "mm", "cm": "cm", "mm_s": "mm/s", "cm_s": "cm/s",
+    "1e7": "1e-7 deg", "e7": "1e-7 deg", "e6": "1e-6 deg", "e5": "1e-5 deg",
+    "micro_degrees": "1e-6 deg", "secs": "s", "nanoseconds": "ns", "microseconds": "us",
+    "milliseconds": "ms", "km": "km", **_SPELT,
 }  # fmt: skip
 # Units in brackets that are written differently from ours.
 _WRITTEN = {
-    "degrees": "deg", "degree": "deg", "grad": "deg", "°": "deg", "meters": "m", "feet": "ft",
-    "fuss": "ft", "knots": "kn", "kts": "kn", "kt": "kn", "kmh": "km/h", "kph": "km/h", "mph": "mi/h",
-    "metres": "m", "meter": "m", "metre": "m", "sec": "s", "seconds": "s", "second": "s", "usec": "us",
-    "msec": "ms", "nsec": "ns", "dps": "deg/s",
-    "mdps": "1e-3 deg/s", "radians": "rad", "semicircles": "semicircle",
-    "gee": "g",
-    "arcminutes": "arcmin", "minutes": "min",
-    "microdegrees": "1e-6 deg", "microdeg": "1e-6 deg", "udeg": "1e-6 deg", "cdeg": "0.01 deg",
-    "centidegrees": "0.01 deg", "µs": "us", "µt": "uT",
-    "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2",
-    "m/s²": "m/s^2", "degc": "", "utesla": "uT", "gauss": "G",
+    **_SPELT, "degree": "deg", "grad": "deg", "°": "deg", "fuss": "ft", "kt": "kn", "meter": "m",
+    "metre": "m", "second": "s", "mdps": "1e-3 deg/s", "radians": "rad", "gee": "g",
+    "arcminutes": "arcmin", "minutes": "min", "centidegrees": "0.01 deg", "µs": "us", "µt": "uT",
+    "ft_msl": "ft", "m/s/s": "m/s^2", "m/s2": "m/s^2", "m/s²": "m/s^2", "degc": "", "utesla": "uT",
+    "gauss": "G",
 }  # fmt: skip
+_MARKS = str.maketrans({"\u03bc": "\u00b5", "°": "deg", "(": "", ")": ""})
 
 
 def parted(name: str) -> tuple[str, str]:
@@ -213,14 +211,7 @@ def bracketed(name: str) -> re.Match[str] | None:
 
 def unit_in(text: str) -> str:
     """Return the unit that a text such as °/s, knots or m/(s^2) means, or an empty string."""
-    bare = (
-        text.strip()
-        .strip("()[]")
-        .replace("\u03bc", "\u00b5")
-        .replace("°", "deg")
-        .replace("(", "")
-        .replace(")", "")
-    )
+    bare = text.strip().strip("()[]").translate(_MARKS)
     if re.fullmatch(r"(?i)hh:?mm:?ss(\.s+)?", bare):
         return TIME_OF_DAY
     if bare.lower().startswith("deg") and (scaled := re.fullmatch(r"(?i)deg_?\*?1?e-?(\d)", bare)):

@@ -250,6 +250,14 @@ def open_text(path: Path) -> BinaryIO:
     return cast(BinaryIO, io.BufferedReader(Chunks(_with_newlines(file))))
 
 
+def texts_in(path: Path) -> Iterator[str]:
+    """Yield the lines of a text that are not blank."""
+    with open_text(path) as file:
+        for line in lines_of(file):
+            if text := line.decode("utf-8", "replace").strip():
+                yield text
+
+
 def _with_newlines(file: BinaryIO) -> Iterator[bytes]:
     with file:
         while chunk := file.read(BLOCK_BYTES):

@@ -372,7 +372,7 @@ def _by_name(
     """Choose a unit by names and sizes; return it with the reason, or empty strings."""
     if "deg" in fitting and "rad" not in fitting:
         return "deg", "by their size"
-    if fitting == ["deg", "rad"] or set(fitting) == {"deg", "rad"}:
+    if set(fitting) == {"deg", "rad"}:
         return (
             "rad",
             f'by their size, up to {np.nanmax(np.abs(place[0].values)):.4g}; units = "deg" if not',
@@ -385,15 +385,9 @@ def _by_name(
     is_fit = all(re.fullmatch("(.*_)?position_(lat|long)", name) for name in plain)
     if "semicircle" in fitting and is_fit:
         return "semicircle", "as files of FIT have them"
-    if (
-        "1e-7 deg" in fitting
-        and plain[0] in ("lat", "latitude")
-        and "semicircle" in fitting
-        and len(fitting) <= 3
-    ):
-        largest = float(np.nanmax(np.abs(place[0].values)))
-        if largest > 9e7:
-            return "1e-7 deg", "as u-blox, PX4 and MAVLink have them"
+    is_alike = {"1e-7 deg", "semicircle"} <= {*fitting} and len(fitting) <= 3
+    if is_alike and plain[0] in ("lat", "latitude") and np.nanmax(np.abs(place[0].values)) > 9e7:
+        return "1e-7 deg", "as u-blox, PX4 and MAVLink have them"
     if len(fitting) == 1:
         return fitting[0], "by their size"
     return "", ""

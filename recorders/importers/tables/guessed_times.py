@@ -345,6 +345,7 @@ def _tried(
     except BadInput as error:
         refusals.append(error)
         return None
+    comments = [*comments]
     known = stamps[stamps != NOT_A_TIME]
     label = f"{table.path}: column {' and '.join(columns)}"
     if len(known) < 2 or known.min() == known.max():
@@ -363,20 +364,16 @@ def _tried(
         rollover = 0 if mapping.unit == "date" else _rollover(table, mapping, parts, back)
         if rollover:
             mapping = mapping.model_copy(update={"rollover": float(rollover)})
-            comments = [
-                *comments,
-                f"{ASSUMED}{columns[0]}: rolls over at {rollover}, and is unwrapped; rollover",
-            ]
+            comments.append(
+                f"{ASSUMED}{columns[0]}: rolls over at {rollover}, and is unwrapped; rollover"
+            )
             stamps = _stamps(table, mapping)
         elif back == 1 and not vehicle:
             vehicle = _separating(table, stamps, columns)
             codes = _codes(table.batch, vehicle) if vehicle else codes
         parts = _parts(stamps, codes)
     if back == -1:
-        comments = [
-            *comments,
-            f"{ASSUMED}rows: newest first, as their times decrease, so reversed; order",
-        ]
+        comments.append(f"{ASSUMED}rows: newest first, as their times decrease, so reversed; order")
     try:
         for part in parts:
             order = Order(label, mapping)
@@ -386,10 +383,7 @@ def _tried(
         refusals.append(error)
         return None
     if vehicle:
-        comments = [
-            *comments,
-            f"{ASSUMED}{vehicle}: {len(parts)} vehicles, each with a namespace; vehicle",
-        ]
+        comments.append(f"{ASSUMED}{vehicle}: {len(parts)} vehicles, each with a namespace; vehicle")
     seen = _seen([stamps[part] for part in parts])
     return GuessedTime(_toml(mapping), {*columns}, [*seen, *comments], stamps, vehicle)
 

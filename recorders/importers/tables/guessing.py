@@ -43,6 +43,7 @@ from fuselog.recorders.importers.tables.files import (
     floats,
     open_table,
     open_text,
+    texts_in,
 )
 from fuselog.recorders.importers.tables.guessed_places import prepared_lines, without_codes
 from fuselog.recorders.importers.tables.guessed_times import GuessedTime, first_cell, guess_time
@@ -140,13 +141,6 @@ def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
     return [*joined, *(Source(path, name) for path, name in files if path not in taken)]
 
 
-def stamps_in(path: Path) -> list[str]:
-    """Read the lines of a file of times, except blank ones."""
-    with open_text(path) as file:
-        lines = [line.decode("utf-8", "replace").strip() for line in lines_of(file)]
-    return [line for line in lines if line]
-
-
 def _count(path: Path, most: int) -> int:
     """Count the rows of a text, up to `most`; 0 if it cannot be read."""
     try:
@@ -159,11 +153,11 @@ def _count(path: Path, most: int) -> int:
 
 def _columns(first: Path, others: Sequence[Path]) -> tuple[tuple[str, ...], set[Path]]:
     """Find a file that lists columns as lines `name: meaning`; return the names and the file."""
-    width = len(stamps_in(first)[0].replace(",", " ").split())
+    width = len(next(texts_in(first)).replace(",", " ").split())
     for path in others:
         try:
             named = [
-                re.match(r"\s*([A-Za-z]\w*)\s*:", line) for line in islice(stamps_in(path), width + 1)
+                re.match(r"\s*([A-Za-z]\w*)\s*:", line) for line in islice(texts_in(path), width + 1)
             ]
         except (OSError, ValueError, BadInput):
             continue
@@ -414,7 +408,7 @@ def _time(
     if source.stamps is None:
         return guess_time(source.path, batch, columns, texts, has_others=has_others)
     path, name = source.stamps
-    cells = pa.array(stamps_in(path)[: len(next(iter(batch.values())))], pa.string())
+    cells = pa.array(islice(texts_in(path), len(next(iter(batch.values())))), pa.string())
     values = _numbers(cells)
     own = [] if values is None else [GuessedColumn(_STAMP, _STAMP, "", values)]
     found = guess_time(path, {_STAMP: cells}, own, [] if own else [_STAMP])

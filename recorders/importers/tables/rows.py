@@ -4,7 +4,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +27,6 @@ from fuselog.recorders.importers.mapping import (
     with_unit_quaternions,
 )
 from fuselog.recorders.importers.stamps import NOT_A_TIME, Stamps, to_ns
-from fuselog.recorders.importers.tables.blocks import lines_of
 from fuselog.recorders.importers.tables.cells import read_ns, sided
 from fuselog.recorders.importers.tables.files import (
     Batch,
@@ -36,7 +34,7 @@ from fuselog.recorders.importers.tables.files import (
     TextOptions,
     floats,
     open_table,
-    open_text,
+    texts_in,
 )
 from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
 from fuselog.recorders.importers.tables.plane import Plane
@@ -151,7 +149,7 @@ class Rows:
         if self._stamps_path is None:
             yield from batches
             return
-        lines = _lines(self._stamps_path)
+        lines = texts_in(self._stamps_path)
         count = 0
         for batch in batches:
             stamps = list(islice(lines, _size(batch)))
@@ -654,11 +652,3 @@ def _times_in(stream: TableStream) -> Iterator[str]:
     for name in times & stream.fields.keys():
         if isinstance(source := stream.fields[name], str):
             yield source
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text that are not blank."""
-    with open_text(path) as file:
-        for line in lines_of(file):
-            if text := line.decode("utf-8", "replace").strip():
-                yield text

@@ -118,15 +118,10 @@ class _Table(NamedTuple):
     values: Floats
 
     def take(self, which: NDArray | slice) -> "_Table":
-        return _Table(self.key_us[which], self.time_us[which], self.logged_us[which], self.values[which])
+        return _Table._make(each[which] for each in self)
 
     def then(self, other: "_Table") -> "_Table":
-        return _Table(
-            np.concatenate([self.key_us, other.key_us]),
-            np.concatenate([self.time_us, other.time_us]),
-            np.concatenate([self.logged_us, other.logged_us]),
-            np.concatenate([self.values, other.values]),
-        )
+        return _Table._make(map(np.concatenate, zip(self, other, strict=True)))
 
 
 def label_of(instance: int) -> str:

@@ -165,17 +165,10 @@ class _Import:
         file = self._file
         streams = []
         if file.parameters:
-            names = list(file.parameters)
-            values = [list(file.parameters.values())]
-            times = [file.start_us]
+            names, rows, times = list(file.parameters), [file.parameters], [file.start_us]
             for time_us, name, value in file.changes:
-                if name in file.parameters and value != values[-1][names.index(name)]:
-                    values.append(
-                        [
-                            value if each == name else old
-                            for each, old in zip(names, values[-1], strict=True)
-                        ]
-                    )
+                if name in rows[-1] and value != rows[-1][name]:
+                    rows.append({**rows[-1], name: value})
                     times.append(max(time_us, times[-1]))
             metadata = {"components": ",".join(names), "kinds": ",".join(["linear"] * len(names))}
             streams.append(
@@ -184,7 +177,7 @@ class _Import:
                     schemas.VECTOR_MEASUREMENT,
                     to_ns(times, 1000, where=f"{file.path}: its parameters"),
                     metadata=metadata,
-                    value=np.array(values),
+                    value=np.array([[*row.values()] for row in rows]),
                 )
             )
         if file.dropouts:

@@ -163,13 +163,13 @@ class Worker:
             return reply
 
 
-def state_of(library: str) -> list[int]:
-    """Return the modification time and size of a library, by which processes detect a new version."""
+def state_of(file: str) -> tuple[int, int]:
+    """Return the modification time and size of a file, such as a library, to detect a new version."""
     try:
-        state = Path(library).stat()
-    except OSError:
-        return [0, 0]
-    return [state.st_mtime_ns, state.st_size]
+        state = Path(file).stat()
+    except (OSError, ValueError):
+        return 0, 0
+    return state.st_mtime_ns, state.st_size
 
 
 class Ran(NamedTuple):
@@ -285,7 +285,6 @@ def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
     """Process runs with filters in parallel, one process per core; None for runs without input."""
-    count = max(1, min(core_count(), sum(each is not None for each in runs)))
     workers = Workers()
 
     def one(given: RunGiven | None) -> Ran | None:
@@ -297,19 +296,22 @@ def follow_runs_apart(
             if ran is not None:
                 return ran
 
-    return in_threads(one, runs, count, workers.end)
+    return in_threads(one, runs, [workers])
 
 
 def in_threads(
-    work: Callable[[Given], Found], items: Sequence[Given], count: int, stop: Callable[[], None]
+    work: Callable[[Given], Found],
+    items: Sequence[Given],
+    started: "Sequence[Workers | Program]",
 ) -> list[Found]:
-    """Process all items in threads; `stop` ends the processes for which the threads wait."""
-    with ThreadPoolExecutor(count) as threads:
+    """Process all items in threads; at the end, also end what they have `started` and wait for."""
+    with ThreadPoolExecutor(max(1, min(core_count(), len(items)))) as threads:
         try:
             return [each.result() for each in [threads.submit(work, item) for item in items]]
         finally:
             threads.shutdown(wait=False, cancel_futures=True)
-            stop()
+            for each in started:
+                each.end()
 
 
 def describe_apart(library: str) -> str:

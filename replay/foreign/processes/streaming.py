@@ -27,7 +27,6 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 
-from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput, printable
 from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.foreign.description import Description, read_description
@@ -294,8 +293,4 @@ def follow_runs_streaming(
     def one(given: RunGiven | None) -> Ran | None:
         return None if given is None else follow_stream(words, given, description, limits, started)
 
-    def stop() -> None:
-        for each in started:
-            each.end()
-
-    return in_threads(one, runs, max(1, min(core_count(), len(runs))), stop)
+    return in_threads(one, runs, started)

@@ -180,7 +180,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
     """Describe rejected measurements by the sensors with a message of the same stamp and target."""
     sensed = {
-        _within(topic, case): scene.read(topic)
+        within(topic, case): scene.read(topic)
         for topic in scene.topics_near(case)
         if scene.source.topics[topic].schema_name not in NOT_SENSED | CONTROLS
     }
@@ -204,7 +204,7 @@ def _targets(stream: Stream) -> list[int]:
     return stream.columns.get("target_id", none).tolist()
 
 
-def _within(topic: str, case: str) -> str:
+def within(topic: str, case: str) -> str:
     """Return the name of a topic within its case."""
     return topic.removeprefix(f"/{case}").removeprefix("/")
 
@@ -218,12 +218,12 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
         if f"{topic}/outages" in scene.source.topics:
             stated = scene.read(f"{topic}/outages")
             outages = np.stack([stated.publish_time_ns, stated["end_time_ns"]], axis=1)
-        gaps = _gaps(scene.read(topic))
-        explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
-        sensor = _within(topic, case)
+        silent = gaps(scene.read(topic))
+        explained = (silent[:, None, 0] < outages[:, 1]) & (outages[:, 0] < silent[:, None, 1])
+        sensor = within(topic, case)
         yield from _changes(sensor, scene.read(topic))
         yield _spans(sensor, "outage of", outages)
-        yield _spans(sensor, "no messages for", gaps[~explained.any(axis=1)])
+        yield _spans(sensor, "no messages for", silent[~explained.any(axis=1)])
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
@@ -238,10 +238,13 @@ def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
             yield Happened(sensor, "INFO", stream.publish_time_ns[rows], texts)
 
 
-def _gaps(stream: Stream) -> Times:
-    """Find gaps (n, 2), start and end, that are much longer than the usual interval of a sensor."""
-    times = stream.publish_time_ns
-    long = np.diff(times) > gap_limit_ns(times)
+def gaps(stream: Stream, *end_ns: int) -> Times:
+    """Find gaps (n, 2), start and end, that are much longer than the usual interval of a sensor.
+
+    With the end of the run, the time after the last message can also be a gap.
+    """
+    times = np.append(stream.publish_time_ns, np.array(end_ns, np.int64))
+    long = np.diff(times) > gap_limit_ns(stream.publish_time_ns)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)
 
 
