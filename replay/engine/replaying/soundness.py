@@ -25,7 +25,7 @@ INDEFINITE = 1e-9
 ASYMMETRIC = 1e-6
 # Fraction of a variance that has to remain for a covariance to be far from singular.
 CLEAR = 1e-10
-LANES = 32  # estimates that are tested together
+LANES = 16  # estimates that are tested together
 
 
 class Work(NamedTuple):
@@ -34,12 +34,11 @@ class Work(NamedTuple):
     factor: Floats
     lanes: Floats
     scale: Floats
-    share: Floats
 
 
 def work_space(size: int) -> Work:
     """Make the work space for covariances (size, size)."""
-    return Work(np.empty((size, size)), np.empty((size, size, LANES)), np.empty(LANES), np.empty(LANES))
+    return Work(np.empty((size, size)), np.empty((size, size, LANES)), np.empty(LANES))
 
 
 def find_unsound(
@@ -93,7 +92,7 @@ def are_clearly_sound(first: int, mean: Floats, covariance: Floats, work: Work) 
         mean, covariance: as for `find_unsound`.
         work: work space.
     """
-    lanes, scale, share = work.lanes, work.scale, work.share
+    lanes, scale = work.lanes, work.scale
     size, is_clear = len(work.factor), True
     for lane in range(LANES):
         own, total = covariance[first + lane], 0.0
@@ -113,11 +112,9 @@ def are_clearly_sound(first: int, mean: Floats, covariance: Floats, work: Work) 
             is_clear &= CLEAR * variance < left < np.inf
             scale[lane] = 1.0 / left
         for i in range(column + 1, size):
-            for lane in range(LANES):
-                share[lane] = lanes[i, column, lane] * scale[lane]
+            share = lanes[i, column] * scale
             for k in range(column + 1, i + 1):
-                for lane in range(LANES):
-                    lanes[i, k, lane] -= share[lane] * lanes[k, column, lane]
+                lanes[i, k] -= share * lanes[k, column]
     return is_clear
 
 
