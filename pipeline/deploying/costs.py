@@ -235,7 +235,7 @@ def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) ->
     patterns = None, pattern_of(known, rows)
     square = Shape((t, t))
     if jacobian == "F":
-        first, last = (_traced(propagating_covariance(each), *(square,) * 4) for each in patterns)
+        first, last = (_traced(propagating_covariance(each), *(square,) * 3) for each in patterns)
     else:
         sizes = square, Shape((rows, t)), Shape((t, rows)), Shape((rows, rows))
         first, last = (_traced(measuring_covariance(each), *sizes) for each in patterns)

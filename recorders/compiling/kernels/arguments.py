@@ -14,7 +14,7 @@ from fuselog.recorders.compiling.kernels.values import STORED, Array, Record, co
 from fuselog.recorders.compiling.kinds import Value
 from fuselog.recorders.errors import BadInput
 
-KNOWN = 64  # sizes up to this are constants of a kernel
+KNOWN = 64  # sizes up to this are constants of a kernel, and so are those of square matrices
 
 
 class KnownArray(NamedTuple):
@@ -70,7 +70,9 @@ def with_types(value: Value, kinds: Iterator[Value]) -> Value:
         if dtype.char not in _LETTERS or not is_usual:
             why = "" if is_usual else ", unaligned or in another machine's order"
             raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
-        shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
+        is_square = len(known) > 1 and known[-1] == known[-2]
+        sizes = (size if size <= KNOWN or is_square else None for size in known)
+        shape = (*(None,) * (axes - len(known)), *sizes)
         return KnownArray(dtype.char, shape, bool(layout & _PACKED))
     for types, name in _SCALARS:
         if issubclass(kind, types):

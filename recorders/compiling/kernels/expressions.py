@@ -38,6 +38,7 @@ from fuselog.recorders.compiling.kernels.values import (
     load,
     made,
     part_of,
+    row_kind,
     store,
 )
 from fuselog.recorders.compiling.kinds import AnyArray, Value
@@ -140,7 +141,7 @@ class Expressions(Scope, ABC):
         """Convert a value to a number; raise TypeError if it is not one."""
         if isinstance(value, Number) or is_static(value):
             return value
-        if isinstance(value, Array) and not value.shape:
+        if isinstance(value, Array) and (not value.shape or row_kind(value)):
             return load(self.emitter, value)
         raise TypeError(f"a number is needed, not a {type(value).__name__}")
 

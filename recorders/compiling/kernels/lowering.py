@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from types import FunctionType
 from typing import NamedTuple
 
+from fuselog.recorders.compiling.kernels.arguments import KNOWN
 from fuselog.recorders.compiling.kernels.frame import Frame, Wider, common_value, unsure
 from fuselog.recorders.compiling.kernels.numbers import (
     REAL,
@@ -21,6 +22,7 @@ from fuselog.recorders.compiling.kernels.numbers import (
     binary,
     compare,
     constant,
+    is_row,
     is_static,
     kind_of,
 )
@@ -32,10 +34,13 @@ from fuselog.recorders.compiling.kernels.values import (
     is_local,
     load,
     part_of,
+    row_kind,
     signature,
     store,
 )
 from fuselog.recorders.compiling.kinds import Value
+
+_LEAST = 8  # numbers of a row that is copied as a whole
 
 
 class _Loop(NamedTuple):
@@ -167,6 +172,10 @@ class _Lowering(Frame):
                     load(self.emitter, source) if isinstance(source, Array) else source,
                 )
 
+        is_copied = row_kind(value) != "" and _LEAST <= int(value.shape[0]) <= KNOWN
+        if row_kind(place) and (is_copied or (isinstance(value, Number) and is_row(value.kind))):
+            store(self.emitter, place, self.scalar(value))
+            return
         size = place.shape[0]
         stop = constant(size) if isinstance(size, int) else Number(WHOLE, size)
         for index in self.counted(constant(0), stop, 1):

@@ -117,11 +117,21 @@ class Emitter:
         if not isinstance(value, Number):
             if kind == REAL:
                 return constant(float(value))
+            if is_row(kind):
+                return self.as_kind(constant(float(value)), kind)
             return constant(
                 np.uint64(value) if kind == WORD else int(value) if kind != TRUTH else bool(value)
             )
         if value.kind == kind:
             return value
+        if is_row(value.kind):
+            raise TypeError("a number is needed, not a row of an array")
+        if is_row(kind):
+            first = self.number(
+                kind, f"insertelement {kind} poison, double {self.as_kind(value, REAL).code}, i64 0"
+            )
+            places = f"<{kind[1:].partition(' ')[0]} x i32> zeroinitializer"
+            return self.number(kind, f"shufflevector {kind} {first.code}, {kind} poison, {places}")
         if kind == TRUTH:
             return self.truth(value)
         if value.kind == REAL:
@@ -139,6 +149,8 @@ class Emitter:
             return constant(bool(value))
         if value.kind == TRUTH:
             return value
+        if is_row(value.kind):
+            raise TypeError("an array is neither true nor false")
         if value.kind == REAL:
             return self.number(TRUTH, f"fcmp une double {value.code}, 0x0000000000000000")
         return self.number(TRUTH, f"icmp ne i64 {value.code}, 0")
@@ -149,6 +161,11 @@ class Emitter:
             return yes
         text = f"select i1 {condition.code}, {yes.type} {yes.code}, {no.type} {no.code}"
         return self.number(yes.kind, text)
+
+
+def is_row(kind: str) -> bool:
+    """Test whether a kind is that of a row of real numbers, with arithmetic element by element."""
+    return kind.startswith("<")
 
 
 def kind_of(value: Scalar) -> str:
@@ -162,6 +179,11 @@ def common_kind(*values: Scalar) -> str:
     Signed and unsigned integers have no common kind.
     """
     kinds = {kind_of(each) for each in values}
+    rows = [each for each in kinds if is_row(each)]
+    if len(rows) > 1:
+        raise TypeError("rows of different sizes")
+    if rows:
+        return rows[0]
     if {WORD, WHOLE} <= kinds:
         raise TypeError("signed and unsigned integers together; convert one of them")
     return max(kinds, key=_WIDTH.__getitem__)
@@ -188,7 +210,7 @@ def binary(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> N
     if operation is operator.pow:
         return power(emitter, left, right)
     kind = common_kind(left, right)
-    if operation is operator.truediv:
+    if operation is operator.truediv and not is_row(kind):
         kind = REAL
     elif operation in _BITS:
         both = [emitter.as_kind(each, kind) for each in (left, right)]
@@ -201,8 +223,8 @@ def binary(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> N
     if operation in _SHIFTS:
         shift = "ashr" if kind == WHOLE and operation is operator.rshift else _SHIFTS[operation]
         return emitter.number(kind, f"{shift} i64 {x.code}, {y.code}")
-    if kind == REAL:
-        return emitter.number(kind, f"{_REAL[operation]} double {x.code}, {y.code}")
+    if kind == REAL or is_row(kind):
+        return emitter.number(kind, f"{_REAL[operation]} {kind} {x.code}, {y.code}")
     name = _WHOLE[operation] if kind == WHOLE else _WHOLE[operation].partition(" ")[0]
     natural = x.natural and y.natural and operation is not operator.sub
     return emitter.number(kind, f"{name} i64 {x.code}, {y.code}")._replace(natural=natural)
@@ -270,7 +292,7 @@ def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
 def compare(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
     """Lower a comparison; it is false with NaN, except for `!=`."""
     kind = common_kind(left, right)
-    kind = WHOLE if kind == TRUTH else kind
+    kind = WHOLE if kind == TRUTH else REAL if is_row(kind) else kind
     x, y = (emitter.as_kind(each, kind) for each in (left, right))
     name = _ORDERED[operation]
     if kind == REAL:
@@ -282,8 +304,9 @@ def compare(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> 
 
 def negative(emitter: Emitter, x: Scalar) -> Number:
     """Lower `-x`."""
-    if kind_of(x) == REAL:
-        return emitter.number(REAL, f"fneg double {emitter.as_kind(x, REAL).code}")
+    kind = kind_of(x)
+    if kind == REAL or is_row(kind):
+        return emitter.number(kind, f"fneg {kind} {emitter.as_kind(x, kind).code}")
     return emitter.number(WHOLE, f"sub nsw i64 0, {emitter.as_kind(x, WHOLE).code}")
 
 

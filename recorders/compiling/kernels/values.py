@@ -221,8 +221,17 @@ def _moved(emitter: Emitter, array: Array, offset: Size) -> str:
     return name
 
 
+def row_kind(value: Value) -> str:
+    """Return the kind of an array that is a row of real numbers of known size; "" for other values."""
+    is_row = isinstance(value, Array) and value.dtype == "<f8" and value.strides == (1,)
+    return f"<{value.shape[0]} x {REAL}>" if is_row and isinstance(value.shape[0], int) else ""
+
+
 def load(emitter: Emitter, place: Array) -> Number:
-    """Load the number in an array without axes."""
+    """Load the number in an array without axes, or a row of numbers."""
+    kind = row_kind(place)
+    if kind:
+        return emitter.number(kind, f"load {kind}, ptr {place.pointer}, align 8")
     stored, kind = STORED[place.dtype]
     found = emitter.number(kind, f"load {stored}, ptr {place.pointer}")
     if stored == "i8" and kind == TRUTH:
@@ -236,7 +245,12 @@ def load(emitter: Emitter, place: Array) -> Number:
 
 
 def store(emitter: Emitter, place: Array, value: Scalar) -> None:
-    """Store a number in an array without axes."""
+    """Store a number in an array without axes, or a row of numbers."""
+    row = row_kind(place)
+    if row:
+        code = emitter.as_kind(value, row).code
+        emitter.add(f"store {row} {code}, ptr {place.pointer}, align 8")
+        return
     stored, kind = STORED[place.dtype]
     number = emitter.as_kind(value, kind)
     if stored == "i8" and kind == TRUTH:

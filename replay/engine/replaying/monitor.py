@@ -22,7 +22,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, make_stream, schemas
 from fuselog.recorders.log.planes import Origin, in_plane
 from fuselog.replay.engine.replaying.coverage import Coverage
-from fuselog.replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
+from fuselog.replay.engine.replaying.soundness import UNSOUND, unsound_over_runs, work_space
 from fuselog.replay.engine.replaying.usage import Usage
 from fuselog.replay.engine.streams.blocks import Ragged, join, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.failures import Failure, failure_stream, reason_of
@@ -274,7 +274,7 @@ class RunMonitor:
             covariance,
             rows,
             found,
-            scratch=_factor_of(size),
+            scratch=_memory_of(size),
         )
         bad = np.flatnonzero(found >= 0)
         for run in bad:
@@ -325,8 +325,8 @@ class RunMonitor:
 
 
 @lru_cache(maxsize=64)
-def _factor_of(size: int) -> Scratch:
-    return Scratch(partial(np.empty, (size, size)))
+def _memory_of(size: int) -> Scratch:
+    return Scratch(partial(work_space, size))
 
 
 @lru_cache(maxsize=64)

@@ -65,7 +65,7 @@ def linear_motion(bound_model: BoundModel) -> Predict:
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
         fill(mean, work.state)
-        move_covariance(covariance, work.transition, work.product, work.rest)
+        move_covariance(covariance, work.transition, work.product)
         add_noise(state, covariance, duration_s, parameters, work)
         return True
 

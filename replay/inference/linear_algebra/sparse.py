@@ -19,11 +19,9 @@ Pattern = tuple[Row, ...]
 
 
 class Propagate(Protocol):
-    """Function that replaces P (t, t) by F P F' and fills F P; the last array is working memory."""
+    """Function that replaces P (t, t) by F P F' and fills F P (t, t)."""
 
-    def __call__(
-        self, covariance: Floats, transition: Floats, product: Floats, turned: Floats, /
-    ) -> None: ...
+    def __call__(self, covariance: Floats, transition: Floats, product: Floats, /) -> None: ...
 
 
 class MeasureCovariance(Protocol):
@@ -49,47 +47,37 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
 
 
 def propagating_covariance(pattern: Pattern | None) -> Propagate:
-    """Make `move(covariance, transition, product, turned)`, which replaces P (t, t) by F P F'.
+    """Make `move(covariance, transition, product)`, which replaces P (t, t) by F P F'.
 
-    `product` becomes F P, and `turned` is working memory. All inner loops are along rows, so that the
-    compiler can process several columns together. Components that F does not change, such as a bias,
-    need no sums.
+    `product` becomes F P. Components that F does not change, such as a bias, need no sums.
     """
     if pattern is None:
-
-        def move_all(covariance: Floats, transition: Floats, product: Floats, turned: Floats) -> None:
-            propagate_covariance(covariance, transition, product)
-
-        return move_all
+        return propagate_covariance
     rows = tuple(enumerate(pattern))
     moved = tuple((row, entries) for row, entries in rows if entries != ((row, 1.0),))
     left = tuple(row for row, entries in rows if entries == ((row, 1.0),))
-    end = max((row + 1 for row, _ in moved), default=0)
-    changed = rows[:end]
 
-    def move(covariance: Floats, transition: Floats, product: Floats, turned: Floats) -> None:
-        size = len(covariance)
+    def move(covariance: Floats, transition: Floats, product: Floats) -> None:
         for row, entries in moved:
-            factors = tuple(transition[row, k] if value is None else value for k, value in entries)
-            for column in range(size):
-                entry = 0.0
-                for factor, (k, _) in zip(factors, entries, strict=True):
-                    entry += factor * covariance[k, column]
-                product[row, column] = entry
+            total = 0.0
+            for k, value in entries:
+                total += (transition[row, k] if value is None else value) * covariance[k]
+            product[row] = total
         for row in left:
             product[row] = covariance[row]
-        turned[:, :end] = product[:end].T
-        for row, entries in changed:
+        for row, entries in moved:
+            covariance[row] = product[row]
             factors = tuple(transition[row, k] if value is None else value for k, value in entries)
-            for column in range(row, end):
-                entry = 0.0
-                for factor, (k, _) in zip(factors, entries, strict=True):
-                    entry += turned[k, column] * factor
-                covariance[row, column] = entry
-            covariance[row, end:] = product[row, end:]
-        for row in range(size):
-            for column in range(min(row, end)):
-                covariance[row, column] = covariance[column, row]
+            for column, _ in moved:
+                if column >= row:
+                    entry = 0.0
+                    for factor, (k, _) in zip(factors, entries, strict=True):
+                        entry += product[column, k] * factor
+                    covariance[row, column] = entry
+        for row, _ in moved:
+            for column, _ in rows:
+                if column > row or column in left:
+                    covariance[column, row] = covariance[row, column]
 
     return move
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from fuselog.replay.engine.api.inputs import Floats, Given, Integers, Messages
 from fuselog.replay.engine.api.outputs import Estimates, Results
 from fuselog.replay.engine.replaying.estimator import Batch, Estimator, Recursive
 from fuselog.replay.engine.replaying.replaying import Report, collect, replay
-from fuselog.replay.engine.replaying.soundness import find_unsound
+from fuselog.replay.engine.replaying.soundness import LANES, unsound_over_runs, work_space
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.failures import Failure, failure_stream, sentences_of
 from fuselog.replay.engine.streams.results import failures_of
@@ -340,24 +341,30 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
         ([[0.0, 0.0], [0.0, 1.0]], True),
         ([[0.0, 0.5], [0.5, 1.0]], False),
         ([[1.0, 1.0, 0.5], [1.0, 1.0, 0.0], [0.5, 0.0, 1.0]], False),
+        ([[1.0, math.nan], [math.nan, 1.0]], False),
+        ([[1.0, 0.0], [0.0, math.inf]], False),
     ],
 )
-def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool) -> None:
-    size = len(covariance)
-    rows, found = np.full(1, 9), np.full(1, -1)
-    find_unsound(
-        0,
-        np.array([0, 1]),
+@pytest.mark.parametrize("others", [0, 2 * LANES])
+def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool, others: int) -> None:
+    """Alone, and among others that are tested together with it."""
+    size, count, place = len(covariance), others + 1, others // 2
+    covariances = np.tile(np.eye(size).ravel(), (count, 1))
+    covariances[place] = np.ravel(covariance)
+    rows, found = np.full(1, -9), np.full(1, -1)
+    unsound_over_runs(
+        1,
+        np.array([0, count]),
+        np.arange(count),
         np.zeros(1, np.int64),
-        np.zeros(1, np.int64),
-        np.zeros((1, size)),
-        np.reshape(covariance, (1, -1)),
+        np.zeros((count, size)),
+        covariances,
         rows,
         found,
-        np.empty((size, size)),
+        scratch=partial(work_space, size),
     )
     assert (found[0] < 0) == is_sound
-    assert rows[0] == (9 if is_sound else 0)
+    assert rows[0] == (-9 if is_sound else place)
 
 
 def test_a_failure_is_told_in_its_block_alone() -> None:

@@ -167,6 +167,21 @@ def parts_of_arrays(run: int, given: Given) -> None:
     out[3] **= 2
 
 
+def rows(run: int, given: Given) -> None:
+    """Arithmetic of rows, element by element."""
+    x, out = given.x, given.out[run]
+    total = 0.0
+    for k in (2, 0, 1):
+        total += x[k] * (1.0 + k) - x[run] / 3.0
+    out[:4] = total
+    out[3:] = 2.0 - out[:4]
+    out[1:3] -= -out[2:4] * x[run, 1:3]
+    long = np.zeros((2, 9))
+    long[0] += out[0]
+    long[1] = long[0]
+    out[6] = long[1, 8]
+
+
 def own_arrays(run: int, given: Given) -> None:
     """Memory of known sizes: zeroed anew in every round, filled by another function."""
     out = given.out[run]
@@ -260,6 +275,7 @@ KERNELS = (
     widening,
     tuples,
     parts_of_arrays,
+    rows,
     own_arrays,
     constants,
     integers,
@@ -408,7 +424,25 @@ def with_a_measured_range(run: int, out: np.ndarray) -> None:
         out[run] += 1.0
 
 
+def with_rows_of_two_sizes(run: int, out: np.ndarray) -> None:
+    own = np.zeros(3)
+    own[:2] = own + np.zeros(2)
+
+
+def with_a_root_of_a_row(run: int, out: np.ndarray) -> None:
+    own = np.zeros(3)
+    own[:] = np.sqrt(own)
+
+
+def with_a_row_as_truth(run: int, out: np.ndarray) -> None:
+    if np.zeros(3) + 1.0:
+        out[run] = 1.0
+
+
 REFUSED = {
+    with_rows_of_two_sizes: "rows of different sizes",
+    with_a_root_of_a_row: "a number is needed, not a row of an array",
+    with_a_row_as_truth: "an array is neither true nor false",
     with_try: "a kernel has no try statements",
     with_growth: "an array that is created here needs known sizes; pass it as scratch",
     with_returned_memory: "it returns an array that it created; pass an array that it fills",
