@@ -14,7 +14,13 @@ from fuselog.pipeline.altering.changes import WHATS, is_of_topic, is_parameter
 from fuselog.pipeline.api.catalog import Entry, rows_of, stated_of
 from fuselog.pipeline.logs.constraints import ConstraintParameters
 from fuselog.pipeline.output.terminal import print_table
-from fuselog.pipeline.runs.experiment import Experiment, Study, experiment_of_logs, read_experiment
+from fuselog.pipeline.runs.experiment import (
+    Experiment,
+    Study,
+    experiment_of_logs,
+    is_of_logs,
+    read_experiment,
+)
 from fuselog.pipeline.runs.inputs import load_scenario
 from fuselog.pipeline.runs.settings import named_by, read_settings
 from fuselog.recorders.errors import BadInput, choices
@@ -166,7 +172,7 @@ def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
     named, labels = options["experiment"], options["labels"]
     if not named:
         raise BadInput(f"--set NAME{ASKED}: name an experiment; fuselog experiments lists them")
-    logs = [Path(each) for each in named if each.endswith(".mcap")]
+    logs = [Path(each) for each in named if is_of_logs(each)]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
     experiment = stated.with_settings({}, {})
     study = load("studies", experiment.study, Study)

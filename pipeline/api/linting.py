@@ -1,8 +1,9 @@
 """Checks of a log for errors before any filter is run."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from fuselog.pipeline.api.planning import Log, sources_of
 from fuselog.pipeline.output.terminal import print_json, say, warn
@@ -36,13 +37,35 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     return lint_source(sources_of([log], set)[0])
 
 
-def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
-    """Print the findings of a log; return whether all of them are hints."""
+@dataclass(frozen=True)
+class Linting:
+    """The check of a log for errors: one row with its faults and its worst finding."""
+
+    alterations: Mapping[str, Any]
+    recover: bool
+    doing: ClassVar[str] = "checking"
+
+    def __call__(self, log: Path, number: int, folder: Path) -> list[dict[str, Any]]:  # noqa: ARG002
+        """Return the row of a log."""
+        found = lint(LogSource(open_log(log, recover=self.recover)), set=self.alterations)
+        faults = sum(each.severity != "hint" for each in found)
+        first = found[0].sentence if found else None
+        return [{"faults": faults, "hints": len(found) - faults, "finding": first}]
+
+
+def alterations_for_lint(settings: Sequence[str]) -> dict[str, Any]:
+    """Parse the settings of lint; raise BadInput unless all of them are about topics."""
     alterations, others = split_texts(settings)
     if others:
         raise BadInput(
             f"--set {others[0]}: lint accepts only settings of topics, such as /imu.delay_s=0.1"
         )
+    return alterations
+
+
+def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
+    """Print the findings of a log; return whether all of them are hints."""
+    alterations = alterations_for_lint(settings)
     log = open_log(path, recover=recover)
     found = lint(LogSource(log), set=alterations)
     if as_json:

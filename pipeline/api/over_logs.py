@@ -10,8 +10,10 @@ import math
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from fuselog.pipeline.api.planning import plan_replay
-from fuselog.pipeline.logs.cataloguing import Selection
+from fuselog.pipeline.logs.cataloguing import select
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import (
@@ -30,12 +32,13 @@ from fuselog.pipeline.output.results import (
     split_metric,
     write_outcome,
 )
-from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next
+from fuselog.pipeline.output.terminal import print_json, print_table, progress, say, say_next
 from fuselog.pipeline.output.words import count, is_error
 from fuselog.pipeline.runs.batches import Row, Task, batches_of, over_logs
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.ensemble import Pass, Progress, Settings, no_progress
-from fuselog.pipeline.runs.executors import PoolFactory
+from fuselog.pipeline.runs.executors import PoolFactory, pool_for
+from fuselog.pipeline.selecting.selection import Selection
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource
@@ -50,14 +53,17 @@ from fuselog.replay.judging.intervals import (
 )
 from fuselog.replay.judging.verdicts import Squares
 
-NEES, NIS, COMPONENTS, FAULTS = "nees", "nis_per_component", "components", "faults"
+NIS, COMPONENTS = "nis_per_component", "components"
+SIZES = {"nees": COMPONENTS, "position_nees": "position_components"}  # of which they are the aims
+FAULTS, GAIN = "faults", "gain"  # by which logs are sorted without errors
 # Columns that identify a row, and columns with texts; all others are metrics.
 KEYS, TEXTS = (
     ("log", "group", "estimator", "case"),
     ("problem", "doubt", "finding", "estimates", "sha256"),
 )
-OTHERS = (*KEYS, *TEXTS, COMPONENTS)
-PRINTED = (NEES, NIS, FAULTS, "problem", "finding", "doubt")
+LOG = "LOG"  # stands for the log in the words of a command
+OTHERS = (*KEYS, *TEXTS, *SIZES.values())
+PRINTED = ("nees", NIS, FAULTS, GAIN, "problem", "finding", "doubt")
 MOST_ROWS, MOST_OPENED = 10, 5  # largest numbers of rows and of commands that are printed
 
 
@@ -124,7 +130,8 @@ def _rows_of(done: Pass) -> list[Row]:
         rows.setdefault((label, case), {"estimator": label, "case": case})[quantity] = value
     for errors in done.judge.judged.values():
         if (errors.estimator, errors.case) in rows and not errors.is_bound:
-            rows[errors.estimator, errors.case][COMPONENTS] = len(errors.components)
+            sizes = len(errors.components), len(errors.position)
+            rows[errors.estimator, errors.case] |= dict(zip(SIZES.values(), sizes, strict=True))
     doubts = {}
     for alarm in reversed(alarms_of(done.judge, done.parameters, done.coverage)):
         doubts[alarm.where, alarm.part] = alarm.sentence
@@ -150,32 +157,50 @@ class OverLogs(NamedTuple):
     folder: Path
 
 
-def run_over_logs(
-    task: Task,
-    selection: Selection,
-    out: Path,
-    kind: Kind,
-    settings: Mapping[str, Any],
-    open_pool: PoolFactory,
-    progress: Progress = no_progress,
-) -> OverLogs:
-    """Run a task over a selection of logs, and write rows and verdicts to the result folder `out`."""
-    check_outputs(out, None, {"log": selection.logs})
-    with checkpoints_of(out) as checkpoints, result_folder(out) as part:
-        batches = batches_of(task, selection.logs)
-        found = list(over_logs(batches, open_pool, checkpoints, progress))
-        checkpoints.hand_over([batch.key for batch in batches], part)
-        table = worst_first(_table_of(selection, found))
-        outcome = Outcome(tables={"logs": table}, kind=kind)
-        verdicts = pd.DataFrame(_measured(table, outcome))
-        if len(verdicts):
-            outcome.tables["verdicts"] = verdicts
-        if "sha256" in table:
-            digests = table["sha256"].fillna("").groupby(table["log"]).first()
-            outcome.input_sha256 = hashlib.sha256("".join(digests).encode()).hexdigest()
-        stated = {"title": f"{kind} of {count(table['log'].nunique(), 'log')}", **settings}
-        write_outcome(part, kind, stated, outcome)
-    return OverLogs(table, verdicts, out)
+class Campaign(NamedTuple):
+    """A selection of logs, the result folder, the workers, and the options that state the selection."""
+
+    selection: Selection
+    out: Path
+    open_pool: PoolFactory
+    stated: Mapping[str, Any] = MappingProxyType({})
+    progress: Progress = no_progress
+
+    def run(self, task: Task, kind: Kind, settings: Mapping[str, Any]) -> OverLogs:
+        """Run a task over the logs, and write its rows and verdicts to the result folder."""
+        with result_folder(self.out) as part, self.table(task, part) as table:
+            outcome = Outcome(tables={"logs": table}, kind=kind)
+            verdicts = pd.DataFrame(_measured(table, outcome))
+            if len(verdicts):
+                outcome.tables["verdicts"] = verdicts
+            if "sha256" in table:
+                digests = table["sha256"].fillna("").groupby(table["log"]).first()
+                outcome.input_sha256 = hashlib.sha256("".join(digests).encode()).hexdigest()
+            title = f"{kind} of {count(table['log'].nunique(), 'log')}"
+            write_outcome(part, kind, {"title": title, **self.stated, **settings}, outcome)
+        return OverLogs(table, verdicts, self.out)
+
+    @contextmanager
+    def table(self, task: Task, folder: Path) -> Iterator[pd.DataFrame]:
+        """Yield the rows of a task, the worst log first, and keep them until the block has succeeded.
+
+        The files that the task wrote are moved to a folder.
+        """
+        check_outputs(self.out, None, {"log": self.selection.logs})
+        with checkpoints_of(self.out) as checkpoints:
+            batches = batches_of(task, self.selection.logs)
+            found = list(over_logs(batches, self.open_pool, checkpoints, self.progress))
+            checkpoints.hand_over([batch.key for batch in batches], folder)
+            yield worst_first(_table_of(self.selection, found))
+
+
+def campaign_of(selection: Mapping[str, Any], out: Path) -> Campaign:
+    """Select logs and workers by the options of a command: paths, where, group, workers, scheduler."""
+    found = select(selection["paths"], selection["where"], selection["group"])
+    stated = {name: selection[name] for name in ("where", "group") if selection[name] is not None}
+    stated["selection"] = [str(path) for path in selection["paths"]]
+    pool = pool_for(selection["workers"], selection["scheduler"], len(found.logs))
+    return Campaign(found, out, pool, stated, progress)
 
 
 def _table_of(selection: Selection, found: Sequence[Sequence[Row]]) -> pd.DataFrame:
@@ -205,8 +230,8 @@ def worst_first(table: pd.DataFrame) -> pd.DataFrame:
         own = table[table[COMPONENTS].notna()] if COMPONENTS in table else table  # no bounds
         best = own.groupby("estimator")[by].mean().idxmin()
         badness = table[by].where(table["estimator"] == best)
-    elif FAULTS in table:
-        badness = table[FAULTS]
+    elif severe := next((name for name in (FAULTS, GAIN) if name in table), None):
+        badness = table[severe]
     elif NIS in table:
         badness = np.log(table[NIS]).abs()
     failed = table["problem"].notna()
@@ -221,15 +246,12 @@ def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
 
     The unit of an interval is the log, or the group of logs; see docs/judge.md.
     """
-    if "estimator" not in table:
+    if "estimator" not in table or "case" not in table:  # nothing was judged
         return
     metrics = [str(name) for name in table if name not in OTHERS]
-    keys = ["estimator", "case"] if "case" in table else ["estimator"]
-    for what, rows in table.fillna({"case": ""}).groupby(keys, sort=False):
-        label, case = (*map(str, what), "")[:2]
-        aims = {NIS: 1.0}
-        if COMPONENTS in rows and len(sizes := {*rows[COMPONENTS].dropna()}) == 1:
-            aims[NEES] = float(sizes.pop())
+    for what, rows in table.fillna({"case": ""}).groupby(["estimator", "case"], sort=False):
+        label, case = map(str, what)
+        aims = {NIS: 1.0, **aims_of(rows)}
         for name in metrics:
             known = rows[rows[name].notna()]
             units = known["group"] if "group" in known else known["log"]
@@ -253,6 +275,12 @@ def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
             }
 
 
+def aims_of(rows: pd.DataFrame) -> dict[str, float]:
+    """Return the expected NEES of rows, for all and for the position, if it is the same for all rows."""
+    sizes = {name: {*rows[of].dropna()} for name, of in SIZES.items() if of in rows}
+    return {name: float(own.pop()) for name, own in sizes.items() if len(own) == 1 and any(own)}
+
+
 def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval:
     """Compute the mean or root mean square of the units' values, with its 95 % interval over units.
 
@@ -268,10 +296,11 @@ def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval
     return rms_interval(own) if is_rms else mean_interval(own)
 
 
-def show_over_logs(found: OverLogs, *, as_json: bool) -> bool:
+def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("info", LOG)) -> bool:
     """Print the worst logs, the commands that open them, and the verdicts over all logs.
 
-    Returns whether every estimator, or the command itself, succeeded on at least one log.
+    `opens` are the words of the command that opens a log without estimates. Returns whether every
+    estimator, or the command itself, succeeded on at least one log.
     """
     table, verdicts = (each.replace({np.nan: None}) for each in found[:2])
     failed = table["problem"].notna()
@@ -288,10 +317,12 @@ def show_over_logs(found: OverLogs, *, as_json: bool) -> bool:
     print_table(columns, table[columns].head(MOST_ROWS).to_numpy().tolist())
     if len(table) > MOST_ROWS:
         say(f"the worst {MOST_ROWS} of {len(table)} rows; all are in {found.folder}/tables")
-    for log, own in list(table.groupby("log", sort=False))[:MOST_OPENED]:
+    is_bad = failed | (table[FAULTS].fillna(0) > 0) if FAULTS in table else failed | True
+    for log, own in list(table[is_bad].groupby("log", sort=False))[:MOST_OPENED]:
         known = own["estimates"].dropna().tolist() if "estimates" in own else []
-        words = ["view", str(found.folder / known[0]), "--at", "worst"] if known else ["info", str(log)]
-        say(shlex.join(["fuselog", *words]))
+        view = ["view", *(str(found.folder / name) for name in known[:1]), "--at", "worst"]
+        words = [str(log) if word == LOG else word for word in opens]
+        say(shlex.join(["fuselog", *(view if known else words)]))
     rows = [
         [
             each["estimator"],
@@ -301,13 +332,15 @@ def show_over_logs(found: OverLogs, *, as_json: bool) -> bool:
             *(each[name] for name in ("aim", "verdict", "logs", "units")),
         ]
         for each in found.verdicts.to_dict("records")
-        if each["quantity"] in (*errors, NEES, NIS)
+        if each["quantity"] in (*errors, "nees", NIS)
     ]
     if rows:
         columns = ["estimator", "case", "metric", "value", "aim", "verdict", "logs", "units"]
         print_table(columns, rows)
     if rows and (few := min(row[-1] for row in rows)) < FEWEST_RUNS:
         say(f"units, each a run or a group of runs: {too_few(few)}")
+    if "estimates" in table:
+        say(f"all of them: fuselog view {shlex.quote(str(found.folder / 'estimates'))}")
     bad = table["log"][failed].nunique()
     say(f"{bad} of {count(table['log'].nunique(), 'log')} failed; {found.folder}: tables, result.json")
     say_next("report", str(found.folder))

@@ -9,9 +9,9 @@ import numpy as np
 
 from fuselog.pipeline.calibrating.calibrating import calibrate
 from fuselog.pipeline.calibrating.ellipsoid import ellipsoid
+from fuselog.pipeline.logs.cataloguing import logs_meant
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.terminal import print_json, print_table, say
-from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.pipeline.tuning.command import tune_logs
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource
@@ -34,7 +34,7 @@ def show_ellipsoid(
     as_json: bool,
 ) -> None:
     """Fit an ellipsoid, and print its parameters with intervals, followed by sentences."""
-    paths = [log for path in logs for log in logs_in(path)]
+    paths = logs_meant(logs).logs
     check_outputs(out, None, {"log": paths})
     sources = [LogSource(open_log(path, recover=recover)) for path in paths]
     found = ellipsoid(sources, field, length=length)

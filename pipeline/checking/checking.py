@@ -9,10 +9,10 @@ from fuselog.pipeline.altering.sources import NOTE, alter
 from fuselog.pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
 from fuselog.pipeline.checking.golden import Replayed, Tolerances, make
 from fuselog.pipeline.checking.stored import SUFFIX, Golden, read, write
+from fuselog.pipeline.logs.cataloguing import logs_meant
 from fuselog.pipeline.output.outputs import Kind, check_files
 from fuselog.pipeline.output.results import RESULT_FILE, read_result
 from fuselog.pipeline.runs.ensemble import Settings
-from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
@@ -68,8 +68,8 @@ def compared(golden: Golden, replayed: Replayed) -> Checked:
     return Checked(fields, found, first_of(found, replayed, golden) if found else [])
 
 
-def runs_of(path: Path) -> Runs:
-    """Return the runs of a log, of a folder of logs, or of the logs in a result folder.
+def runs_of(path: Path, where: str | None = None) -> Runs:
+    """Return the runs of a log, of a folder or catalog of logs, or of the logs in a result folder.
 
     Raises BadInput if there are no logs, or two of them have the same name.
     """
@@ -80,7 +80,7 @@ def runs_of(path: Path) -> Runs:
         stated = given.get("files", []) if isinstance(given, dict) else given
         files = [Path(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
     else:
-        files = logs_in(path)
+        files = list(logs_meant([path], where).logs)
     if not files:
         raise BadInput(f"{path}: has no logs to replay; give a log, or a result that keeps its logs")
     runs = {file.name: alter(LogSource(open_log(file)), applied) for file in files}
@@ -97,6 +97,7 @@ def update(
     estimators: Settings,
     columns: Sequence[str] = (),
     tolerances: Tolerances | None = None,
+    where: str | None = None,
 ) -> Golden:
     """Write the golden of the runs at `path` to the file `place`.
 
@@ -112,7 +113,7 @@ def update(
         raise BadInput(f"{path}: name the estimators of the new golden, such as -e ekf")
     kept = None if before is None else before["tolerances"]
     golden = make(
-        runs_of(path),
+        runs_of(path, where),
         chosen,
         late=settings.get("late") or stated.get("late"),
         arrival_order=bool(settings.get("arrival_order") or stated.get("arrival_order")),

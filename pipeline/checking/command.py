@@ -1,16 +1,18 @@
 """The command `fuselog check`, which replays runs and reports the first difference from a golden."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
-from fuselog.pipeline.checking.checking import Checked, Runs, check, runs_of, update
+from fuselog.pipeline.api.over_logs import FAULTS, campaign_of, show_over_logs
+from fuselog.pipeline.checking.checking import Checked, check, runs_of, update
 from fuselog.pipeline.checking.golden import Tolerance
-from fuselog.pipeline.checking.stored import Golden, read
+from fuselog.pipeline.checking.over_logs import InPlace, check_over_logs
+from fuselog.pipeline.checking.stored import read
 from fuselog.pipeline.output.outputs import Kind, check_files
 from fuselog.pipeline.output.terminal import print_json, say
 from fuselog.pipeline.output.words import count
-from fuselog.pipeline.runs.ensemble import Settings
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.errors import BadInput
@@ -31,10 +33,12 @@ def check_path(
     columns: Sequence[str],
     tolerances: Sequence[str],
     junit: Path | None,
+    out: Path | None,
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
-    in_place: Callable[[str, Runs, Golden], Settings] | None = None,
+    in_place: InPlace | None = None,
+    selection: Mapping[str, Any] | None = None,
 ) -> bool:
     """Compare the runs at `path` with a golden, or write the golden; return whether all fields agree.
 
@@ -52,6 +56,7 @@ def check_path(
             estimators=chosen,
             columns=columns,
             tolerances=pairs_of("--tolerance", tolerances, _tolerance, _TOLERANCE),
+            where=selection["where"] if selection else None,
         )
         streams = sum(len(run["streams"]) for run in made["runs"].values())
         size_kb = golden.stat().st_size / 1e3
@@ -74,6 +79,15 @@ def check_path(
                 f"{golden}: already defines the replay and the allowed differences; to change them, add "
                 "--update"
             )
+        if selection is not None:
+            campaign = campaign_of(selection, out or Path("out/check"))
+            if junit is not None:
+                raise BadInput("--junit: does not apply to a selection of logs; leave it out")
+            of_logs = check_over_logs(campaign, golden, labels[0] if labels else None, in_place)
+            show_over_logs(of_logs, as_json=as_json)
+            return bool(of_logs.table["problem"].isna().all() and not of_logs.table[FAULTS].any())
+        if out is not None:
+            raise BadInput(f"--out {out}: applies to a selection of logs; leave it out")
         sources, stored = runs_of(path), read(golden)
         replaced = in_place(labels[0], sources, stored) if in_place and labels else None
         done = check(sources, stored, replaced)

@@ -6,6 +6,7 @@ from shlex import quote
 from typing import Any
 
 from fuselog.pipeline.api.api import run, sweep
+from fuselog.pipeline.logs.cataloguing import select
 from fuselog.pipeline.output.alarms import NOT_TESTED
 from fuselog.pipeline.output.results import RESULT_FILE, RUNS, keep, read_table, split_metric
 from fuselog.pipeline.output.terminal import (
@@ -20,11 +21,13 @@ from fuselog.pipeline.output.terminal import (
     progress,
     say,
     say_next,
+    warn,
 )
 from fuselog.pipeline.runs.experiment import (
     Experiment,
     Stated,
     experiment_of_logs,
+    is_of_logs,
     read_experiment,
     require_campaign,
 )
@@ -53,12 +56,13 @@ def run_named(
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
+    where: str | None,
 ) -> None:
     """Run an experiment, or replay logs as an experiment, and print its metrics and claims.
 
     With `tells_parameters`, print only the parameters of its estimators.
     """
-    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
+    stated, values = _stated_experiment(named, labels, over, settings_file, settings, where)
     if data is not None and stated.source.endswith(".mcap"):
         raise BadInput(
             f"{stated.source}: --data does not apply to logs, which are replayed as they are; leave it "
@@ -139,9 +143,10 @@ def _stated_experiment(
     over: Mapping[str, Any],
     settings_file: Path | None,
     settings: Sequence[str],
+    where: str | None,
 ) -> tuple[Stated, dict[str, Any]]:
     """Read the experiment (a name, a TOML file, or logs) and the settings that override its own."""
-    files = [Path(each) for each in named if each.endswith(".mcap")]
+    files = [Path(each) for each in named if is_of_logs(each)]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
         raise BadInput(
             f"{files[0]}: logs are replayed as they are; give only logs and -e, without --runs and "
@@ -151,7 +156,15 @@ def _stated_experiment(
         raise BadInput(
             f"{named[0]}: give one experiment at a time, without -e; it names its own estimators"
         )
-    stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
+    if where is not None and not files:
+        raise BadInput(f"--where {where}: selects logs; give a catalog, or folders of logs")
+    if where is None and all(path.suffix == ".mcap" for path in files):
+        stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
+    else:
+        chosen = select(files, where)
+        for note in chosen.notes:
+            warn(note)
+        stated = experiment_of_logs(chosen.logs, labels, chosen.unreadable)
     values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]
     return stated._replace(files=files), {**values, **over}
@@ -171,10 +184,11 @@ def sweep_named(
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
+    where: str | None,
 ) -> None:
     """Run an experiment, or replay logs as one, at many points, and print its metrics at each."""
     overs = [parse_over(text) for text in swept]
-    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
+    stated, values = _stated_experiment(named, labels, over, settings_file, settings, where)
     done = sweep(
         stated,
         overs,

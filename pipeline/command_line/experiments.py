@@ -21,6 +21,7 @@ from fuselog.pipeline.command_line.options import (
     scheduler_option,
     set_option,
     settings_option,
+    where_option,
     workers_option,
 )
 
@@ -55,6 +56,7 @@ stress_option = click.option(
     "--data", type=ANY_PATH, help="The folder or file of real data, for experiments that import."
 )
 @click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT].")
+@where_option
 @workers_option
 @scheduler_option
 @diagnose_option
@@ -74,7 +76,8 @@ def run(
 ) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
 
-    To run your own logs as an experiment, give LOG.mcap ... and -e for each estimator.
+    To run your own logs as an experiment, give LOG.mcap ..., folders or a catalog, and -e for each
+    estimator.
 
     --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 a parameter of one
     estimator, --set gate_probability=1 of all estimators that have it, and --set gap_limit_s=1 an entry
@@ -112,6 +115,7 @@ def run(
 @click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT-sweep].")
+@where_option
 @workers_option
 @scheduler_option
 @json_option

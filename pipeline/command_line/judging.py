@@ -21,6 +21,8 @@ from fuselog.pipeline.command_line.options import (
     model_option,
     recover_option,
     replay_options,
+    selecting,
+    selection_options,
     set_option,
 )
 from fuselog.recorders.errors import BadInput
@@ -158,6 +160,7 @@ def evaluate(
     is_flag=True,
     help="Exit with 1 if a side is worse than the first in an error, in consistency or in failures.",
 )
+@selection_options
 @replay_options
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
@@ -165,11 +168,16 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     SIDES can also be logs or folders of logs, with -e for each estimator. Estimates that the logs
     already contain, such as an autopilot's, come first and are not replayed. All other sides are
     compared with the first, metric by metric over the runs that both have, with 95 % bootstrap intervals
-    over runs.
+    over runs. With a catalog, or with --where, --group, --workers or --scheduler, each log is replayed
+    by itself.
     """
-    from fuselog.pipeline.comparing.command import compare_candidates
+    from fuselog.pipeline.comparing.command import compare_candidates, compare_selection
 
-    if not compare_candidates(list(sides), list(labels), **options):
+    if selection := selecting(sides, options):
+        is_good = compare_selection(selection, list(labels), **options)
+    else:
+        is_good = compare_candidates(list(sides), list(labels), **options)
+    if not is_good:
         click.get_current_context().exit(1)
 
 
@@ -187,16 +195,22 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @click.option(
     "--tried", "tells_tried", is_flag=True, help="List every change that was tried, with its gain."
 )
+@selection_options
 @replay_options
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     """Explain what is likely wrong with LOG or with an estimator's settings, and what to try.
 
     LOG is a log, or an estimates log next to its source log. The output has at most five sentences, the
-    likeliest cause first: the one whose correction increases the log-likelihood most.
+    likeliest cause first: the one whose correction increases the log-likelihood most. For a folder or a
+    catalog, a result folder has a row for each log.
     """
-    from fuselog.pipeline.diagnosing.command import diagnose_log
+    from fuselog.pipeline.diagnosing.command import diagnose_log, diagnose_selection
 
-    diagnose_log(logs, **options)
+    if selection := selecting(logs, options, always=logs[0].is_dir()):
+        if not diagnose_selection(selection, **options):
+            click.get_current_context().exit(1)
+    else:
+        diagnose_log(logs, **options)
 
 
 @command(

@@ -21,12 +21,14 @@ from fuselog.pipeline.command_line.options import (
     out_log_option,
     recover_option,
     scheduler_option,
+    selecting,
+    selection_options,
     set_option,
     where_option,
     workers_option,
 )
 from fuselog.pipeline.command_line.recording import say_written
-from fuselog.recorders.errors import printable
+from fuselog.recorders.errors import BadInput, printable
 
 if TYPE_CHECKING:
     from fuselog.pipeline.logs.rewriting import Changed
@@ -158,20 +160,32 @@ def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
     "Find wrong units, signs, stamps and frames in a log.",
     "fuselog lint run.mcap",
     "fuselog lint run.mcap --set /imu.turn_rate_scale=0.01745",
+    "fuselog lint drives --workers 4",
 )
-@click.argument("log", type=ANY_PATH)
+@click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--out", type=RESULT, help="For several logs: the result folder [default: out/lint].")
+@selection_options
 @recover_option
 @json_option
 @set_option("lint")
-def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> None:
+def lint(logs: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Find errors in LOG before any filter runs: units, stamps, frames, covariances, values, names.
 
     Each finding has a confidence, its evidence and a fix, which you can try with --set. The exit code is
-    1 if there is a finding that is more than a hint.
+    1 if there is a finding that is more than a hint. With several logs, a folder or a catalog, a result
+    folder has a row for each log.
     """
-    from fuselog.pipeline.api.linting import show_lint
+    if selection := selecting(logs, options, always=len(logs) > 1 or logs[0].is_dir()):
+        from fuselog.pipeline.command_line.selections import lint_selection
 
-    if not show_lint(log, settings, recover=recover, as_json=as_json):
+        is_good = lint_selection(selection, out=out, **options)
+    else:
+        from fuselog.pipeline.api.linting import show_lint
+
+        if out is not None:
+            raise BadInput(f"--out {out}: applies to several logs; leave it out")
+        is_good = show_lint(logs[0], **options)
+    if not is_good:
         click.get_current_context().exit(1)
 
 
@@ -217,9 +231,10 @@ def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> 
     "--web", is_flag=True, help="Serve the timeline to a browser on this machine until Ctrl-C."
 )
 @click.option("--focus", help="Entity to show first, for example robot3.")
+@where_option
 @recover_option
 @gap_option
-def view(paths: tuple[Path, ...], **options: Any) -> None:
+def view(paths: tuple[Path, ...], where: str | None, **options: Any) -> None:
     """Open PATHS in the Rerun viewer: a log, an estimates log, a result, an .rrd, or a folder of logs.
 
     Results with several runs and folders of logs open as a sortable table of runs, the worst first.
@@ -227,6 +242,10 @@ def view(paths: tuple[Path, ...], **options: Any) -> None:
     """
     from fuselog.pipeline.command_line.commands import view_path
 
+    if selecting(paths, {"where": where}):
+        from fuselog.pipeline.logs.cataloguing import select
+
+        paths = tuple(select(paths, where).logs)
     view_path(paths, **options)
     _say_next_of_view(paths[0], recover=options["recover"])
 

@@ -174,16 +174,19 @@ def selection_options(function: Callable[..., None]) -> Callable[..., None]:
     return where_option(group_option(workers_option(scheduler_option(function))))
 
 
-def selecting(paths: Sequence[Path], options: dict[str, Any]) -> dict[str, Any] | None:
+def selecting(
+    paths: Sequence[Path], options: dict[str, Any], *, always: bool = False
+) -> dict[str, Any] | None:
     """Move the options of a selection out of the options of a command.
 
-    Returns None if there is no selection: the paths are logs and folders, and no option is given.
+    Returns None if there is no selection: the paths are logs and folders, no option is given, and
+    `always` is not set.
     """
     from fuselog.pipeline.selecting.catalog import is_catalog
 
-    found = {name: options.pop(name) for name in ("where", "group", "workers", "scheduler")}
-    is_given = any(map(is_catalog, paths)) or any(value is not None for value in found.values())
-    return {"paths": paths, **found} if is_given else None
+    found = {name: options.pop(name, None) for name in ("where", "group", "workers", "scheduler")}
+    is_given = any(value is not None for value in found.values()) or any(map(is_catalog, paths))
+    return {"paths": paths, **found} if always or is_given else None
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -30,6 +30,7 @@ from fuselog.pipeline.command_line.options import (
     selection_options,
     set_option,
     settings_option,
+    where_option,
     workers_option,
 )
 
@@ -181,13 +182,14 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
     "--out", type=RESULT, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @model_option
+@where_option
 @workers_option
 @scheduler_option
 @replay_options
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
     """Estimate the parameters of an estimator that explain LOGS best, with 95 % intervals.
 
-    LOGS are logs or folders of logs; --validate takes one log or folder and can be repeated. The search
+    LOGS are logs, folders or catalogs; --validate takes one of these and can be repeated. The search
     starts from --set NAME=VALUE, or from the values in the log's channels. Truth is needed only for
     --by nees and --by rmse. Ctrl-C ends the search with the best values so far. Use settings.toml from
     the result folder with --settings of fuselog replay and run.
@@ -274,6 +276,8 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     "(repeatable) [default: 1e-12, 1e-6 on another CPU].",
 )
 @click.option("--junit", type=JUNIT, help="Write the results as JUnit XML, for continuous integration.")
+@click.option("--out", type=RESULT, help="For a catalog: the result folder [default: out/check].")
+@selection_options
 @json_option
 @settings_option
 @set_option("estimators")
@@ -282,12 +286,15 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 
     The exit code is 1 if anything differs; the first difference is printed with its stamp. For an
     intended change, update the golden in the same commit. To check a filter written by fuselog deploy,
-    use -e lib:PATH; it must have been deployed from the golden's filter.
+    use -e lib:PATH; it must have been deployed from the golden's filter. With a catalog, or with
+    --where, --group, --workers or --scheduler, a result folder has a row for each log, also for those
+    that are missing or new.
     """
     from fuselog.pipeline.checking.command import check_path
     from fuselog.pipeline.deploying.deploying import in_place_of_golden
 
-    if not check_path(path, golden, **options, in_place=in_place_of_golden):
+    selection = selecting([path], options)
+    if not check_path(path, golden, **options, in_place=in_place_of_golden, selection=selection):
         click.get_current_context().exit(1)
 
 

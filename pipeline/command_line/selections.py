@@ -2,33 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from fuselog.pipeline.api.over_logs import Replaying, run_over_logs, show_over_logs
-from fuselog.pipeline.logs.cataloguing import Selection, select
-from fuselog.pipeline.output.terminal import progress
-from fuselog.pipeline.runs.executors import PoolFactory, pool_for, states_of
+from fuselog.pipeline.api.linting import Linting, alterations_for_lint
+from fuselog.pipeline.api.over_logs import LOG, Replaying, campaign_of, show_over_logs
+from fuselog.pipeline.runs.executors import states_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.foreign.naming import program_files
-
-
-class Chosen(NamedTuple):
-    """A selection of logs, the workers that process it, and the options that state it."""
-
-    selection: Selection
-    open_pool: PoolFactory
-    stated: dict[str, Any]
-
-
-def _chosen(options: Mapping[str, Any]) -> Chosen:
-    """Select logs by the options that `selecting` returns."""
-    selection = select(options["paths"], options["where"], options["group"])
-    stated = {"selection": [str(path) for path in options["paths"]]}
-    stated |= {name: options[name] for name in ("where", "group") if options[name] is not None}
-    return Chosen(
-        selection, pool_for(options["workers"], options["scheduler"], len(selection.logs)), stated
-    )
 
 
 def replay_selection(
@@ -54,7 +35,6 @@ def replay_selection(
             raise BadInput(f"{option}: applies to logs that are replayed together; leave it out here")
     if {*origins} - {"truth"}:
         raise BadInput(f"--start-from {origins[0]}: only truth applies to the logs of a selection")
-    chosen = _chosen(selection)
     alterations, own = split_texts(settings)
     estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
     options |= {"start_from": origins, "start_sigma": sigmas_of(sigmas, "--start-sigma")}
@@ -64,6 +44,22 @@ def replay_selection(
         raise BadInput(f"--out {out}: a selection has a result folder; give a folder")
     programs = states_of(program_files(estimators))
     task = Replaying(estimators, options, recover, place.absolute(), programs)
-    stated = {**chosen.stated, "estimators": estimators, "options": options}
-    found = run_over_logs(task, chosen.selection, place, "replay", stated, chosen.open_pool, progress)
+    stated = {"estimators": estimators, "options": options}
+    found = campaign_of(selection, place).run(task, "replay", stated)
     return show_over_logs(found, as_json=as_json)
+
+
+def lint_selection(
+    selection: Mapping[str, Any],
+    *,
+    out: Path | None,
+    recover: bool,
+    as_json: bool,
+    settings: Sequence[str],
+) -> bool:
+    """Check each log of a selection for errors; return whether all can be read and have only hints."""
+    alterations = alterations_for_lint(settings)
+    campaign = campaign_of(selection, out or Path("out/lint"))
+    found = campaign.run(Linting(alterations, recover), "lint", {"set": alterations})
+    show_over_logs(found, as_json=as_json, opens=("lint", LOG))
+    return bool(found.table["problem"].isna().all() and not found.table["faults"].any())

@@ -1,17 +1,24 @@
 """The command `fuselog compare`, which prints verdicts with intervals and writes the chosen outputs."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fuselog.pipeline.comparing.comparing import compare
+from fuselog.pipeline.api.over_logs import Replaying, campaign_of
+from fuselog.pipeline.comparing.comparing import Differences, compare
 from fuselog.pipeline.comparing.groups import recorded_labels, with_logs_of_folders
+from fuselog.pipeline.comparing.over_logs import compare_over_logs
+from fuselog.pipeline.comparing.paired import Paired
 from fuselog.pipeline.output.alarms import NOT_TESTED
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.terminal import print_json, print_table, progress, say, warn
+from fuselog.pipeline.runs.executors import states_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.foreign.naming import program_files
 
 COLUMNS = {
     "quantity": "metric",
@@ -75,6 +82,51 @@ def compare_candidates(
     if save is not None:
         found.draw(save)
         written.append(save)
+    stress_tests = [NOT_TESTED] if found.stress is None else found.stress.sentences
+    _show(found, worse, written, stress_tests, as_json=as_json)
+    if not (as_json or labels) and all(each.is_dir() or each.suffix == ".mcap" for each in given):
+        say(f"to see each run with all results in one scene: fuselog view {shlex.join(map(str, given))}")
+    return not worse
+
+
+def compare_selection(
+    selection: Mapping[str, Any],
+    labels: Sequence[str],
+    *,
+    margin: float,
+    out: Path | None,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    fail_if_worse: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+    **others: Any,
+) -> bool:
+    """Compare estimators over the logs of a selection; see `compare_candidates`."""
+    for name, value in others.items():
+        if value:
+            raise BadInput(f"--{name}: does not apply to a selection of logs; leave it out")
+    alterations, own = split_texts(settings)
+    estimators = settings_of_estimators(labels, own, settings_file)
+    options = {"gap_limit_s": gap_limit_s, "set": alterations}
+    task = Replaying(estimators, options, recover, programs=states_of(program_files(estimators)))
+    campaign = campaign_of(selection, out or Path("out/compare"))
+    found = compare_over_logs(task, campaign, margin, gap_limit_s, fail_if_worse=fail_if_worse)
+    worse = found.worse() if fail_if_worse else []
+    _show(found, worse, [campaign.out], [], as_json=as_json)
+    return not worse
+
+
+def _show(
+    found: Differences,
+    worse: Sequence[Paired],
+    written: Sequence[Path],
+    stress_tests: Sequence[str],
+    *,
+    as_json: bool,
+) -> None:
+    """Print the differences, the verdicts and the notes."""
     for note in found.notes:
         warn(note)
     if worse:
@@ -85,12 +137,12 @@ def compare_candidates(
                 "differences": found.table.replace({np.nan: None}).to_dict("records"),
                 "sentences": found.sentences,
                 "notes": found.notes,
-                "stress": [NOT_TESTED] if found.stress is None else found.stress.sentences,
+                "stress": list(stress_tests),
                 "coverage": [row._asdict() for row in found.coverage],
                 "written": [str(path) for path in written],
             }
         )
-        return not worse
+        return
     table = found.table.replace({np.nan: None})
     for (first, second, case_), rows in table.groupby(["first", "second", "case"], sort=False):
         columns = [title.format(first=first, second=second) for title in COLUMNS.values()]
@@ -98,10 +150,7 @@ def compare_candidates(
         print_table(columns, rows[list(COLUMNS)].to_numpy().tolist(), title)
     for sentence in found.sentences:
         say(sentence)
-    for sentence in [NOT_TESTED] if found.stress is None else found.stress.sentences:
+    for sentence in stress_tests:
         say(sentence)
     for path in written:
         say(str(path))
-    if not labels and all(each.is_dir() or each.suffix == ".mcap" for each in given):
-        say(f"to see each run with all results in one scene: fuselog view {shlex.join(map(str, given))}")
-    return not worse

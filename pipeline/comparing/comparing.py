@@ -65,6 +65,7 @@ class Differences:
         paired: every metric of every pair.
         times: a row per pair, case, quantity and time span, with the difference and its interval.
         stress: effects of changes that should not matter; None if they were not tested.
+        tables: other tables for the result folder.
     """
 
     groups: Sequence[Sequence[Candidate]]
@@ -74,6 +75,7 @@ class Differences:
     paired: Sequence[Paired]
     times: pd.DataFrame = field(default_factory=pd.DataFrame)
     stress: Stress | None = None
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -168,7 +170,7 @@ class Differences:
         inputs = self.inputs
         check_folder(place, {"input": inputs})
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
-        tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
+        tables = {"differences": self.table, "runs": table_of_runs(self.groups), **self.tables}
         outcome = Outcome(tables=tables, figures=dict(self.charts()), kind="compare")
         for run in self.drawable[:1]:
             outcome.figures |= scene_of(self.groups[0], run, self.gap_limit_s)
@@ -296,7 +298,26 @@ def compare(
     givens = inputs_of(
         paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
-    groups = list(map(_with_ages, comparable_groups(givens, named)))
+    done = differences_of(comparable_groups(givens, named), margin, gap_limit_s)
+    paired, notes = done.paired, list(done.notes)
+    found = None
+    if stress:
+        if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
+            raise BadInput(
+                f"--stress: {paths[0]} is not a log to replay; give logs, and estimators with -e"
+            )
+        sources = [LogSource(open_log(path, recover=recover)) for path in paths]
+        found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
+        paired = under_stress(paired, verdicts_of(found.stressed))
+    notes += sentences(done.coverage)
+    return replace(done, notes=list(dict.fromkeys(notes)), paired=paired, stress=found)
+
+
+def differences_of(
+    candidates: Iterable[Sequence[Candidate]], margin: float, gap_limit_s: float
+) -> Differences:
+    """Compare the first candidate of each group with the others."""
+    groups = list(map(_with_ages, candidates))
     notes = [note for group in groups for candidate in group for note in candidate.notes]
     paired: list[Paired] = []
     times: list[pd.DataFrame] = []
@@ -308,17 +329,7 @@ def compare(
             times.append(over_time)
     filled = [each for each in times if len(each)]
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
-    found = None
-    if stress:
-        if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
-            raise BadInput(
-                f"--stress: {paths[0]} is not a log to replay; give logs, and estimators with -e"
-            )
-        sources = [LogSource(open_log(path, recover=recover)) for path in paths]
-        found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
-        paired = under_stress(paired, verdicts_of(found.stressed))
-    notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
-    return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
+    return Differences(groups, margin, gap_limit_s, notes, paired, table)
 
 
 def _with_ages(group: Sequence[Candidate]) -> list[Candidate]:

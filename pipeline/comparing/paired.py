@@ -24,6 +24,7 @@ class Paired(NamedTuple):
         where: start and end of the time span that contributes most to the difference, in s since the
             run's epoch; None if there is no such span.
         stressed: largest change of either candidate's metric under changes that should not matter.
+        unit: what a run is, if it is not a single run.
     """
 
     first: str
@@ -34,6 +35,7 @@ class Paired(NamedTuple):
     found: Difference
     where: tuple[float, float] | None = None
     stressed: float = 0.0
+    unit: str = "run"
 
     @property
     def is_withheld(self) -> bool:
@@ -52,7 +54,7 @@ class Paired(NamedTuple):
             equal = "equal in every run; " if found.verdict == Comparison.TIE else ""
             return f"{self.quantity}{of}: {values}; {equal}{too_few(found.runs)}"
         interval = f"difference {found.more}"
-        of_runs = f"{count(found.runs, 'run')}, margin {found.margin:.3g}"
+        of_runs = f"{count(found.runs, self.unit)}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
         if found.verdict == Comparison.UNDECIDED:
             verdict = f"{self.second} and {self.first} may or may not differ by more than the margin"

@@ -1,12 +1,15 @@
 """The command `fuselog diagnose`, which prints likely faults and what to try against them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from fuselog.pipeline.api.over_logs import LOG, campaign_of, show_over_logs
 from fuselog.pipeline.diagnosing.consistency import comparable
 from fuselog.pipeline.diagnosing.diagnosis import diagnose
+from fuselog.pipeline.diagnosing.over_logs import Diagnosing
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status
@@ -107,3 +110,33 @@ def diagnose_log(
         )
     for sentence in [*found.told, *found.notes, *written]:
         say(sentence)
+
+
+def diagnose_selection(
+    selection: Mapping[str, Any],
+    *,
+    label: str | None,
+    out: Path | None,
+    save: Path | None,
+    model: str | None,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    tells_tried: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> bool:
+    """Diagnose each log of a selection; return whether at least one could be diagnosed."""
+    if save is not None or tells_tried:
+        raise BadInput("--save and --tried apply to a single log; leave them out for a selection")
+    alterations, own = split_texts(settings)
+    given: dict[str, Any] = {}
+    if label is not None:
+        [(label, given)] = settings_of_estimators([label], own, settings_file, model=model).items()
+    elif own or settings_file is not None or model is not None:
+        raise BadInput("settings are for one estimator; name it with -e")
+    campaign = campaign_of(selection, out or Path("out/diagnose"))
+    task = Diagnosing(label, given | alterations, gap_limit_s, recover)
+    found = campaign.run(task, "diagnose", {"estimators": {label: given} if label else {}})
+    opens = ("diagnose", LOG, *(("-e", label) if label else ()))
+    return show_over_logs(found, as_json=as_json, opens=opens)

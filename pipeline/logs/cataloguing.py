@@ -20,6 +20,7 @@ from fuselog.pipeline.selecting.catalog import (
     State,
     is_catalog,
     is_written,
+    logs_in,
     logs_under,
     read_catalog,
     require_unchanged,
@@ -30,8 +31,9 @@ from fuselog.pipeline.selecting.catalog import (
     with_columns,
     write_catalog,
 )
+from fuselog.pipeline.selecting.selection import Selection, selected
 from fuselog.pipeline.selecting.where import rows_where
-from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
+from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, read_span
 from fuselog.recorders.log.impossible import YEAR_NS
 from fuselog.replay.engine.streams.linting import lint_source
@@ -212,21 +214,6 @@ def _row(log: str, found: Row, state: State, deep: bool) -> Row:
     return own | dict(zip(("size_bytes", "modified_ns"), state, strict=True)) | found
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The logs that the paths of a command mean.
-
-    Attributes:
-        logs: the logs that can be read.
-        groups: the group of each log, such as its robot; empty if no column is named.
-        unreadable: why other logs cannot be read.
-    """
-
-    logs: Sequence[Path]
-    groups: Sequence[str] = ()
-    unreadable: Mapping[Path, str] = field(default_factory=dict)
-
-
 def select(paths: Sequence[Path], where: str | None = None, group: str | None = None) -> Selection:
     """Find the logs of folders and catalogs, and single logs, that meet a condition.
 
@@ -244,25 +231,17 @@ def select(paths: Sequence[Path], where: str | None = None, group: str | None = 
         if is_catalog(path):
             tables.append(table := read_catalog(path))
             require_unchanged(table, path)
-        elif (where, group) == (None, None):
-            tables.append(table_of([{"log": log} for log in _logs_of([path])]))
         else:
             tables.append(_rows(_logs_of([path])))
     table = with_columns(table_of([row for table in tables for row in rows_in(table)]))
-    if where is not None:
-        table = rows_where(table, where)
-    if table.empty:
-        condition = "" if where is None else f" meets --where {where}"
-        raise BadInput(f"{paths[0]}: no log{condition}; fuselog catalog shows the rows")
-    if group is not None and group not in table:
-        raise BadInput(
-            f"--group: no column '{group}' in the catalog; {choices(group, [*map(str, table)])}"
-        )
-    bad = table["problem"].notna()
-    logs = [Path(log) for log in table["log"][~bad]]
-    groups = [] if group is None else table[group][~bad].astype(str).tolist()
-    why = {Path(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)}
-    return Selection(logs, groups, why)
+    return selected(table, str(paths[0]), where, group)
+
+
+def logs_meant(paths: Sequence[Path], where: str | None = None) -> Selection:
+    """Find the logs that a command uses together: all logs in folders, or a selection of catalogs."""
+    if where is None and not any(map(is_catalog, paths)):
+        return Selection([log for path in paths for log in logs_in(path)])
+    return select(paths, where)
 
 
 def show_catalog(

@@ -18,6 +18,8 @@ from fuselog.pipeline.runs.ensemble import Progress, no_progress
 from fuselog.pipeline.runs.executors import PoolFactory
 from fuselog.pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
 from fuselog.pipeline.runs.settings import named_by, parameters_by_label
+from fuselog.pipeline.selecting.catalog import is_catalog
+from fuselog.pipeline.selecting.selection import of_catalog
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import open_log
 from fuselog.recorders.parameters import Parameters, build, merge
@@ -235,8 +237,8 @@ class Stated(NamedTuple):
             experiment = experiment.model_copy(update={"claims": claims})
         if experiment.logs is None:
             return experiment
-        files = _found(experiment.logs.files, self.folder, where)
-        return experiment.model_copy(update={"logs": Logs(files=files)})
+        logs = _logs_of(experiment.logs, self.folder, where)
+        return experiment.model_copy(update={"logs": logs})
 
 
 def load_experiment(
@@ -262,17 +264,42 @@ def read_experiment(name: str) -> Stated:
     return Stated(path.stem, name, read_toml(path), path.parent, () if name in known else (path,))
 
 
-def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
+def is_of_logs(name: str) -> bool:
+    """Test whether a name is that of a log, a catalog or a folder of logs, not of an experiment."""
+    path = Path(name)
+    is_folder = path.is_dir() and name not in shipped("experiments")
+    return path.suffix == ".mcap" or is_catalog(path) or is_folder
+
+
+def experiment_of_logs(
+    logs: Sequence[Path], labels: Sequence[str], unreadable: Mapping[Path, str] | None = None
+) -> Stated:
     """Make the experiment that replays logs; raise BadInput if no estimator is named."""
     if not labels:
         raise BadInput(f"{logs[0]}: name the estimators to replay, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
+    of_logs: dict[str, Any] = {"files": [str(log) for log in logs]}
+    if unreadable:
+        of_logs["unreadable"] = {str(log): why for log, why in unreadable.items()}
     values = {
         "title": title,
-        "logs": {"files": [str(log) for log in logs]},
+        "logs": of_logs,
         "estimators": named_by(labels),
     }
     return Stated(title, str(logs[0]), values, Path())
+
+
+def _logs_of(stated: Logs, folder: Path, where: str) -> Logs:
+    """Find the logs that files, patterns and a catalog name."""
+    files = _found(stated.files, folder, where)
+    if stated.catalog is None:
+        if stated.where is not None:
+            raise BadInput(f"{where}: where = {stated.where!r} selects from a catalog; name it too")
+        return stated.model_copy(update={"files": files})
+    found = of_catalog(Path(os.path.normpath(folder / stated.catalog)), stated.where)
+    files = list(dict.fromkeys([*files, *map(str, found.logs)]))
+    why = {str(log): problem for log, problem in found.unreadable.items()}
+    return Logs(files=files, unreadable=why or None)
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
@@ -408,6 +435,11 @@ def run_experiment(
             checkpoints=checkpoints,
         )
         outcome = study.run(experiment, setting)
+        if experiment.logs and experiment.logs.unreadable:
+            import pandas as pd  # slow to import
+
+            rows = list(experiment.logs.unreadable.items())
+            outcome.tables["unreadable"] = pd.DataFrame(rows, columns=["log", "problem"])
         metrics = plain(outcome.metrics)
         outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers, recordings)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)

@@ -43,9 +43,15 @@ class Logs(Parameters):
     Attributes:
         files: files or patterns such as `drive-*.mcap`, relative to the folder of the experiment's file;
             estimates logs are ignored if a pattern has several matches.
+        catalog: a catalog with more logs, relative to the same folder.
+        where: a condition on the columns of the catalog.
+        unreadable: why logs of the selection cannot be read, by path.
     """
 
     files: list[str] = []
+    catalog: str | None = None
+    where: str | None = None
+    unreadable: dict[str, str] | None = None
 
 
 class Recording(Parameters):

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fuselog.pipeline.logs.cataloguing import logs_meant
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators, split_texts
-from fuselog.pipeline.selecting.catalog import logs_in
 from fuselog.pipeline.tuning.objective import Best, By
 from fuselog.pipeline.tuning.outcome import SETTINGS, Tuning
 from fuselog.pipeline.tuning.tuning import tune
@@ -39,13 +39,17 @@ def tune_logs(
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
+    where: str | None = None,
 ) -> None:
     """Tune on logs, write the result folder, and print the names of the logs and the result.
 
     If `search` is given, it determines the free parameters and the criterion, and `free`, `by` and
     `grid` are ignored.
     """
-    logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
+    chosen_logs, others = logs_meant(logs, where), logs_meant(held_out)
+    logs, held_out = chosen_logs.logs, others.logs
+    for note in (*chosen_logs.notes, *others.notes):
+        warn(note)
     _check_apart(logs, held_out)
     check_outputs(
         out, None, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))}

@@ -1,0 +1,79 @@
+"""The logs that a condition selects from the rows of a catalog."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fuselog.pipeline.selecting.catalog import read_catalog, require_unchanged, with_columns
+from fuselog.pipeline.selecting.where import rows_where
+from fuselog.recorders.errors import BadInput, choices
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_NAMED = 3  # largest number of logs that notes name
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The logs that the paths of a command mean.
+
+    Attributes:
+        logs: the logs that can be read.
+        groups: the group of each log, such as its robot; empty if no column is named.
+        unreadable: why other logs cannot be read.
+    """
+
+    logs: Sequence[Path]
+    groups: Sequence[str] = ()
+    unreadable: Mapping[Path, str] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """Yield sentences on the logs that cannot be read."""
+        yield from notes_of(self.unreadable)
+
+
+def notes_of(left_out: Mapping[Any, str]) -> Iterator[str]:
+    """Yield sentences on logs that are left out, with the reasons of the first ones."""
+    for log, why in list(left_out.items())[:MOST_NAMED]:
+        yield f"{log}: left out: {why}"
+    if len(left_out) > MOST_NAMED:
+        yield f"{len(left_out) - MOST_NAMED} other logs are left out as well"
+
+
+def of_catalog(path: Path, where: str | None = None) -> Selection:
+    """Select logs from a catalog; see `selected`."""
+    table = read_catalog(path)
+    require_unchanged(table, path)
+    return selected(with_columns(table), str(path), where)
+
+
+def selected(
+    table: "pd.DataFrame", name: str, where: str | None = None, group: str | None = None
+) -> Selection:
+    """Select the logs whose rows meet a condition.
+
+    Args:
+        table: the rows of catalogs, with all columns.
+        name: the name of the table for messages.
+        where: the condition.
+        group: the column that names the group of each log.
+
+    Raises BadInput if no log meets the condition, or there is no such column.
+    """
+    if where is not None:
+        table = rows_where(table, where)
+    if table.empty:
+        condition = "" if where is None else f" meets --where {where}"
+        raise BadInput(f"{name}: no log{condition}; fuselog catalog shows the rows")
+    if group is not None and group not in table:
+        raise BadInput(
+            f"--group: no column '{group}' in the catalog; {choices(group, [*map(str, table)])}"
+        )
+    bad = table["problem"].notna()
+    logs = [Path(log) for log in table["log"][~bad]]
+    groups = [] if group is None else table[group][~bad].astype(str).tolist()
+    why = {Path(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)}
+    return Selection(logs, groups, why)
