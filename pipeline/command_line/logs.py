@@ -193,9 +193,10 @@ def view(paths: tuple[Path, ...], **options: Any) -> None:
     Results with several runs and folders of logs open as a sortable table of runs, the worst first.
     Several results of the same runs, or several estimates logs of one log, are drawn in one scene.
     """
-    from fuselog.pipeline.command_line.commands import view_path
+    from fuselog.pipeline.presenting.command import view_path
+    from fuselog.pipeline.presenting.options import Options
 
-    view_path(paths, **options)
+    view_path(paths, Options(**options))
     _say_next_of_view(paths[0], recover=options["recover"])
 
 

@@ -20,7 +20,8 @@ from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.divergence import Divergence, find_divergence
 from fuselog.replay.judging.errors.evaluation import Errors, errors_at
 from fuselog.replay.judging.errors.moments import Moments
-from fuselog.replay.timeline.drawing.canvas import ABOUT, DRAWN_ROWS, Canvas, Scene, Timeline
+from fuselog.replay.timeline.catalog import ABOUT
+from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 from fuselog.replay.timeline.fanning import Fan, draw_fans
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
