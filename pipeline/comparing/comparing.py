@@ -66,6 +66,7 @@ class Differences:
         paired: every metric of every pair.
         times: a row per pair, case, quantity and time span, with the difference and its interval.
         stress: effects of changes that should not matter; None if they were not tested.
+        results: the results and logs whose estimates were compared; empty if logs were replayed.
     """
 
     groups: Sequence[Sequence[Candidate]]
@@ -75,6 +76,7 @@ class Differences:
     paired: Sequence[Paired]
     times: pd.DataFrame = field(default_factory=pd.DataFrame)
     stress: Stress | None = None
+    results: Sequence[Path] = ()
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -189,6 +191,8 @@ class Differences:
             "margin": self.margin,
             "notes": list(self.notes),
         }
+        if self.results:
+            settings["candidates"] = [str(path.absolute()) for path in self.results]
         with result_folder(place) as part:
             if self.drawable:
                 self.draw(part / "timeline.rrd")
@@ -297,6 +301,7 @@ def compare(
     givens = inputs_of(
         paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
+    kinds = {kind_of(path, named, recover=recover) for path in paths}
     groups = list(map(_with_ages, comparable_groups(givens, named)))
     notes = [note for group in groups for candidate in group for note in candidate.notes]
     paired: list[Paired] = []
@@ -311,7 +316,7 @@ def compare(
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
     found = None
     if stress:
-        if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
+        if kinds != {"log"}:
             raise BadInput(
                 f"--stress: {paths[0]} is not a log to replay; give logs, and estimators with -e"
             )
@@ -319,7 +324,9 @@ def compare(
         found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
         paired = under_stress(paired, verdicts_of(found.stressed))
     notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
-    return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
+    notes = list(dict.fromkeys(notes))
+    results = paths if kinds <= {"result", "estimates"} else []
+    return Differences(groups, margin, gap_limit_s, notes, paired, table, found, results)
 
 
 def _with_ages(group: Sequence[Candidate]) -> list[Candidate]:

@@ -51,13 +51,18 @@ def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
         paths: results, folders of logs, or logs and estimates logs; see `list_runs`. A comparison is
             replaced by the results that it compared.
         gap_limit_s: longest gap over which the truth of logs is interpolated.
+
+    Raises BadInput if a result that a comparison compared is gone; see `list_runs`.
     """
     listed = [result for path in paths for result in results_of(path)]
+    missing = next((result for result in listed if not result.exists()), None)
+    if missing is not None:
+        raise BadInput(f"{paths[0]}: compared {missing}, which is gone; run fuselog compare again")
     given = files_of(listed)
     for file in _place_of(paths[0]).glob(f"{LIST}/*/{RUNS}"):
         with suppress(OSError, ValueError):  # an older fuselog wrote it
             kept = _READER.validate_json(file.read_bytes())
-            has_own_gap = all(each.name == RESULT_FILE for each in given)
+            has_own_gap = all(each.name == RESULT_FILE for each in given)  # in its settings
             is_of_paths = kept.given == given and (has_own_gap or kept.gap_limit_s == gap_limit_s)
             if is_of_paths and kept.key == file.parent.name:
                 return kept._replace(path=paths[0])

@@ -241,6 +241,24 @@ def test_two_results_of_the_same_runs_are_shown_together(
         rows = read_table(folder / TABLE).query("estimator == 'ekf'").sort_values("run")
         shown = [each[0] for each in table[catalog.column_of(label, "nees")]]
         np.testing.assert_array_equal(shown, rows["nees"])
+    same = tmp_path / "new" / result.name
+    shutil.copytree(old, same)
+    compared = tmp_path / "compared"
+    assert fuselog("compare", result, same, "--out", compared).code == 0
+    said = fuselog("view", compared, "--runs", "2", "--save", tmp_path / "both")
+    assert said.code == 0, said.err
+    (server, *_), both = read_back(tmp_path / "both")
+    server.shutdown()
+    for label, named in (("ekf", "ekf"), ("ekf old", f"ekf new-{result.name}")):
+        expected, shown = (
+            each[catalog.column_of(name, "nees")].map(list)
+            for each, name in ((table, label), (both, named))
+        )
+        assert expected.to_list() == shown.to_list()
+    shutil.rmtree(same)
+    gone = fuselog("view", compared, "--runs", "2")
+    assert (gone.code, gone.err.count("\n")) == (2, 1)
+    assert f"compared {same}, which is gone" in gone.err
     other = tmp_path / "other"
     assert fuselog("run", *common, "--seed", "9", "--out", other).code == 0
     said = fuselog("view", result, other, "--save", tmp_path / "none")
