@@ -54,7 +54,7 @@ def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
 
     Raises BadInput if a result that a comparison compared is gone; see `list_runs`.
     """
-    listed = [result for path in paths for result in results_of(path)]
+    listed = list({each.resolve(): each for path in paths for each in results_of(path)}.values())
     missing = next((result for result in listed if not result.exists()), None)
     if missing is not None:
         raise BadInput(f"{paths[0]}: compared {missing}, which is gone; run fuselog compare again")

@@ -4,11 +4,13 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.output.outputs import PICTURE, TIMELINE, check_files
 from fuselog.pipeline.output.terminal import say, status, warn, warn_of_losses
 from fuselog.pipeline.presenting.drawing import differing, open_run
+from fuselog.pipeline.presenting.making import MARKER
 from fuselog.pipeline.presenting.options import Options
 from fuselog.pipeline.presenting.runs import Segment
 from fuselog.pipeline.runs.ensemble import judge_logs
@@ -46,8 +48,18 @@ def view_timeline(path: Path, segment: Segment | None, options: Options) -> None
                 f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log, "
                 "or one run with --runs NUMBER"
             )
+        elif (path / MARKER).is_file():
+            raise BadInput(
+                f"{path}: is a dataset that fuselog saved; to serve it: rerun server --host 127.0.0.1 "
+                f"-d {quote(str(path))}"
+            )
+        elif not rrd.is_file():
+            raise BadInput(
+                f"{rrd}: no such file; give a result with a timeline, a log, or a folder of *.mcap"
+            )
         elif save is not None:
-            _copy_timeline(rrd, save)
+            with whole_file(save) as new:
+                shutil.copyfile(rrd, new)
         if isinstance(at, str):
             moments = [each for each in read_moments(rrd) if options.focus in (None, each.case)]
             worst = worst_at(moments, at)
@@ -65,13 +77,6 @@ def view_timeline(path: Path, segment: Segment | None, options: Options) -> None
             viewer.serve(rrd, lambda url: say(f"viewing {path} at {url}; press Ctrl-C to end"))
         elif is_shown and screenshot is None:
             viewer.view(rrd, at_s=at)
-
-
-def _copy_timeline(rrd: Path, save: Path) -> None:
-    if not rrd.is_file():
-        raise BadInput(f"{rrd}: no such file; give a result folder with a timeline, or a log")
-    with whole_file(save) as new:
-        shutil.copyfile(rrd, new)
 
 
 def _draw(path: Path, segment: Segment | None, rrd: Path, options: Options) -> None:

@@ -19,6 +19,7 @@ from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
 from rerun.server import Server
 
 from fuselog.recorders.errors import BadInput
+from fuselog.replay.timeline.sinks import TableLayout, write_layout
 
 LOOPBACK = "127.0.0.1"
 PROPERTIES, BASE = "properties", "base"
@@ -162,4 +163,4 @@ def write_table_layout(path: Path, properties: Sequence[tuple[str, str]]) -> Non
     shown = [rrt.Column("rerun_segment_id", name="run"), *map(rrt.Column, columns)]
     hidden = [rrt.Column(name, visible=False) for name in _HIDDEN]
     layout = rrt.TableLayout(columns=[*shown, *hidden])
-    rrt.TableBlueprint(table_layout=layout, sort_by=columns[0]).save(APPLICATION, path)
+    write_layout(path, APPLICATION, TableLayout(table_layout=layout, sort_by=columns[0]))

@@ -27,7 +27,7 @@ from fuselog.replay.timeline.fanning import Fan, draw_fans
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
 from fuselog.replay.timeline.moments import keep_moments, worst_at
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
-from fuselog.replay.timeline.sinks import open_recording
+from fuselog.replay.timeline.sinks import open_recording, write_layout
 
 # Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
@@ -172,7 +172,8 @@ class Drawing:
         if self._layout is not None:
             about = rrb.TextDocumentView(origin=ABOUT, name="Run")
             layout = rrb.Vertical(about, layout, row_shares=[1.0, 8.0])
-            rrb.Blueprint(layout, panel, collapse_panels=True).save(self._names[0], str(self._layout))
+            shared = rrb.Blueprint(layout, panel, collapse_panels=True)
+            write_layout(self._layout, self._names[0], shared)
 
 
 def show(

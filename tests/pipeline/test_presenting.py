@@ -309,6 +309,55 @@ def test_what_cannot_be_shown_is_refused(
     assert [path.name for path in tmp_path.rglob("*")] == ["notes", "note.txt"]
 
 
+def test_a_folder_without_runs_is_refused(dataset: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    for folder, words in (
+        (dataset, "is a dataset that fuselog saved; to serve it: rerun server --host 127.0.0.1 -d"),
+        (dataset.with_name("result.segments"), "is a dataset that fuselog saved"),
+        (tmp_path, "no such file; give a result with a timeline, a log, or a folder of *.mcap"),
+    ):
+        said = fuselog("view", folder)
+        assert (said.code, said.err.count("\n")) == (2, 1)
+        assert words in said.err
+
+
+def test_a_folder_that_is_not_of_fuselog_is_kept(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    """What is next to a result under the name of its drawings is not replaced."""
+    place = tmp_path / "result"
+    shutil.copytree(result, place)
+    other = tmp_path / "result.segments" / "note.txt"
+    other.parent.mkdir()
+    other.write_text("mine")
+    said = fuselog("view", place, "--save", tmp_path / "set")
+    assert (said.code, said.err.count("\n")) == (2, 1)
+    assert "result.segments: exists and is not a dataset that fuselog wrote; move it away" in said.err
+    assert [path.name for path in other.parent.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.unix
+def test_a_full_disk_is_one_sentence(result: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    """Rerun's own writer of layouts would wait forever or stay silent; nothing half is left."""
+    resource = pytest.importorskip("resource")
+    place, saved = tmp_path / "result", tmp_path / "set"
+    shutil.copytree(result, place)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit, what in ((4000, "all runs"), (10_000, "layout"), (100_000, "whole")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            said = fuselog("view", place, "--runs", "0", "--save", saved)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert (said.code, said.err.count("\n")) == (2, 1), (what, said.err)
+        assert "cannot be written" in said.err
+        kept = tmp_path / "result.segments"
+        assert not saved.exists()
+        assert not [*kept.rglob("*.part")]
+        assert not (kept / "run-0000").exists()
+        runs = list_runs([place], 0.2)
+        assert runs is not None
+        Kept(runs).properties()
+    assert fuselog("view", place, "--runs", "0", "--save", tmp_path / "set").code == 0
+
+
 def test_a_port_in_use_is_refused(result: Path, fuselog: Fuselog) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
