@@ -4,27 +4,22 @@ Rerun, matplotlib, pandas and scipy are slow to import, so only code that draws,
 imports them.
 """
 
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fuselog.pipeline.altering.sources import alter
 from fuselog.pipeline.api.planning import plan_replay
 from fuselog.pipeline.output.alarming import alarms_of
 from fuselog.pipeline.output.alarms import as_alarm
 from fuselog.pipeline.output.coverage import sentences
 from fuselog.pipeline.output.outputs import (
     ESTIMATES,
-    PICTURE,
     TIMELINE,
     check_files,
     replaced,
     run_written,
 )
 from fuselog.pipeline.output.results import (
-    RESULT_FILE,
     in_order,
     plain,
     split_metric,
@@ -40,25 +35,17 @@ from fuselog.pipeline.output.terminal import (
     progress,
     say,
     say_next,
-    status,
     warn,
+    warn_of_losses,
 )
-from fuselog.pipeline.runs.ensemble import judge_logs
-from fuselog.pipeline.runs.estimates import source_of_estimates
-from fuselog.pipeline.runs.initial_states import span_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from fuselog.pipeline.selecting.catalog import logs_in
-from fuselog.recorders.atomic import scratch_folder, whole_file
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Log, Mirrors, open_log
+from fuselog.recorders.log import Mirrors, open_log
 from fuselog.replay.engine.streams.linting import lint_source, worst
-from fuselog.replay.engine.streams.sources import LogSource, MemorySource
-from fuselog.replay.judging.errors.moments import Moment
+from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.judge import Judge
-
-if TYPE_CHECKING:
-    from fuselog.pipeline.presenting.segments import Runs, Segment
 
 MOST_LOGS = 5  # number of logs whose findings are printed
 
@@ -123,7 +110,7 @@ def replay_logs(
             warn(sentence)
     for path in paths[:1]:
         say_left_out(path, foxglove)
-    _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
+    warn_of_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
     details = {
@@ -195,12 +182,6 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     return paths
 
 
-def _state_losses(logs: Iterable[Log]) -> None:
-    for log in logs:
-        if log.loss_statement:
-            warn(log.loss_statement)
-
-
 def evaluate_logs(
     estimates: list[Path],
     logs: list[Path],
@@ -226,7 +207,7 @@ def evaluate_logs(
         recover=recover,
         gap_limit_s=gap_limit_s,
     )
-    _state_losses(source.log for source in found.sources)
+    warn_of_losses(source.log for source in found.sources)
     _print_outcome(
         found.judge,
         found.estimators,
@@ -332,226 +313,10 @@ def _print_outcome(
     for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
     for moment in judge.worst.values():
-        say(_worst(moment, judge.name_of(moment.run) if judge.runs > 1 else ""))
+        say(moment.sentence(judge.name_of(moment.run) if judge.runs > 1 else ""))
     if details and "seconds" in details:
         print_table(("estimator", "time (s)"), list(details["seconds"].items()))
     for path in written:
         say(str(path))
     if written:
         say_next("report" if written[0].is_dir() else "view", str(written[0]))
-
-
-def _worst(moment: Moment, run: str = "") -> str:
-    where = "".join(f" of {each}" for each in (moment.case, run) if each)
-    return f"{moment.estimator}: worst at {moment.elapsed_s:.3f} s{where}: {moment.words}"
-
-
-def view_path(
-    paths: Sequence[Path],
-    *,
-    runs: str | None,
-    port: int | None,
-    screenshot: Path | None,
-    at: float | str | None,
-    start_s: float | None,
-    end_s: float | None,
-    focus: str | None,
-    save: Path | None,
-    connect: str | None,
-    web: bool,
-    gap_limit_s: float,
-    recover: bool,
-) -> None:
-    """Open a path in the viewer, take a screenshot of it, or write or stream its timeline.
-
-    Several runs are shown as a dataset, unless the options are about one run.
-    """
-    of_one = [at, start_s, end_s, focus, connect]
-    is_timeline = any(each is not None for each in of_one) or (save and save.suffix == ".rrd")
-    path, segment = paths[0], None
-    is_asked = runs is not None or len(paths) > 1 or port is not None
-    is_shown_first = is_timeline or screenshot is not None
-    if is_asked or (path.is_dir() and not (is_shown_first and (path / RESULT_FILE).is_file())):
-        found = _runs_of(paths, gap_limit_s, is_asked=is_asked)
-        chosen = [] if found is None else found.chosen(runs or "worst")
-        if found is not None and not (is_timeline or (screenshot and len(chosen) == 1)):
-            from fuselog.pipeline.presenting.command import save_dataset, show_dataset
-
-            if save is not None:
-                save_dataset(found, chosen, save)
-            else:
-                show_dataset(found, chosen, port=port, web=web, picture=screenshot)
-            return
-        if found is not None and len(chosen) != 1:
-            raise BadInput(
-                f"{path}: --at, --start, --end, --focus, --connect and --save FILE.rrd are about one "
-                "run; choose it with --runs NUMBER"
-            )
-        segment, gap_limit_s = (chosen[0], found.gap_limit_s) if found else (None, gap_limit_s)
-    _view_one(
-        path,
-        segment,
-        screenshot=screenshot,
-        at=at,
-        span=(start_s, end_s),
-        focus=focus,
-        save=save,
-        connect=connect,
-        web=web,
-        gap_limit_s=gap_limit_s,
-        recover=recover,
-    )
-
-
-def _runs_of(paths: Sequence[Path], gap_limit_s: float, *, is_asked: bool) -> "Runs | None":
-    """Return the runs of results or folders; None if there is only a timeline to show.
-
-    Raises BadInput if several runs are requested and there are none.
-    """
-    from fuselog.pipeline.presenting.segments import runs_in, runs_of_logs, together
-    from fuselog.replay.timeline.catalog import EXTRA, has_catalog
-
-    if len(paths) > 1 and all(path.suffix == ".mcap" for path in paths):
-        return runs_of_logs(paths[0], paths, gap_limit_s)
-    is_result = (paths[0] / RESULT_FILE).is_file()
-    try:
-        given = [runs_in(path, gap_limit_s) for path in paths]
-    except BadInput as error:
-        if is_asked or not is_result:
-            raise
-        warn(f"{error}; showing the first run")
-        return None
-    found = [each for each in given if each is not None]
-    if len(found) < len(paths):
-        if is_asked:
-            without = paths[given.index(None)]
-            raise BadInput(
-                f"{without}: has no row for each run; give results of fuselog run or sweep, such as "
-                "those of a comparison, or logs, or leave out --runs and --port"
-            )
-        return None
-    if not is_asked and is_result:
-        if len(found[0].segments) < 2:
-            return None
-        if not has_catalog():
-            warn(f"{EXTRA}; showing the first run")
-            return None
-    return together(found)
-
-
-def _view_one(
-    path: Path,
-    segment: "Segment | None",
-    *,
-    screenshot: Path | None,
-    at: float | str | None,
-    span: tuple[float | None, float | None],
-    focus: str | None,
-    save: Path | None,
-    connect: str | None,
-    web: bool,
-    gap_limit_s: float,
-    recover: bool,
-) -> None:
-    """Show, write or stream the timeline of a log, a result or one of its runs (`segment`)."""
-    from fuselog.replay.timeline import viewer
-    from fuselog.replay.timeline.show import read_moments, worst_at
-
-    is_shown = save is None and connect is None and not web
-    if at is not None and screenshot is None and not is_shown:
-        raise BadInput(
-            f"--at {at}: sets the time cursor of the viewer and of --screenshot; leave it out with "
-            "--save, --connect and --web"
-        )
-    rrd = path / "timeline.rrd" if path.is_dir() else path
-    outputs = [(save, TIMELINE), (screenshot, PICTURE)]
-    check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
-    with scratch_folder("fuselog-view") as folder:
-        if segment is not None or rrd.suffix != ".rrd":
-            rrd = save or folder / "timeline.rrd"
-            with status() as told:
-                told("drawing the timeline")
-                if segment is not None:
-                    source, estimates, _ = segment.load()
-                    name = f"{path} {segment.name}"
-                    judged: Sequence[LogSource | MemorySource] = [estimates] if estimates.topics else []
-                else:
-                    name = str(path)
-                    source, judged = _read_log(path, recover=recover)
-                judge = _draw(source, judged, name, rrd, connect, focus, at, span, gap_limit_s)
-                if segment is not None and span == (None, None):
-                    from fuselog.pipeline.presenting.making import differing
-
-                    for sentence in differing(segment, judge):
-                        warn(sentence)
-        elif any(given is not None for given in (*span, focus, connect)):
-            raise BadInput(
-                f"{rrd}: this is a finished timeline; --start, --end, --focus and --connect need a log, "
-                "or one run with --runs NUMBER"
-            )
-        elif save is not None:
-            _copy_timeline(rrd, save)
-        if isinstance(at, str):
-            worst = worst_at([each for each in read_moments(rrd) if focus in (None, each.case)], at)
-            say(_worst(worst))
-            at = worst.elapsed_s
-        if screenshot is not None:
-            with status() as told:
-                complaints = viewer.screenshot(rrd, screenshot, at_s=at, progress=told)
-            for complaint in complaints:
-                warn(complaint)
-        for written in (save, screenshot):
-            if written is not None:
-                say(str(written))
-        if web:
-            viewer.serve(rrd, lambda url: say(f"viewing {path} at {url}; press Ctrl-C to end"))
-        elif is_shown and screenshot is None:
-            viewer.view(rrd, at_s=at)
-
-
-def _copy_timeline(rrd: Path, save: Path) -> None:
-    if not rrd.is_file():
-        raise BadInput(f"{rrd}: no such file; give a result folder with a timeline, or a log")
-    with whole_file(save) as new:
-        shutil.copyfile(rrd, new)
-
-
-def _read_log(path: Path, *, recover: bool) -> tuple[LogSource, list[LogSource]]:
-    """Open a log, or an estimates log together with its source log; return the run and its estimates."""
-    log = open_log(path, recover=recover)
-    estimates = source = LogSource(log)
-    is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
-    if is_estimates and log.run is not None and "log" in log.run.notes:
-        source = source_of_estimates(log, recover=recover)
-    elif not is_estimates:
-        source = alter(source, {})  # draws a log with several local tangent planes in one of them
-    _state_losses([log, source.log])
-    return source, [estimates] if is_estimates else []
-
-
-def _draw(
-    source: LogSource | MemorySource,
-    estimates: Sequence[LogSource | MemorySource],
-    name: str,
-    rrd: Path,
-    connect: str | None,
-    focus: str | None,
-    at: float | str | None,
-    span: tuple[float | None, float | None],
-    gap_limit_s: float,
-) -> Judge:
-    """Draw a span of a run in seconds, with its estimates if there are any, and judge them."""
-    from fuselog.replay.timeline.show import Drawing
-
-    shown = span_of(source, *span, "publish_time")
-    worst = at if isinstance(at, str) else None
-    with Drawing(
-        shown, identity=f"{name} {span}", focus=focus, save=rrd, connect=connect, at=worst
-    ) as drawing:
-        judged = [replace(each, start_ns=shown.start_ns, end_ns=shown.end_ns) for each in estimates]
-        judge = judge_logs(judged, [source], {}, gap_limit_s=gap_limit_s, drawing=drawing)
-    for sentence in judge.components_without_truth:
-        warn(sentence)
-    for topic in source.rejections:
-        say(f"{topic}: {source.rejections.sentence(topic)}")
-    return judge

@@ -240,13 +240,14 @@ def view(paths: tuple[Path, ...], where: str | None, **options: Any) -> None:
     Results with several runs and folders of logs open as a sortable table of runs, the worst first.
     Several results of the same runs, or several estimates logs of one log, are drawn in one scene.
     """
-    from fuselog.pipeline.command_line.commands import view_path
+    from fuselog.pipeline.presenting.command import view_path
+    from fuselog.pipeline.presenting.options import Options
 
     if selecting(paths, {"where": where}):
         from fuselog.pipeline.logs.cataloguing import select
 
         paths = tuple(select(paths, where).logs)
-    view_path(paths, **options)
+    view_path(paths, Options(**options))
     _say_next_of_view(paths[0], recover=options["recover"])
 
 

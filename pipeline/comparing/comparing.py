@@ -66,6 +66,7 @@ class Differences:
         times: a row per pair, case, quantity and time span, with the difference and its interval.
         stress: effects of changes that should not matter; None if they were not tested.
         tables: other tables for the result folder.
+        results: the results and logs whose estimates were compared; empty if logs were replayed.
     """
 
     groups: Sequence[Sequence[Candidate]]
@@ -76,6 +77,7 @@ class Differences:
     times: pd.DataFrame = field(default_factory=pd.DataFrame)
     stress: Stress | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    results: Sequence[Path] = ()
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -190,6 +192,8 @@ class Differences:
             "margin": self.margin,
             "notes": list(self.notes),
         }
+        if self.results:
+            settings["candidates"] = [str(path.absolute()) for path in self.results]
         with result_folder(place) as part:
             if self.drawable:
                 self.draw(part / "timeline.rrd")
@@ -298,11 +302,12 @@ def compare(
     givens = inputs_of(
         paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
+    kinds = {kind_of(path, named, recover=recover) for path in paths}
     done = differences_of(comparable_groups(givens, named), margin, gap_limit_s)
     paired, notes = done.paired, list(done.notes)
     found = None
     if stress:
-        if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
+        if kinds != {"log"}:
             raise BadInput(
                 f"--stress: {paths[0]} is not a log to replay; give logs, and estimators with -e"
             )
@@ -310,7 +315,9 @@ def compare(
         found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
         paired = under_stress(paired, verdicts_of(found.stressed))
     notes += sentences(done.coverage)
-    return replace(done, notes=list(dict.fromkeys(notes)), paired=paired, stress=found)
+    notes = list(dict.fromkeys(notes))
+    results = paths if kinds <= {"result", "estimates"} else []
+    return replace(done, notes=notes, paired=paired, stress=found, results=results)
 
 
 def differences_of(

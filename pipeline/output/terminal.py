@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from fuselog.pipeline.output.claims import Claim
     from fuselog.pipeline.output.results import Bounds, Measured, MetricTable, MetricValue
+    from fuselog.recorders.log import Log
 
 # With more cases than this, metrics are summarised, and only files list each case.
 MOST_CASES = 6
@@ -119,6 +120,13 @@ def say_next(*words: str) -> None:
 def warn(text: str) -> None:
     """Print a line on standard error."""
     err.print(printable(f"fuselog: {text}"), soft_wrap=True)
+
+
+def warn_of_losses(logs: "Iterable[Log]") -> None:
+    """Print what could not be read of damaged logs."""
+    for log in logs:
+        if log.loss_statement:
+            warn(log.loss_statement)
 
 
 def print_json(value: Any) -> None:

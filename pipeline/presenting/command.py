@@ -1,25 +1,83 @@
-"""The command `fuselog view` for several runs: a dataset in Rerun, or one of its runs as a timeline."""
+"""The command `fuselog view`: runs as a dataset in Rerun, or one log or run as a timeline."""
 
 import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 
-from fuselog.pipeline.output.outputs import PICTURE, check_files, check_folder
+from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import progress, say, status, warn
-from fuselog.pipeline.presenting.making import LAYOUT, TABLE, Kept, Made
-from fuselog.pipeline.presenting.segments import Runs, Segment
+from fuselog.pipeline.presenting.making import TABLE, Kept, Made, runs_at
+from fuselog.pipeline.presenting.options import Options
+from fuselog.pipeline.presenting.runs import LAYOUT, WITHOUT_RUNS, Runs, Segment
 from fuselog.pipeline.runs.executors import PoolFactory, inline_pool, processes
-from fuselog.replay.timeline.catalog import PROPERTIES, Dataset, serve_dataset
+from fuselog.recorders.errors import BadInput
+from fuselog.replay.timeline.catalog import EXTRA, PROPERTIES, Dataset, has_catalog, serve_dataset
 from fuselog.replay.timeline.viewer import Listener, screenshot, serving, showing
 
 # Fewer runs are drawn sooner by this process than by others, which have to start.
 PAYING_SEGMENTS = 3
 
 
-def save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
+def view_path(paths: Sequence[Path], options: Options) -> None:
+    """Open paths in the viewer, take a screenshot of them, or write or stream a timeline.
+
+    Several runs are shown as a dataset, unless the options are about one run.
+    """
+    runs, segment = _runs_to_show(paths, options), None
+    if runs is not None:
+        chosen = runs.chosen(options.runs or "worst")
+        if not options.is_of_one and (options.screenshot is None or len(chosen) > 1):
+            if options.save is not None:
+                _save_dataset(runs, chosen, options.save)
+            else:
+                _show_dataset(runs, chosen, options)
+            return
+        if len(chosen) != 1:
+            raise BadInput(
+                f"{runs.path}: --at, --start, --end, --focus, --connect and --save FILE.rrd are about "
+                "one run; choose it with --runs NUMBER"
+            )
+        segment, options = chosen[0], replace(options, gap_limit_s=runs.gap_limit_s)
+    from fuselog.pipeline.presenting.timeline import view_timeline  # slow to import
+
+    view_timeline(paths[0], segment, options)
+
+
+def _runs_to_show(paths: Sequence[Path], options: Options) -> Runs | None:
+    """Return the runs of results or folders; None if there is only a timeline to show.
+
+    Raises BadInput if several runs are requested and there are none.
+    """
+    path = paths[0]
+    is_asked = options.runs is not None or len(paths) > 1 or options.port is not None
+    is_result = (path / RESULT_FILE).is_file()
+    is_shown_first = is_result and (options.is_of_one or options.screenshot is not None)
+    if not is_asked and (is_shown_first or not path.is_dir()):
+        return None
+    try:
+        found = runs_at(paths, options.gap_limit_s)
+    except BadInput as error:
+        if is_asked or not is_result:
+            raise
+        warn(f"{error}; showing the first run")
+        return None
+    if found is None and is_asked:
+        raise BadInput(WITHOUT_RUNS.format(path))
+    if found is None or is_asked or not is_result:
+        return found
+    if len(found.segments) > 1 and not has_catalog():
+        warn(f"{EXTRA}; showing the first run")
+        return None
+    return found if len(found.segments) > 1 else None
+
+
+def _save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
     """Write the runs as a dataset to a folder, with the streams and estimates of the chosen runs."""
+    from fuselog.pipeline.output.outputs import check_folder  # slow to import
+
     check_folder(folder, {"input": [runs.path]})
     kept = Kept(runs)
     made = _all_made(kept, chosen)
@@ -28,22 +86,17 @@ def save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
     say(f"to serve it: rerun server --host 127.0.0.1 -d {quote(str(folder))}")
 
 
-def show_dataset(
-    runs: Runs,
-    chosen: Sequence[Segment],
-    *,
-    port: int | None,
-    web: bool,
-    picture: Path | None,
-) -> None:
+def _show_dataset(runs: Runs, chosen: Sequence[Segment], options: Options) -> None:
     """Show the runs in the viewer or in a browser until it is closed, or take a picture of the table.
 
     The table comes first; chosen runs are added as they are drawn.
     """
-    if picture is not None:
-        check_files([(picture, PICTURE)], {"input": [runs.path]})
+    if options.screenshot is not None:
+        from fuselog.pipeline.output.outputs import PICTURE, check_files  # slow to import
+
+        check_files([(options.screenshot, PICTURE)], {"input": [runs.path]})
     kept = Kept(runs)
-    with serve_dataset(runs.path.resolve().name, port) as dataset:
+    with serve_dataset(runs.path.resolve().name, options.port) as dataset:
         with status() as told:
             told(f"listing {len(runs.segments)} runs")
             place = kept.properties()
@@ -56,16 +109,16 @@ def show_dataset(
                 dataset.lay_out(each.folder / LAYOUT)
         missing = _missing(chosen, made)
         say(f"{runs.path}: {len(runs.segments)} runs, {runs.order}; {dataset.url}")
-        if picture is not None:
+        if options.screenshot is not None:
             with status() as told:
-                for complaint in screenshot(dataset.url, picture, progress=told):
+                for complaint in screenshot(dataset.url, options.screenshot, progress=told):
                     warn(complaint)
-            say(str(picture))
+            say(str(options.screenshot))
             return
         if len(chosen) == 1:  # it is what is opened, so it has to be there
             _add(dataset, kept, missing, None)
         address = dataset.url_of(chosen[0].name) if len(chosen) == 1 else dataset.url
-        with _viewer(runs, address, web=web) as listener:
+        with _viewer(runs, address, web=options.web) as listener:
             _add(dataset, kept, _missing(chosen, kept.made()), listener)
             listener.process.wait()
 

@@ -2,15 +2,13 @@
 
     PATH.segments/
         fuselog.json            shows that fuselog wrote the folder
-        properties/KEY/         the layer of properties of every segment, and the layout of the table
+        all runs/KEY/           the list of runs, the layer of properties of each, and the table's layout
         NAME/KEY/               the other layers of a segment, and its layout
 
 A key is a hash of everything that determines the files, so that nothing outdated is shown.
 """
 
-import hashlib
 import json
-import math
 import shutil
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -18,34 +16,65 @@ from contextlib import suppress
 from pathlib import Path
 from shlex import quote
 from time import monotonic, sleep
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote as file_name
 from urllib.parse import unquote
 
-from rerun.chunk import Chunk
+from pydantic import TypeAdapter
 
-from fuselog.pipeline.presenting.segments import SAME, Runs, Segment
-from fuselog.pipeline.runs.ensemble import judge_logs
+from fuselog.pipeline.output import RESULT_FILE
+from fuselog.pipeline.presenting.runs import LAYOUT, Runs, Segment, files_of, hash_of, results_of
 from fuselog.pipeline.runs.executors import PoolFactory, version_of_code
 from fuselog.recorders.atomic import clear_leftovers, whole_file, whole_folder
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parsing import parse_json
-from fuselog.replay.judging.judge import Judge
 from fuselog.replay.timeline.catalog import (
     BASE,
-    PROPERTIES,
     read_chunks,
     write_chunks,
     write_properties,
     write_table_layout,
 )
-from fuselog.replay.timeline.drawing.canvas import escaped
 
 MARKER = "fuselog.json"
+LIST = "all runs"  # no segment has this name, because `file_name` replaces spaces
 # Time in which terminated workers end.
 ENDING_S = 5.0
-LAYOUT, TABLE = "layout.rbl", "table.rbl"
-APPLICATION = "fuselog"
+TABLE, RUNS = "table.rbl", "runs.json"
+_READER = TypeAdapter(Runs)
+
+
+def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
+    """Return the runs at paths, as they were listed before or from the results or logs.
+
+    Args:
+        paths: results, folders of logs, or logs and estimates logs; see `list_runs`. A comparison is
+            replaced by the results that it compared.
+        gap_limit_s: longest gap over which the truth of logs is interpolated.
+
+    Raises BadInput if a result that a comparison compared is gone; see `list_runs`.
+    """
+    listed = list({each.resolve(): each for path in paths for each in results_of(path)}.values())
+    missing = next((result for result in listed if not result.exists()), None)
+    if missing is not None:
+        raise BadInput(f"{paths[0]}: compared {missing}, which is gone; run fuselog compare again")
+    given = files_of(listed)
+    for file in _place_of(paths[0]).glob(f"{LIST}/*/{RUNS}"):
+        with suppress(OSError, ValueError):  # an older fuselog wrote it
+            kept = _READER.validate_json(file.read_bytes())
+            has_own_gap = all(each.name == RESULT_FILE for each in given)  # in its settings
+            is_of_paths = kept.given == given and (has_own_gap or kept.gap_limit_s == gap_limit_s)
+            if is_of_paths and kept.key == file.parent.name:
+                return kept._replace(path=paths[0])
+    from fuselog.pipeline.presenting.segments import list_runs  # slow to import
+
+    found = list_runs(listed, gap_limit_s)
+    return found and found._replace(path=paths[0])
+
+
+def _place_of(path: Path) -> Path:
+    place = path.resolve()
+    return place.with_name(f"{place.name}.segments")
 
 
 class Made(NamedTuple):
@@ -73,27 +102,23 @@ class Kept:
 
     def __init__(self, runs: Runs) -> None:
         self._runs = runs
-        place = runs.path.resolve()
-        self.folder = place.with_name(f"{place.name}.segments")
+        self.folder = _place_of(runs.path)
         _require_ours(self.folder, "move it away")
         with whole_file(self.folder / MARKER) as new:
-            new.write_text(json.dumps({"of": place.name}) + "\n", encoding="utf-8")
+            new.write_text(json.dumps({"of": runs.path.resolve().name}) + "\n", encoding="utf-8")
         self._clear()
 
     def properties(self) -> Path:
         """Return the folder of the layer of properties of all segments; make it if it is not there."""
         runs = self._runs
-        known = [[each.name, each.properties] for each in runs.segments]
-        contents = json.dumps([known, runs.columns, version_of_code()], sort_keys=True)
-        key = hashlib.sha256(contents.encode()).hexdigest()[:16]
-        place = self.folder / PROPERTIES / key
+        place = self.folder / LIST / runs.key
         if not place.is_dir():
             with whole_folder(place, _refuse) as new:
                 for segment in runs.segments:
                     path = new / f"{file_name(segment.name)}.rrd"
-                    text = _text(segment, runs)
-                    write_properties(path, APPLICATION, segment.name, segment.properties, text)
-                write_table_layout(new / TABLE, APPLICATION, runs.columns)
+                    write_properties(path, segment.name, segment.properties, _text(segment, runs))
+                write_table_layout(new / TABLE, runs.columns)
+                (new / RUNS).write_text(json.dumps(runs._asdict(), default=_plain), encoding="utf-8")
             _remove_others(place)
         return place
 
@@ -116,7 +141,7 @@ class Kept:
                     while waiting and len(pending) < pool.workers:
                         segment = waiting.pop()
                         place = self._place(segment)
-                        drawing = pool.executor.submit(draw, segment, self._runs.gap_limit_s, place)
+                        drawing = pool.executor.submit(_draw, segment, self._runs.gap_limit_s, place)
                         pending[drawing] = segment
                     for done in wait(pending, return_when=FIRST_COMPLETED).done:
                         segment = pending.pop(done)
@@ -139,7 +164,8 @@ class Kept:
         return bool(active)
 
     def _place(self, segment: Segment) -> Path:
-        key = hashlib.sha256(f"{segment.key} {self._runs.gap_limit_s}".encode()).hexdigest()[:16]
+        parts = [part.contents for part in segment.parts]
+        key = hash_of([parts, self._runs.gap_limit_s, version_of_code()])
         return self.folder / file_name(segment.name) / key
 
     def save(self, folder: Path, made: Sequence[Made]) -> None:
@@ -154,7 +180,7 @@ class Kept:
                     continue
                 layers = [properties / file, *(path for path, _ in drawn[segment.name].layers)]
                 chunks = [chunk for path in layers for chunk in read_chunks(path)]
-                write_chunks(new / file, APPLICATION, segment.name, chunks)
+                write_chunks(new / file, segment.name, chunks)
             for each in made[:1]:
                 shutil.copyfile(each.folder / LAYOUT, new / LAYOUT)
             names = sorted(path.name for path in new.iterdir())
@@ -162,53 +188,19 @@ class Kept:
             (new / MARKER).write_text(marker + "\n", encoding="utf-8")
 
 
-def draw(segment: Segment, gap_limit_s: float, place: Path) -> list[str]:
-    """Draw a segment into the folder `place`: a file for each layer, and the layout.
+def _draw(segment: Segment, gap_limit_s: float, place: Path) -> list[str]:
+    """Draw a segment into a new folder; see `draw`."""
+    from fuselog.pipeline.presenting.drawing import draw  # slow to import
 
-    Returns sentences on errors that differ from those of the result, since the code has changed.
-    """
-    from fuselog.replay.timeline.show import Drawing  # slow to import
-
-    source, estimates, versions = segment.load()
     with whole_folder(place, _refuse) as new:
-        whole = new / "whole.rrd"
-        with Drawing(source.whole(), identity=segment.name, save=whole, layout=new / LAYOUT) as drawing:
-            judge = judge_logs([estimates], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing)
-        layers: dict[str, list[Chunk]] = {BASE: [], **{label: [] for label in versions}}
-        names = {escaped(label): label for label in versions}
-        for chunk in read_chunks(whole):
-            parts = chunk.entity_path.split("/")[2:]  # without the root, such as `plots`
-            layers[next((names[each] for each in parts if each in names), BASE)].append(chunk)
-        whole.unlink()
-        for label, chunks in layers.items():
-            write_chunks(new / f"{file_name(label)}.rrd", APPLICATION, segment.name, chunks)
-    return differing(segment, judge)
-
-
-def differing(segment: Segment, judge: Judge) -> list[str]:
-    """Describe the first error of a replay that differs from what the result states, if any does."""
-    if segment.parts[0].runner is None:
-        return []
-    for row in judge.runs_table.to_dict("records"):
-        label, case = str(row["estimator"]), str(row["case"])
-        stated = segment.properties.get(label) or segment.properties.get(f"{label} {case}") or {}
-        for key, value in stated.items():
-            now = row.get(key)
-            if not isinstance(value, float) or now is None:
-                continue
-            if not math.isclose(value, float(now), rel_tol=SAME, abs_tol=1e-12):
-                return [
-                    f"{segment.name}: drawn now, {key} of {label} is {now:.6g}, where the result has "
-                    f"{value:.6g}; the code has changed since"
-                ]
-    return []
+        return draw(segment, gap_limit_s, new)
 
 
 def _text(segment: Segment, runs: Runs) -> str:
     """Describe a run in Markdown, with the command that draws it."""
     run = segment.properties["run"]
     facts = ", ".join(f"{name} {value}" for name, value in run.items())
-    command = f"fuselog view {quote(str(runs.path))} --runs {quote(segment.name)}"
+    command = f"fuselog view {quote(str(runs.path.resolve()))} --runs {quote(segment.name)}"
     about = f"**{segment.name}** of {len(runs.segments)} ({facts}), sorted {runs.order}."
     return f"{about}\n\nIf nothing is drawn below, this command adds it: `{command}`"
 
@@ -230,7 +222,13 @@ def _require_ours(folder: Path, remedy: str) -> None:
 
 
 def _refuse(place: Path) -> None:
+    """Raise BadInput, because a folder that is to be made exists already."""
     raise BadInput(f"{place}: another fuselog command wrote it meanwhile; run this command again")
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON can represent of a path, a segment or a part."""
+    return str(value) if isinstance(value, Path) else vars(value)
 
 
 def _remove_others(place: Path) -> None:

@@ -1,186 +1,70 @@
-"""Runs as segments of a dataset: what is known about each, and the logs or settings that draw it."""
+"""Lists of the runs of results, sweeps, comparisons and logs, with what is known about each run."""
 
-import hashlib
-import json
 import math
+import os
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, count
+from dataclasses import replace
+from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from fuselog.pipeline.altering.sources import alter, alter_all
-from fuselog.pipeline.comparing.renamed import Renamed
 from fuselog.pipeline.output.results import RESULT_FILE, RUNS, Result, read_result, read_table
 from fuselog.pipeline.output.words import is_error
+from fuselog.pipeline.presenting.drawing import open_run, runner_of, worst_times
+from fuselog.pipeline.presenting.runs import (
+    WITHOUT_RUNS,
+    WORST_AT,
+    Part,
+    Runs,
+    Segment,
+    Value,
+    files_of,
+    group_of,
+    hash_of,
+)
 from fuselog.pipeline.runs.ensemble import judge_logs
 from fuselog.pipeline.runs.estimates import labels_of, source_of_estimates
-from fuselog.pipeline.runs.executors import states_of, version_of_code
-from fuselog.pipeline.runs.experiment import Stated
-from fuselog.pipeline.runs.initial_states import order_of
-from fuselog.pipeline.runs.recorded import replay_in_memory
-from fuselog.pipeline.runs.runner import Runner, runner_again
+from fuselog.pipeline.runs.runner import Runner
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import RunMetadata, open_log
-from fuselog.replay.engine.streams.sources import LogSource, MemorySource
+from fuselog.recorders.log import open_log
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Value = float | int | str
-Recorded = LogSource | MemorySource
-Properties = dict[str, dict[str, Value]]
-# Relative difference of an error that the same code may give on another processor.
-SAME = 1e-6
-WORST = 20
 
+def list_runs(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
+    """Return the runs of a result, of a folder of logs, or of several of them; None if there are none.
 
-@dataclass(frozen=True)
-class Part:
-    """The estimates of one run: a log of them, or what records and replays the run again.
+    Several results of the same runs are versions of their estimates, as are several estimates logs of
+    one log.
 
-    Attributes:
-        title: name of this version, if the run has several.
-        log: the log of the run, if it was kept.
-        estimates: the log of the estimates, if they were kept.
-        runner: object that records or opens the run and replays it, if it was not kept.
-        run: the number of the run for the runner.
+    Args:
+        paths: results, folders of logs, or logs and estimates logs.
+        gap_limit_s: longest gap over which the truth of logs is interpolated.
+
+    Raises BadInput if a result or a log cannot be read, if one of several paths has no separate runs, or
+    if they are not of the same runs.
     """
-
-    title: str = ""
-    log: Path | None = None
-    estimates: Path | None = None
-    runner: Runner | None = None
-    run: int = 0
-
-    @property
-    def key(self) -> str:
-        """Return a hash of everything that determines the drawing."""
-        files = [path for path in (self.log, self.estimates) if path is not None]
-        contents: list[Any] = [self.title, [str(file) for file in files], states_of(files)]
-        if self.runner is not None and self.estimates is None:
-            experiment = self.runner.experiment
-            logs = experiment.files[self.run : self.run + 1]
-            stated = experiment.model_dump(mode="json", by_alias=True)
-            contents += [stated, self.run, states_of(logs)]
-        contents.append(version_of_code())
-        return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()[:16]
-
-    def load(self) -> tuple[Recorded, Recorded]:
-        """Open or make the run and its estimates.
-
-        Raises BadInput if the logs are gone and the run cannot be recorded again.
-        """
-        if self.estimates is not None:
-            estimates = open_log(self.estimates)
-            return source_of_estimates(estimates, self.log), LogSource(estimates)
-        if self.log is not None:
-            source = alter(LogSource(open_log(self.log)), {})
-            return source, MemorySource({}, source.run or RunMetadata("unknown"), source.name)
-        assert self.runner is not None
-        experiment = self.runner.experiment
-        found = alter_all(self.runner.obtain(first_run=self.run, runs=1), experiment.alterations or {})
-        order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
-        outputs = replay_in_memory(found, experiment.estimators, order=order, late=late)
-        run = found[0].run or RunMetadata("unknown", epoch_ns=found[0].epoch_ns)
-        streams = {topic: rows.of_run(0) for topic, rows in outputs.items()}
-        return found[0], MemorySource(streams, run, found[0].name)
+    if len(paths) > 1 and all(path.suffix == ".mcap" for path in paths):
+        runs = _of_logs(paths[0], paths, gap_limit_s)
+    else:
+        found = {path: _runs_in(path, gap_limit_s) for path in paths}
+        if len(paths) > 1 and None in found.values():
+            without = next(path for path, own in found.items() if own is None)
+            raise BadInput(WITHOUT_RUNS.format(without))
+        given = [own for own in found.values() if own is not None]
+        if not given:
+            return None
+        runs = _together(given)
+    return runs._replace(given=files_of(paths))
 
 
-@dataclass(frozen=True)
-class Segment:
-    """One run in a dataset.
-
-    Attributes:
-        name: the run's name, from which file names are made.
-        parts: the versions of its estimates, the current one first.
-        properties: what is known about the run, and about each estimator.
-    """
-
-    name: str
-    parts: tuple[Part, ...]
-    properties: Properties
-
-    @property
-    def key(self) -> str:
-        """Return a hash of everything that determines the drawing."""
-        return hashlib.sha256("".join(part.key for part in self.parts).encode()).hexdigest()[:16]
-
-    def load(self) -> tuple[Recorded, MemorySource, dict[str, str]]:
-        """Return the run, the estimates of all versions, and the version of each estimator by label.
-
-        If an earlier version has an estimator with the same label, the version's title is appended to
-        the label.
-        """
-        source, first = self.parts[0].load()
-        versions = dict.fromkeys(labels_of(first), self.parts[0].title)
-        streams = first.read([topic for topic in first.topics if topic.startswith("/estimates/")])
-        for part in self.parts[1:]:
-            _, other = part.load()
-            for label in labels_of(other):
-                names = chain(
-                    [label, named := f"{label} {part.title}"], map(f"{named} {{}}".format, count(2))
-                )
-                name = next(each for each in names if each not in versions)
-                versions[name] = part.title
-                own = Renamed(other, label, name)
-                streams |= own.read([*own.topics])
-        run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-        return source, MemorySource(streams, run, source.name), versions
-
-
-class Runs(NamedTuple):
-    """The runs of a result or of a folder of logs.
-
-    Attributes:
-        path: the result or the folder.
-        segments: the runs, the worst first.
-        order: description of the order of the runs.
-        columns: groups and names of the properties that a table shows first.
-        gap_limit_s: longest gap over which the truth is interpolated.
-    """
-
-    path: Path
-    segments: list[Segment]
-    order: str
-    columns: list[tuple[str, str]]
-    gap_limit_s: float
-
-    def chosen(self, text: str) -> list[Segment]:
-        """Return the runs of `worst:N`, `all`, or of numbers or names separated by commas.
-
-        Raises BadInput if there is no such run.
-        """
-        if text == "all":
-            return self.segments
-        word, _, count = text.partition(":")
-        if word == "worst" and (not count or (count.isdecimal() and int(count))):
-            return self.segments[: int(count or WORST)]
-        by_name = {each.name: each for each in self.segments}
-        found: dict[str, Segment] = {}
-        for name in text.split(","):
-            number = f"run-{int(name):04d}" if name.isdecimal() else name
-            own = [each for each in by_name if each == number or each.startswith(f"{name}-")]
-            if not own:
-                first, last = min(by_name), max(by_name)
-                raise BadInput(
-                    f"--runs {text}: {self.path} has no run {name}; its {len(by_name)} runs are "
-                    f"{first} to {last}; to select several, give worst:N or all"
-                )
-            found |= {each: by_name[each] for each in own}
-        return list(found.values())
-
-
-def runs_in(path: Path, gap_limit_s: float) -> Runs | None:
-    """Return the runs of a result or of a folder of logs; None if the path has no separate runs.
-
-    Raises BadInput if a result or a log cannot be read.
-    """
+def _runs_in(path: Path, gap_limit_s: float) -> Runs | None:
     if not path.is_dir():
         return None
     if not (path / RESULT_FILE).is_file():
-        files = sorted(path.glob("*.mcap"))
-        return runs_of_logs(path, files, gap_limit_s) if files else None
+        files = files_of([path])
+        return _of_logs(path, files, gap_limit_s) if files else None
     result = read_result(path)
     if "sweep" in result.settings:
         return _of_sweep(path, result)
@@ -189,30 +73,40 @@ def runs_in(path: Path, gap_limit_s: float) -> Runs | None:
     return _of_result(path, result)
 
 
-def together(given: Sequence[Runs]) -> Runs:
-    """Join several results of the same runs, with the estimates of each result as a version.
+def _together(given: Sequence[Runs]) -> Runs:
+    """Join lists of the same runs, with the estimates of each list as a version.
 
     Raises BadInput if they are not the same runs.
     """
     first, *others = given
+    _, *titles = _distinct([each.path for each in given])
     segments = {each.name: each for each in first.segments}
-    for other in others:
-        title = other.path.resolve().name
+    for other, title in zip(others, titles, strict=True):
         for segment in other.segments:
             own = segments.get(segment.name)
-            if own is None or own.properties["run"].get("seed") != segment.properties["run"].get("seed"):
+            if own is None or own.of != segment.of:
                 raise BadInput(
                     f"{other.path}: its run {segment.name} is not a run of {first.path}; give results "
                     "of the same runs"
                 )
-            named = {
-                f"{label} {title}" if label in own.properties else label: values
-                for label, values in segment.properties.items()
-                if label != "run"
-            }
+            properties = dict(own.properties)
+            for group, values in segment.properties.items():
+                label, _, case = group.partition(" ")
+                if group != "run":
+                    named = group_of(f"{label} {title}", case)
+                    properties[named if group in properties else group] = values
             parts = (*own.parts, *(replace(part, title=title) for part in segment.parts))
-            segments[segment.name] = replace(own, parts=parts, properties=own.properties | named)
+            segments[segment.name] = replace(own, parts=parts, properties=properties)
     return first._replace(segments=list(segments.values()))
+
+
+def _distinct(paths: Sequence[Path]) -> list[str]:
+    """Return the names of paths, with those of the folders above them if names are equal."""
+    places = [str(path.absolute()).removesuffix(".mcap").removesuffix(".estimates") for path in paths]
+    parts = [Path(os.path.normpath(place)).parts for place in places]
+    lengths = range(1, max(map(len, parts), default=0) + 1)
+    named = (["-".join(each[-length:]) for each in parts] for length in lengths)
+    return next((names for names in named if len({*names}) == len({*parts})), [])
 
 
 def _of_result(folder: Path, result: Result) -> Runs | None:
@@ -225,114 +119,115 @@ def _of_result(folder: Path, result: Result) -> Runs | None:
     if not {"estimator", "case", "run"} <= {*rows} or not pd.api.types.is_integer_dtype(rows["run"]):
         return None
     found = findings(result, {"runs": rows})
-    runner = runner_again(folder, result)
-    runs = range(runner.experiment.runs)
-    names = {run: f"run-{run:04d}" for run in runs}
-    parts = {name: (_part_of(folder, runner, run),) for run, name in names.items()}
-    experiment = runner.experiment
-    seed: dict[str, Value] = {"seed": experiment.seed} if experiment.record else {}
-    about: dict[str, dict[str, Value]] = {name: {"run": run, **seed} for run, name in names.items()}
-    for name, file in zip(about, experiment.files, strict=False):
-        about[name]["log"] = file.name
+    runner = runner_of(folder, result)
+    segments = _segments(folder, runner, "run-{run:04d}", {})
+    names = [*segments]
+    rows = rows.assign(segment=[names[run] for run in rows["run"]])
     tables = {}
     for kind in ("times", "failures"):
         place = folder / "tables" / f"{kind}.parquet"
         if place.is_file():
             table = read_table(place)
-            tables[kind] = table.assign(segment=table["run"].map(names))
+            tables[kind] = table.assign(segment=[names[run] for run in table["run"]])
     verdicts = {label: found.of[label].verdict.value for label in found.labels}
-    rows = rows.assign(segment=rows["run"].map(names))
-    return _sorted(folder, rows, parts, about, experiment.gap_limit_s, tables, verdicts)
-
-
-def _part_of(folder: Path, runner: Runner, run: int) -> Part:
-    """Return the kept logs of a run, or what records and replays it again."""
-    log, estimates = (folder / kind / f"run-{run:04d}.mcap" for kind in ("logs", "estimates"))
-    if estimates.is_file() and (log.is_file() or runner.experiment.logs):
-        return Part(log=log if log.is_file() else None, estimates=estimates)
-    return Part(runner=runner, run=run)
+    gap_limit_s = runner.experiment.gap_limit_s
+    return _sorted(folder, rows, segments, gap_limit_s, tables, verdicts)
 
 
 def _of_sweep(folder: Path, result: Result) -> Runs:
     """Return the runs at all points of a sweep."""
-    from fuselog.pipeline.runs.sweeps import settings_at  # slow to import
-
-    points = result.settings["sweep"]
-    runner = runner_again(folder, result)
-    entries = runner.experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
-    stated = Stated(result.experiment, str(folder / RESULT_FILE), entries, Path())
+    segments: dict[str, Segment] = {}
+    for number, point in enumerate(result.settings["sweep"]):
+        swept: dict[str, Value] = {
+            key: float(value) if isinstance(value, int | float) else str(value)
+            for key, value in point.items()
+        }
+        runner = runner_of(folder, result, number)
+        name = f"point-{number:04d}-run-{{run:04d}}"
+        segments |= _segments(folder, runner, name, swept, number)
     rows = read_table(folder / "tables" / "sweep-runs.parquet")
-    parts: dict[str, tuple[Part, ...]] = {}
-    about: dict[str, dict[str, Value]] = {}
-    for number, point in enumerate(points):
-        there = replace(runner, experiment=stated.with_settings(settings_at(point), {}))
-        for run in range(there.experiment.runs):
-            name = f"point-{number:04d}-run-{run:04d}"
-            parts[name] = (Part(runner=there, run=run),)
-            about[name] = {"point": number, "run": run, "seed": there.experiment.seed} | {
-                key: float(value) if isinstance(value, int | float) else str(value)
-                for key, value in point.items()
-            }
     named = [
         f"point-{point:04d}-run-{run:04d}" for point, run in zip(rows["point"], rows["run"], strict=True)
     ]
     rows = rows.drop(columns="point").assign(segment=named)
-    return _sorted(folder, rows, parts, about, runner.experiment.gap_limit_s)
+    return _sorted(folder, rows, segments, runner_of(folder, result).experiment.gap_limit_s)
 
 
-def runs_of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
+def _segments(
+    folder: Path, runner: Runner, name: str, swept: Mapping[str, Value], point: int | None = None
+) -> dict[str, Segment]:
+    """Return the runs of a result, or of one point of a sweep, by name."""
+    experiment, data = runner.experiment, runner.setting.data
+    folder = folder.resolve()
+    stated = experiment.model_dump(mode="json", by_alias=True)
+    settings = hash_of([stated, str(data)])
+    seed: dict[str, Value] = {"seed": experiment.seed} if experiment.record else {}
+    found: dict[str, Segment] = {}
+    for run, log in zip(range(experiment.runs), chain(experiment.files, repeat(None)), strict=False):
+        about: dict[str, Value] = {"run": run, **seed, **swept}
+        if point is not None:
+            about = {"point": point, **about}
+        if log is not None:
+            about["log"] = log.name
+        kept, estimates = (folder / kind / f"run-{run:04d}.mcap" for kind in ("logs", "estimates"))
+        opened = kept if kept.is_file() else log
+        if point is None and estimates.is_file() and opened is not None:
+            part = Part(log=opened, estimates=estimates)
+        else:
+            part = Part(log=log, result=folder, run=run, point=point, settings=settings)
+        of = str(log) if log else hash_of([stated["record"], stated["import"], str(data), seed, run])
+        own = name.format(run=run)
+        found[own] = Segment(own, of, (part,), {"run": about})
+    return found
+
+
+def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
     """Return a run for each log, with the estimates in all estimates logs of it as versions.
-
-    Args:
-        path: the path next to which the drawings are kept.
-        files: logs and estimates logs.
-        gap_limit_s: longest gap over which the truth is interpolated.
 
     Raises BadInput if a log cannot be read, or the log of estimates is missing.
     """
     from fuselog.replay.judging.tables import joined  # slow to import
 
-    parts: dict[str, list[Part]] = {}
-    logs: dict[str, Path] = {}
-    for file in files:
-        log = open_log(file)
-        if "log" in (log.run.notes if log.run else {}):
-            source = source_of_estimates(log).log.path
-            own = parts.setdefault(source.stem, [])
-            title = file.name.removesuffix(".mcap").removesuffix(".estimates")
-            own.append(Part(title=title, log=source, estimates=file))
-        else:
-            logs[file.stem] = file
-    for name, file in logs.items():
-        parts.setdefault(name, [Part(log=file, estimates=file if labels_of(open_log(file)) else None)])
-    segments = [
-        Segment(name, tuple(sorted(own, key=lambda part: (part.title != name, part.title))), {})
-        for name, own in parts.items()
-    ]
-    rows = joined(_judged(segment, gap_limit_s) for segment in segments)
-    about: dict[str, dict[str, Value]] = {
-        each.name: {"log": str(each.parts[0].log)} for each in segments
-    }
-    versions = {each.name: each.parts for each in segments}
-    return _sorted(path, rows, versions, about, gap_limit_s)
+    logs: dict[Path, Path] = {}
+    versions: dict[Path, list[Path]] = {}
+    for file in map(Path.absolute, files):
+        opened = open_log(file)
+        is_estimates = "log" in (opened.run.notes if opened.run else {})
+        source = source_of_estimates(opened).log.path.absolute() if is_estimates else file
+        logs.setdefault(source.resolve(), source)
+        versions.setdefault(source.resolve(), []).extend([file] if is_estimates else [])
+    segments: dict[str, Segment] = {}
+    for name, (place, log) in zip(_distinct([*logs.values()]), logs.items(), strict=True):
+        titles = _distinct(versions[place])
+        parts = [
+            Part(title=title, log=log, estimates=file)
+            for title, file in zip(titles, versions[place], strict=True)
+        ]
+        parts.sort(key=lambda part: (part.title != log.stem, part.title))
+        if not parts:
+            parts = [Part(log=log, estimates=log if labels_of(open_log(log)) else None)]
+        segments[name] = Segment(name, str(place), tuple(parts), {"run": {"log": str(log)}})
+    rows = joined(_judged(segment, gap_limit_s) for segment in segments.values())
+    return _sorted(path, rows, segments, gap_limit_s)
 
 
 def _judged(segment: Segment, gap_limit_s: float) -> "pd.DataFrame":
     """Judge the estimates of a segment: a row per estimator and case."""
-    source, estimates, _ = segment.load()
+    source, estimates, _ = open_run(segment)
     if not estimates.topics:
         import pandas as pd
 
         return pd.DataFrame()
     judge = judge_logs([estimates], [source], {}, gap_limit_s=gap_limit_s)
-    return judge.runs_table.assign(segment=segment.name)
+    rows, worst_s = judge.runs_table.assign(segment=segment.name), worst_times(judge)
+    keys = zip(rows["estimator"], rows["case"], strict=True)
+    return rows.assign(**{WORST_AT: [worst_s.get(key, math.nan) for key in keys]})
 
 
 def _sorted(
     path: Path,
     rows: "pd.DataFrame",
-    parts: Mapping[str, tuple[Part, ...]],
-    about: Mapping[str, dict[str, Value]],
+    segments: Mapping[str, Segment],
     gap_limit_s: float,
     tables: Mapping[str, "pd.DataFrame"] | None = None,
     verdicts: Mapping[str, str] | None = None,
@@ -342,8 +237,8 @@ def _sorted(
     Runs are sorted by the error of the estimator that has the smallest error over all runs.
     """
     tables, verdicts = tables or {}, verdicts or {}
+    properties = {name: each.properties for name, each in segments.items()}
     quantity = next((str(key) for key in rows if is_error(str(key))), "")
-    properties: dict[str, Properties] = {name: {"run": dict(about.get(name, {}))} for name in parts}
     several = len(rows) > 0 and len({*rows["case"]}) > 1
     for row in [*rows.to_dict("records"), *_worst_spans(tables.get("times"), quantity)]:
         label = str(row["estimator"])
@@ -355,9 +250,9 @@ def _sorted(
         }
         if label in verdicts:
             group["verdict"] = verdicts[label]
-    failed = _failures(rows, parts, tables.get("failures"))
-    order, error = "in the order of their names", dict.fromkeys(parts, 0.0)
-    columns = [("run", key) for key in ("rank", *next(iter(about.values()), {}))]
+    failed = _failures(rows, segments, tables.get("failures"))
+    order, error = "in the order of their names", dict.fromkeys(segments, 0.0)
+    columns = [("run", key) for key in ("rank", *next(iter(properties.values()), {"run": {}})["run"])]
     if quantity:
         by_run = (rows[quantity] ** 2).groupby([rows["estimator"], rows["segment"]]).mean()
         best = str(by_run.groupby(level=0).mean().idxmin())
@@ -366,15 +261,15 @@ def _sorted(
         groups = dict.fromkeys(group for own in properties.values() for group in own if group != "run")
         firsts = sorted(groups, key=lambda group: group.partition(" ")[0] != best)
         columns += [(group, quantity) for group in firsts]
-    names = sorted(parts, key=lambda name: (name not in failed, -error[name], name))
+    names = sorted(segments, key=lambda name: (name not in failed, -error[name], name))
     for rank, name in enumerate(names, start=1):
         properties[name]["run"]["rank"] = rank
     for name, sentence in failed.items():
         properties[name]["run"]["failure"] = sentence
     if failed:
         columns.append(("run", "failure"))
-    segments = [Segment(name, parts[name], properties[name]) for name in names]
-    return Runs(path, segments, order, columns, gap_limit_s)
+    ordered = [segments[name] for name in names]
+    return Runs(path, ordered, order, columns, gap_limit_s)
 
 
 def _worst_spans(times: "pd.DataFrame | None", quantity: str) -> list[dict[Hashable, Any]]:
@@ -391,13 +286,13 @@ def _worst_spans(times: "pd.DataFrame | None", quantity: str) -> list[dict[Hasha
 
 
 def _failures(
-    rows: "pd.DataFrame", parts: Mapping[str, object], failures: "pd.DataFrame | None"
+    rows: "pd.DataFrame", segments: Mapping[str, Segment], failures: "pd.DataFrame | None"
 ) -> dict[str, str]:
     """Return by run why estimators failed, or which estimators have no errors."""
     found: dict[str, list[str]] = {}
     if len(rows):
         for label, own in rows.groupby("estimator", sort=False):
-            for name in parts.keys() - set(own["segment"]):
+            for name in segments.keys() - set(own["segment"]):
                 found.setdefault(name, []).append(f"{label} has no errors")
     if failures is not None and len(failures):
         for segment, sentences in failures.groupby("segment", sort=False)["failure"]:

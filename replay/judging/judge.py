@@ -319,10 +319,15 @@ class Judge:
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
+    def moments(self) -> list[Moment]:
+        """Return the moments of the largest NEES and the largest error of each estimator and case."""
+        return self._moments.found
+
+    @property
     def worst(self) -> dict[str, Moment]:
         """Return, by estimator, the moment of the largest NEES or, without NEES, the largest error."""
         found: dict[str, list[Moment]] = {}
-        for moment in self._moments.found:
+        for moment in self.moments:
             found.setdefault(moment.estimator, []).append(moment)
         worst = {estimator: worst_of(moments) for estimator, moments in found.items()}
         return {estimator: moment for estimator, moment in worst.items() if moment is not None}

@@ -19,10 +19,13 @@ from rerun.catalog import CatalogClient, OnDuplicateSegmentLayer
 from rerun.server import Server
 
 from fuselog.recorders.errors import BadInput
-from fuselog.replay.timeline.drawing.canvas import ABOUT
+from fuselog.replay.timeline.sinks import TableLayout, write_layout
 
 LOOPBACK = "127.0.0.1"
 PROPERTIES, BASE = "properties", "base"
+APPLICATION = "fuselog"
+# The entity of a text about the run.
+ABOUT = "about"
 EXTRA = "a list of runs needs the extra catalog (DataFusion, 115 MB): pip install 'fuselog[catalog]'"
 # Columns of Rerun's own that say nothing about a run.
 _HIDDEN = (
@@ -121,7 +124,7 @@ def has_catalog() -> bool:
 
 
 def write_properties(
-    path: Path, application: str, name: str, properties: Mapping[str, Mapping[str, Any]], text: str
+    path: Path, name: str, properties: Mapping[str, Mapping[str, Any]], text: str
 ) -> None:
     """Write the layer of a segment's properties, with a text in Markdown."""
     plain: dict[str, str] = {}
@@ -129,25 +132,22 @@ def write_properties(
         other = plain.setdefault(_plain(group), group)
         if other != group:
             raise BadInput(f"{other} and {group}: columns cannot tell these names apart; rename one")
-    chunks = [
-        rc.Chunk.from_property(group, _values(properties[of]))
-        for group, of in plain.items()
-        if properties[of]
-    ]
+    chunks = [properties_chunk(group, own) for group, own in properties.items() if own]
     about = rr.TextDocument.columns(text=[text], media_type=[rr.MediaType.MARKDOWN])
-    write_chunks(path, application, name, [*chunks, rc.Chunk.from_columns(f"/{ABOUT}", [], about)])
+    write_chunks(path, name, [*chunks, rc.Chunk.from_columns(f"/{ABOUT}", [], about)])
 
 
-def _values(values: Mapping[str, Any]) -> rr.AnyValues:
+def properties_chunk(group: str, values: Mapping[str, Any]) -> rc.Chunk:
+    """Return a group of a segment's properties; those of several layers are combined."""
     columns: dict[str, Any] = {_plain(name): [value] for name, value in values.items()}
-    return rr.AnyValues(**columns)
+    return rc.Chunk.from_property(_plain(group), rr.AnyValues(**columns))
 
 
-def write_chunks(path: Path, application: str, name: str, chunks: Sequence[rc.Chunk]) -> None:
+def write_chunks(path: Path, name: str, chunks: Sequence[rc.Chunk]) -> None:
     """Write chunks of a segment to an .rrd file; raises OSError if that fails."""
     try:
         stream = rc.LazyChunkStream.from_iter(chunks)
-        stream.write_rrd(path, application_id=application, recording_id=name)
+        stream.write_rrd(path, application_id=APPLICATION, recording_id=name)
     except Exception as error:  # rerun does not document its exceptions
         raise OSError(errno.EIO, str(error), str(path)) from error
 
@@ -157,10 +157,10 @@ def read_chunks(path: Path) -> list[rc.Chunk]:
     return [each for each in rc.RrdReader(str(path)).stream() if each.entity_path != "/__properties"]
 
 
-def write_table_layout(path: Path, application: str, properties: Sequence[tuple[str, str]]) -> None:
+def write_table_layout(path: Path, properties: Sequence[tuple[str, str]]) -> None:
     """Write the layout of a table of segments that shows `properties` first, sorted by the first."""
     columns = [column_of(*each) for each in properties]
     shown = [rrt.Column("rerun_segment_id", name="run"), *map(rrt.Column, columns)]
     hidden = [rrt.Column(name, visible=False) for name in _HIDDEN]
     layout = rrt.TableLayout(columns=[*shown, *hidden])
-    rrt.TableBlueprint(table_layout=layout, sort_by=columns[0]).save(application, path)
+    write_layout(path, APPLICATION, TableLayout(table_layout=layout, sort_by=columns[0]))

@@ -22,8 +22,8 @@ from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.divergence import Divergence, find_divergence
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
 from fuselog.replay.judging.errors.moments import Moment, Moments, worst_of
+from fuselog.replay.timeline.catalog import ABOUT
 from fuselog.replay.timeline.drawing.canvas import (
-    ABOUT,
     DRAWN_ROWS,
     PALETTE,
     Board,
@@ -37,7 +37,7 @@ from fuselog.replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 from fuselog.replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 from fuselog.replay.timeline.generic import TIMELINE as GENERIC
 from fuselog.replay.timeline.side_by_side import draw_side_by_side
-from fuselog.replay.timeline.sinks import open_recording
+from fuselog.replay.timeline.sinks import open_recording, write_layout
 
 # Number of output messages to send to a receiver at a time.
 LIVE_MESSAGES = 20_000
@@ -213,7 +213,8 @@ class Drawing:
         if self._layout is not None:
             about = rrb.TextDocumentView(origin=ABOUT, name="Run")
             layout = rrb.Vertical(about, layout, row_shares=[1.0, 8.0])
-            rrb.Blueprint(layout, panel, collapse_panels=True).save(self._names[0], str(self._layout))
+            shared = rrb.Blueprint(layout, panel, collapse_panels=True)
+            write_layout(self._layout, self._names[0], shared)
 
 
 def show(

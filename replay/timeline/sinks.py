@@ -1,4 +1,4 @@
-"""Sinks of a timeline: a file or a live viewer.
+"""Sinks of a timeline and of its layout: a file or a live viewer.
 
 A file appears under its name only when it is complete. Rerun encodes it in memory, and fuselog writes
 it, because Rerun's own writer does not report a full disk at the end and may wait forever. A live
@@ -12,9 +12,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Self
 from urllib.parse import urlsplit
 
 import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.api import create_in_memory_blueprint
+from rerun.blueprint.table import TableBlueprint
 
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.errors import BadInput
@@ -25,6 +29,14 @@ _SETTINGS = 4
 _ANSWER_S = 2.0
 _FLUSH_S = 60.0
 _GIVEN_UP_S = 2.0
+
+
+class TableLayout(TableBlueprint):
+    """The layout of a table of segments, of the same interface as that of a segment."""
+
+    def to_blueprint(self) -> Self:
+        """Return itself."""
+        return self
 
 
 @contextmanager
@@ -58,8 +70,20 @@ def open_recording(
         elif save is not None:
             new = stack.enter_context(whole_file(save, parents=False))
             encoded = rr.binary_stream(recording)
-            yield recording
-            new.write_bytes(encoded.read() or b"")
+            try:
+                yield recording
+            finally:  # Rerun warns of what is not read
+                contents = encoded.read() or b""
+            new.write_bytes(contents)
+
+
+def write_layout(path: Path, application_id: str, layout: rrb.Blueprint | TableLayout) -> None:
+    """Write a layout to an .rbl file; raises OSError if that fails."""
+    kept = create_in_memory_blueprint(
+        application_id=application_id,
+        blueprint=layout,  # type: ignore[arg-type]
+    )
+    path.write_bytes(kept.drain_as_bytes())
 
 
 def rerun_path(path: Path) -> str:

@@ -1,8 +1,9 @@
 """Runs as a dataset: what Rerun's catalog reads back, what is kept, and what is refused."""
 
+import os
 import shutil
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ import pandas as pd
 import psutil
 import pytest
 
+from fuselog.pipeline.output.results import RUNS as TABLE
 from fuselog.pipeline.output.results import read_table
 from fuselog.pipeline.presenting import segments
-from fuselog.pipeline.presenting.making import Kept, draw
-from fuselog.pipeline.presenting.segments import runs_in
+from fuselog.pipeline.presenting.drawing import draw, open_run
+from fuselog.pipeline.presenting.making import Kept, runs_at
+from fuselog.pipeline.presenting.segments import list_runs
 from fuselog.recorders.log import open_log, read_streams
 from fuselog.replay.timeline import catalog, viewer
 
@@ -56,7 +59,7 @@ def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
 
 def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
     (server, _client, entry), table = read_back(dataset)
-    rows = read_table(result / segments.RUNS)
+    rows = read_table(result / TABLE)
     assert list(table.index) == [f"run-{run:04d}" for run in range(RUNS)]
     assert [each[0] for each in table["property:run:run"]] == [*range(RUNS)]
     for label, own in rows.groupby("estimator"):
@@ -84,7 +87,7 @@ def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -
 def test_layers_are_what_was_recorded_and_each_estimator(result: Path, dataset: Path) -> None:
     """Kept files are drawn once, and are registered onto the segments that have only properties."""
     assert dataset.is_dir()
-    runs = runs_in(result, 0.2)
+    runs = list_runs([result], 0.2)
     assert runs is not None
     kept = Kept(runs)
     before = {path: path.stat().st_mtime_ns for path in kept.folder.rglob("*.rrd")}
@@ -106,6 +109,34 @@ def test_layers_are_what_was_recorded_and_each_estimator(result: Path, dataset: 
     assert found["run-0000"] == found["run-0003"] == drawn
     assert found["run-0001"] == {"properties"}
     assert before == {path: path.stat().st_mtime_ns for path in kept.folder.rglob("*.rrd")}
+
+
+def test_the_list_of_runs_is_kept_until_a_file_of_it_changes(
+    result: Path, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is read without the tables, from any folder, and equals what they give."""
+    assert dataset.is_dir()
+    place = tmp_path / "result"
+    shutil.copytree(result, place)
+    listed = list_runs([place], 0.2)
+    assert listed is not None
+    Kept(listed).properties()
+    again: list[Sequence[Path]] = []
+    monkeypatch.setattr(segments, "list_runs", lambda paths, _: again.append(paths))
+    monkeypatch.chdir(tmp_path)
+    assert runs_at([Path("result")], 0.5) == listed._replace(path=Path("result"))
+    assert again == []
+    stated = place / "result.json"
+    before, text = stated.stat(), stated.read_text()
+    stated.write_text(text.replace('"seed": 1', '"seed": 2'))
+    os.utime(stated, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert runs_at([place], 0.2) is None
+    stated.write_text(text)
+    os.utime(stated, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert runs_at([place], 0.2) is not None
+    (place / "logs" / "run-0000.mcap").unlink()
+    assert runs_at([place], 0.2) is None
+    assert len(again) == 2
 
 
 def test_one_run_is_drawn_as_a_log_would_be(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
@@ -141,20 +172,22 @@ def test_two_versions_of_an_estimator_are_in_one_scene(
     server.shutdown()
     old, other = (table[f"property:{name}:position_rmse_m"]["run"][0] for name in ("ekf", "ekf_new"))
     assert old != other
-    runs = runs_in(log.parent, 0.2)
+    runs = list_runs([log.parent], 0.2)
     assert runs is not None
     (made,) = Kept(runs).made()
     assert {name for _, name in made.layers} == {"base", "ekf", "ekf new"}
     (segment,) = runs.segments
     again = replace(segment, parts=(*segment.parts, segment.parts[1]))
-    assert list(again.load()[2]) == ["ekf", "ekf new", "ekf new 2"]
+    assert list(open_run(again)[2]) == ["ekf", "ekf new", "ekf new 2"]
     assert Kept(runs._replace(gap_limit_s=9.0)).made() == []
 
 
 def test_a_run_that_is_not_replayed_as_it_was_is_reported(result: Path, tmp_path: Path) -> None:
-    runs = runs_in(result, 0.2)
+    runs = list_runs([result], 0.2)
     assert runs is not None
     (segment,) = runs.chosen("2")
+    for name in ("same", "other"):
+        (tmp_path / name).mkdir()
     assert draw(segment, runs.gap_limit_s, tmp_path / "same") == []
     ekf = segment.properties["ekf"]
     stated = {**segment.properties, "ekf": {**ekf, "nees": 2.0 * float(ekf["nees"])}}
@@ -182,12 +215,12 @@ def test_the_layout_that_runs_share_counts_nothing(result: Path, tmp_path: Path)
             if name
         }
 
-    runs = runs_in(result, 0.2)
+    runs = list_runs([result], 0.2)
     assert runs is not None
-    draw(runs.chosen("0")[0], runs.gap_limit_s, tmp_path / "drawn")
+    draw(runs.chosen("0")[0], runs.gap_limit_s, tmp_path)
     of_one = titles(result / "timeline.rrd")
     assert any("outside" in title for title in of_one)
-    shared = titles(tmp_path / "drawn" / "layout.rbl")
+    shared = titles(tmp_path / "layout.rbl")
     assert len(shared) == len(of_one) + 1
     assert not any("outside" in title for title in shared)
 
@@ -205,9 +238,27 @@ def test_two_results_of_the_same_runs_are_shown_together(
     (server, *_), table = read_back(tmp_path / "set")
     server.shutdown()
     for folder, label in ((result, "ekf"), (old, "ekf old")):
-        rows = read_table(folder / segments.RUNS).query("estimator == 'ekf'").sort_values("run")
+        rows = read_table(folder / TABLE).query("estimator == 'ekf'").sort_values("run")
         shown = [each[0] for each in table[catalog.column_of(label, "nees")]]
         np.testing.assert_array_equal(shown, rows["nees"])
+    same = tmp_path / "new" / result.name
+    shutil.copytree(old, same)
+    compared = tmp_path / "compared"
+    assert fuselog("compare", result, same, "--out", compared).code == 0
+    said = fuselog("view", compared, "--runs", "2", "--save", tmp_path / "both")
+    assert said.code == 0, said.err
+    (server, *_), both = read_back(tmp_path / "both")
+    server.shutdown()
+    for label, named in (("ekf", "ekf"), ("ekf old", f"ekf new-{result.name}")):
+        expected, shown = (
+            each[catalog.column_of(name, "nees")].map(list)
+            for each, name in ((table, label), (both, named))
+        )
+        assert expected.to_list() == shown.to_list()
+    shutil.rmtree(same)
+    gone = fuselog("view", compared, "--runs", "2")
+    assert (gone.code, gone.err.count("\n")) == (2, 1)
+    assert f"compared {same}, which is gone" in gone.err
     other = tmp_path / "other"
     assert fuselog("run", *common, "--seed", "9", "--out", other).code == 0
     said = fuselog("view", result, other, "--save", tmp_path / "none")
@@ -258,6 +309,55 @@ def test_what_cannot_be_shown_is_refused(
     assert [path.name for path in tmp_path.rglob("*")] == ["notes", "note.txt"]
 
 
+def test_a_folder_without_runs_is_refused(dataset: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    for folder, words in (
+        (dataset, "is a dataset that fuselog saved; to serve it: rerun server --host 127.0.0.1 -d"),
+        (dataset.with_name("result.segments"), "is a dataset that fuselog saved"),
+        (tmp_path, "no such file; give a result with a timeline, a log, or a folder of *.mcap"),
+    ):
+        said = fuselog("view", folder)
+        assert (said.code, said.err.count("\n")) == (2, 1)
+        assert words in said.err
+
+
+def test_a_folder_that_is_not_of_fuselog_is_kept(result: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    """What is next to a result under the name of its drawings is not replaced."""
+    place = tmp_path / "result"
+    shutil.copytree(result, place)
+    other = tmp_path / "result.segments" / "note.txt"
+    other.parent.mkdir()
+    other.write_text("mine")
+    said = fuselog("view", place, "--save", tmp_path / "set")
+    assert (said.code, said.err.count("\n")) == (2, 1)
+    assert "result.segments: exists and is not a dataset that fuselog wrote; move it away" in said.err
+    assert [path.name for path in other.parent.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.unix
+def test_a_full_disk_is_one_sentence(result: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    """Rerun's own writer of layouts would wait forever or stay silent; nothing half is left."""
+    resource = pytest.importorskip("resource")
+    place, saved = tmp_path / "result", tmp_path / "set"
+    shutil.copytree(result, place)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit, what in ((4000, "all runs"), (10_000, "layout"), (100_000, "whole")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            said = fuselog("view", place, "--runs", "0", "--save", saved)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert (said.code, said.err.count("\n")) == (2, 1), (what, said.err)
+        assert "cannot be written" in said.err
+        kept = tmp_path / "result.segments"
+        assert not saved.exists()
+        assert not [*kept.rglob("*.part")]
+        assert not (kept / "run-0000").exists()
+        runs = list_runs([place], 0.2)
+        assert runs is not None
+        Kept(runs).properties()
+    assert fuselog("view", place, "--runs", "0", "--save", tmp_path / "set").code == 0
+
+
 def test_a_port_in_use_is_refused(result: Path, fuselog: Fuselog) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -287,7 +387,7 @@ def test_without_the_extra_the_first_run_is_shown(
     result: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[Path] = []
-    monkeypatch.setattr(catalog, "has_catalog", lambda: False)
+    monkeypatch.setattr("fuselog.pipeline.presenting.command.has_catalog", lambda: False)
     monkeypatch.setattr(viewer, "view", lambda rrd, at_s: shown.append(rrd))  # noqa: ARG005
     said = fuselog("view", result)
     assert said.code == 0
@@ -302,10 +402,10 @@ def test_a_report_has_the_command_that_opens_the_worst_run(
     """Its run is that of the table, and `view` opens it."""
     page = tmp_path / "page.html"
     assert fuselog("report", result, "-o", page).code == 0
-    rows = read_table(result / segments.RUNS).query("estimator == 'ekf'").set_index("run")
+    rows = read_table(result / TABLE).query("estimator == 'ekf'").set_index("run")
     worst = rows["position_rmse_m"].idxmax()
     command = f"fuselog view {result} --runs {worst} --at worst:ekf"
     assert f'<code>{command}</code> <button type="button" class="copy">' in page.read_text()
-    runs = runs_in(result, 0.2)
+    runs = list_runs([result], 0.2)
     assert runs is not None
     assert [each.name for each in runs.chosen(str(worst))] == [f"run-{worst:04d}"]

@@ -43,7 +43,7 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
         key
         for each in settings
         for key in each
-        if key != ("title",) and not (key[0] == "parameters" and key[1:] in given)
+        if key not in (("title",), ("candidates",)) and not (key[0] == "parameters" and key[1:] in given)
     )
     differing = [key for key in keys if any(each.get(key) != own.get(key) for each in settings)]
     lasts = [key[-1] for key in differing]

@@ -38,6 +38,11 @@ class Moment(NamedTuple):
         name = "NEES" if self.quantity == NEES else self.quantity
         return f"{name} {self.value:.3g}"
 
+    def sentence(self, run: str = "") -> str:
+        """Return a sentence on when the estimator is worst, with the name of the run if it is given."""
+        where = "".join(f" of {each}" for each in (self.case, run) if each)
+        return f"{self.estimator}: worst at {self.elapsed_s:.3f} s{where}: {self.words}"
+
 
 class Moments:
     """Worst moments of each estimator and case, for any number of runs."""

@@ -36,8 +36,6 @@ PALETTE: tuple[Colour, ...] = (
     (240, 228, 66),
     (0, 114, 178),
 )
-# The entity of a text about the run, in a dataset of runs.
-ABOUT = "about"
 # Width of a line in pixels.
 WIDTH = 1.5
 TRUTH: Colour = (200, 200, 200)
