@@ -32,6 +32,7 @@ from fuselog.pipeline.runs.settings import read_settings
 from fuselog.pipeline.runs.sweeps import DRAWN, Sampling, parse_over
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.foreign.naming import allowed
 
@@ -141,7 +142,7 @@ def _stated_experiment(
     settings: Sequence[str],
 ) -> tuple[Stated, dict[str, Any]]:
     """Read the experiment (a name, a TOML file, or logs) and the settings that override its own."""
-    files = [Path(each) for each in named if each.endswith(".mcap")]
+    files = [path for path in map(located, named) if path.suffix == ".mcap"]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
         raise BadInput(
             f"{files[0]}: logs are replayed as they are; give only logs and -e, without --runs and "
