@@ -7,12 +7,12 @@ import posixpath
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from errno import EISDIR
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 from urllib.parse import urlsplit
 
-from fuselog.recorders.errors import BadInput
 from fuselog.recorders.remote.backends import (
     Identity,
     NoRanges,
@@ -70,7 +70,7 @@ class RemotePath(_LocalPath):
     def identity(self) -> Identity:
         """Ask for the version of the file, once: other versions are refused later."""
         if self.is_dir():
-            raise BadInput(f"{self}: is a folder; give the URL of a log in it")
+            raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(self))
         return identity_of(self.url)
 
     def __str__(self) -> str:

@@ -122,7 +122,7 @@ def test_folders_patterns_and_archives(fuselog, site):
         assert names == ["a.estimates.mcap", "b.estimates.mcap"]
         shutil.rmtree("out")
     assert fuselog("info", f"zip://a.mcap::{day}logs.zip").code == 0
-    assert "is a folder" in fuselog("info", day).err
+    assert fuselog("lint", day).err == f"fuselog: {day}: cannot be read (Is a directory)\n"
 
 
 @pytest.mark.parametrize("ranges", [True, False])
