@@ -8,7 +8,7 @@ from pathlib import Path
 from fuselog.recorders.errors import BadInput
 
 UNCOMPILED, BOUNDSCHECK, TRACEBACK = "FUSELOG_UNCOMPILED", "FUSELOG_BOUNDSCHECK", "FUSELOG_TRACEBACK"
-CORES = "NUMBA_NUM_THREADS"
+CORES, REMOTE_GB = "NUMBA_NUM_THREADS", "FUSELOG_REMOTE_GB"
 
 
 def is_on(name: str) -> bool:
@@ -45,6 +45,11 @@ def cache_folder() -> Path:
     return (home if home.is_absolute() else Path.home() / ".cache") / "fuselog"
 
 
+def remote_bytes() -> int:
+    """Return the largest total size of the copies of remote logs in the cache: 10 GB if not set."""
+    return int(float(os.environ.get(REMOTE_GB) or 10) * 1e9)
+
+
 def check() -> None:
     """Raise BadInput if a variable has an invalid value.
 
@@ -63,6 +68,10 @@ def _is_count(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 16
 
 
+def _is_size(text: str) -> bool:
+    return re.fullmatch(r"|\d{1,9}(\.\d{1,9})?", text, re.ASCII) is not None
+
+
 def _is_switch(text: str) -> bool:
     return text in ("", "0", "1")
 
@@ -72,5 +81,6 @@ _EXPECTED: dict[str, tuple[Callable[[str], bool], str]] = {
     UNCOMPILED: (_is_switch, "1"),
     BOUNDSCHECK: (_is_switch, "1"),
     CORES: (lambda text: _is_count(text) and int(text) > 0, "a number of cores, 1 or more"),
+    REMOTE_GB: (_is_size, "a number of gigabytes, such as 10"),
     "SOURCE_DATE_EPOCH": (_is_count, "whole seconds since 1970"),
 }

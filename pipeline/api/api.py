@@ -37,6 +37,7 @@ from fuselog.recorders.errors import BadInput, UnknownName, choices, without_war
 from fuselog.recorders.log import Stream, write_log
 from fuselog.recorders.parameters import merge
 from fuselog.recorders.recording import import_run, record_run
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.foreign.naming import allowed
 
@@ -77,7 +78,7 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
 
     Raises BadInput for an unknown importer or parameter, or if the importer cannot read the data.
     """
-    return memory_source(*import_run(importer, Path(path), parameters))
+    return memory_source(*import_run(importer, located(path), parameters))
 
 
 @without_warnings_of_numbers()

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 from fuselog.pipeline.altering.changes import WHATS, is_of_topic, is_parameter
@@ -28,6 +27,7 @@ from fuselog.recorders.log import open_log
 from fuselog.recorders.parameters import merge, parse_settings
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import load
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.replaying.estimator import Estimator, find_estimator
 from fuselog.replay.inference.estimators import registered_models
 from fuselog.replay.inference.observability import OBSERVABILITY
@@ -172,7 +172,7 @@ def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
     named, labels = options["experiment"], options["labels"]
     if not named:
         raise BadInput(f"--set NAME{ASKED}: name an experiment; fuselog experiments lists them")
-    logs = [Path(each) for each in named if is_of_logs(each)]
+    logs = [located(each) for each in named if is_of_logs(each)]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
     experiment = stated.with_settings({}, {})
     study = load("studies", experiment.study, Study)

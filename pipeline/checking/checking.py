@@ -15,6 +15,7 @@ from fuselog.pipeline.output.results import RESULT_FILE, read_result
 from fuselog.pipeline.runs.ensemble import Settings
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.foreign.naming import of_file
 
@@ -78,7 +79,7 @@ def runs_of(path: Path, where: str | None = None) -> Runs:
         settings = read_result(path).settings
         given, applied = settings.get("logs", {}), settings.get(NOTE) or {}
         stated = given.get("files", []) if isinstance(given, dict) else given
-        files = [Path(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
+        files = [located(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
     else:
         files = list(logs_meant([path], where).logs)
     if not files:

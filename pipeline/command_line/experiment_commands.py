@@ -35,6 +35,7 @@ from fuselog.pipeline.runs.settings import read_settings
 from fuselog.pipeline.runs.sweeps import DRAWN, Sampling, parse_over
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.foreign.naming import allowed
 
@@ -146,7 +147,7 @@ def _stated_experiment(
     where: str | None,
 ) -> tuple[Stated, dict[str, Any]]:
     """Read the experiment (a name, a TOML file, or logs) and the settings that override its own."""
-    files = [Path(each) for each in named if is_of_logs(each)]
+    files = [located(each) for each in named if is_of_logs(each)]
     if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
         raise BadInput(
             f"{files[0]}: logs are replayed as they are; give only logs and -e, without --runs and "

@@ -8,6 +8,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.foreign.naming import allow_programs_of_files
 
 
@@ -21,6 +22,15 @@ class Output(click.Path):
     def __init__(self, suffix: str = "", **options: Any) -> None:
         super().__init__(path_type=Path, **options)
         self.suffix = suffix
+
+
+class Input(click.Path):
+    """A path that a command reads, or a URL that fsspec knows."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path."""
+        path = super().convert(value, param, ctx)
+        return located(path if isinstance(path, Path) else os.fsdecode(path))
 
 
 class OutputFile(Output):
@@ -115,7 +125,7 @@ RESULT = Output(file_okay=False)
 LOG_OR_FOLDER, TIMELINE_OR_FOLDER = Output(".mcap"), Output(".rrd")
 LOG, TIMELINE, PICTURE, PAGE = map(OutputFile, (".mcap", ".rrd", ".png", ".html"))
 GOLDEN, JUNIT, CATALOG = map(OutputFile, (".xz", ".xml", ".parquet"))
-ANY_PATH = click.Path(path_type=Path)
+ANY_PATH = Input()
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
 

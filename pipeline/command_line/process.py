@@ -24,6 +24,7 @@ from fuselog.recorders import environment
 from fuselog.recorders.compiling.trial import require_processor
 from fuselog.recorders.errors import BadInput, printable, without_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here
+from fuselog.recorders.remote.backends import masked
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -170,7 +171,7 @@ def _sentence(error: Exception, place: str) -> str:
 
 
 def _fail(sentence: str) -> int:
-    line = printable(sentence.strip().replace("\n", " "))
+    line = masked(printable(sentence.strip().replace("\n", " ")))
     if len(line) > _LONGEST:
         line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
     click.echo(f"fuselog: {line}", err=True)

@@ -36,6 +36,7 @@ from fuselog.pipeline.stressing.sums import verdicts_of
 from fuselog.pipeline.stressing.verdicts import Stress
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import RunMetadata, open_log
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.replaying.usage import Row
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.differences import (
@@ -296,7 +297,7 @@ def compare(
     if not 0 <= margin < np.inf:
         raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which means 2 %")
     named = named_in(estimators)
-    paths = with_logs_of_folders(list(map(Path, candidates)), named, recover=recover)
+    paths = with_logs_of_folders(list(map(located, candidates)), named, recover=recover)
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
     givens = inputs_of(

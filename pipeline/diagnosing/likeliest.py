@@ -14,6 +14,7 @@ from fuselog.pipeline.output.words import count, meaning_alone, number, quantity
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.judging.verdicts import Consistency
 
 MENDED = "mended"
@@ -51,7 +52,7 @@ def _logs(folder: Path, result: Result) -> list[Path]:
     kept = sorted(folder.glob("logs/run-*.mcap"))
     stated = result.settings.get("logs")
     files = stated.get("files", []) if isinstance(stated, Mapping) else []
-    return kept or [Path(each) for each in files if Path(each).is_file()]
+    return kept or [path for path in map(located, files) if path.is_file()]
 
 
 def _cause(label: str, found: Finding, mended: str) -> Cause:

@@ -31,6 +31,7 @@ from fuselog.recorders.errors import BadInput, UnknownName, choices, without_war
 from fuselog.recorders.log import Log, Stream, open_log, read_empty, schemas, topics_of
 from fuselog.recorders.log.schemas import SCHEMAS
 from fuselog.recorders.parameters import build
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.streams.sources import LogSource
 
 
@@ -303,11 +304,11 @@ def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int
     """Return the offset of each log; raise BadInput if it would move stamps out of their range."""
     paths = [log.path for log in logs]
     for path, offset_s in offsets_s.items():
-        if Path(path) not in paths:
+        if located(path) not in paths:
             raise UnknownName(f"no log {path} to merge; {choices(path, list(map(str, paths)))}")
         if not abs(offset_s) <= 1e9:
             raise BadInput(f"offset of {path}: is {offset_s}; give a number of seconds, such as 0.5")
-    by_path = {Path(path): round(offset_s * 1e9) for path, offset_s in offsets_s.items()}
+    by_path = {located(path): round(offset_s * 1e9) for path, offset_s in offsets_s.items()}
     found = [by_path.get(path, 0) for path in paths]
     for log, offset_ns in zip(logs, found, strict=True):
         source = LogSource(log)

@@ -18,6 +18,8 @@ from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, re
 from fuselog.recorders.parameters import build, describe, flat
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import available, foreign_code, load
+from fuselog.recorders.remote.copies import kept_copies
+from fuselog.recorders.remote.paths import RemotePath, partly, size_of
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, bound_to, require_values
 from fuselog.replay.engine.replaying.truth import truths_among
 from fuselog.replay.engine.streams.linting import lint_source, worst
@@ -40,6 +42,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     """
     from fuselog.recorders.importers.ros.files.bags import looks_like_bag
 
+    path = partly(path)
     if path.suffix == ".rrd":
         from fuselog.pipeline.logs.made import show_timeline
 
@@ -58,18 +61,19 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     except BadInput as error:
         if not (path.is_dir() or isinstance(error, NotMcap)):
             raise
-        command = f"fuselog import table {shlex.quote(str(path))}"
+        command = f"fuselog import table {_quoted(path)}"
         raise BadInput(f"{error}; to import tables, such as CSV: {command}") from error
     if as_json:
         print_json(_as_json(log))
         return
-    main_ns = main_span(log)
+    is_partial = isinstance(path, RemotePath)
+    main_ns = None if is_partial else main_span(log)
     first_ns, last_ns = main_ns or read_span(log, "log_time")
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
     span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
     others = "; other messages are years away from these" if main_ns else ""
-    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}{others}")
+    say(f"{path}: {size_of(path) / 1e6:.1f} MB, {span}{others}")
     if log.run:
         _say_run(log.run)
     rows = [
@@ -85,8 +89,10 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     if log.mirrors:
         count = sum(topic.messages for topic in log.mirrors.values())
         say(f"Foxglove mirror, for viewers: {count} messages on {len(log.mirrors)} topics")
-    for sentence in worst(_findings(log), path):
+    for sentence in worst(_findings(log) or [], path):
         say(sentence)
+    if is_partial:
+        say(f"Its messages are not checked, since that needs all of them: fuselog lint {_quoted(path)}")
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
     elif any(topic.startswith(ESTIMATES) for topic in log.topics):
@@ -105,8 +111,10 @@ def main_span(log: Log) -> tuple[int, int] | None:
         return None
 
 
-def _findings(log: Log) -> list[Finding]:
-    """Check the log with lint; warn and return no findings if it is damaged."""
+def _findings(log: Log) -> list[Finding] | None:
+    """Check the log with lint; None if it is read by ranges; warn if it is damaged."""
+    if isinstance(log.path, RemotePath):
+        return None
     try:
         return lint_source(LogSource(log), portions=1)
     except BadInput as error:
@@ -147,8 +155,11 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
 
 
 def estimators_that_fit(log: Log) -> dict[str, list[str]]:
-    """Find the estimators without a model, such as trackers, that fit a log, with their topics."""
-    source = LogSource(log)
+    """Find the estimators without a model, such as trackers, that fit a log, with their topics.
+
+    Values are not considered if the log is read by ranges.
+    """
+    sources = [] if isinstance(log.path, RemotePath) else [LogSource(log)]
     found: dict[str, list[str]] = {}
     for name in available("estimators"):
         if name not in {*METHODS, *PROGRAMS}:
@@ -157,8 +168,8 @@ def estimators_that_fit(log: Log) -> dict[str, list[str]]:
                 parameters = build(estimator.parameters, {}, f"estimator {name}")
                 with foreign_code(f"estimator {name}"):
                     if bound := bound_to(estimator, name, log.topics, parameters):
-                        for each in bound:
-                            require_values([source], each)
+                        for each in bound if sources else ():
+                            require_values(sources, each)
                         found[name] = _topics_used(bound)
     return found
 
@@ -226,13 +237,13 @@ def _show_bag(path: Path, *, as_json: bool) -> None:
 
 
 def _say_how_to_import(path: Path) -> None:
-    say(f"This is a ROS log; to import it: fuselog import ros {shlex.quote(str(path))} -o NAME.mcap")
+    say(f"This is a ROS log; to import it: fuselog import ros {_quoted(path)} -o NAME.mcap")
 
 
 def show_cache(*, clear: bool, as_json: bool) -> None:
     """Print the number and size of the files in each folder of the cache; with `clear`, delete them."""
     place = cache_folder()
-    kept = set(kept_files())
+    kept = {*kept_files(), *kept_copies()}
     found: dict[str, dict[str, int]] = {}
     for path in sorted(kept):
         size = found.setdefault(path.parent.name, {"files": 0, "bytes": 0})
@@ -269,11 +280,15 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
-        "findings": [each.as_json for each in _findings(log)],
+        "findings": None if (found := _findings(log)) is None else [each.as_json for each in found],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "estimators": estimators_that_fit(log),
         "lost": log.loss_statement,
     }
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
 
 
 def rate(messages: int, duration_s: float) -> float | None:

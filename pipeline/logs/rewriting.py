@@ -1,6 +1,5 @@
 """Functions that rewrite logs block by block: the choice of topics, notes on losses, and the new log."""
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from fuselog.recorders.errors import BadInput, UnknownName, choices
 from fuselog.recorders.log import Log, LogWriter, RunMetadata, Stream, read_blocks, read_empty
 from fuselog.recorders.log.container.sealed import OWN_NAMES
 from fuselog.recorders.log.schemas import message_class
+from fuselog.recorders.remote.paths import reference_to, referred_to
 from fuselog.replay.engine.streams.sources import LogSource
 
 Blocks = Iterator[list[Stream]]
@@ -132,7 +132,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
     run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
     if "log" not in run.notes:
         return run
-    place = os.path.relpath((log.path.parent / run.notes["log"]).resolve(), target.resolve().parent)
+    place = reference_to(referred_to(run.notes["log"], log.path), target)
     return replace(run, notes={**run.notes, "log": place})
 
 

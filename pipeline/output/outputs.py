@@ -18,6 +18,7 @@ from fuselog.recorders.atomic import settled
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, open_log
 from fuselog.recorders.parsing import parse_json
+from fuselog.recorders.remote.paths import RemotePath
 
 MOST_SETTINGS = 3  # largest number of settings that a sentence names
 # Notes of a log's run on how it was cut, merged or relabelled, and by which command last.
@@ -64,7 +65,7 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
     _refuse_link(folder)
     for role, paths in inputs.items():
         for path in paths:
-            place = Path(os.path.realpath(path))
+            place = path if isinstance(path, RemotePath) else Path(os.path.realpath(path))
             if _identity(folder) in map(_identity, (place, *place.parents)):
                 raise BadInput(f"{folder}: the {role} {path} is in it; give another folder with --out")
 

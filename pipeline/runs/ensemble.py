@@ -4,7 +4,6 @@ Runs are recorded on any `concurrent.futures.Executor`; the replay itself uses a
 """
 
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +22,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, LogWriter, Mirrors, RunMetadata
 from fuselog.recorders.log.impossible import Rejections
 from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.remote.paths import reference_to
 from fuselog.replay.engine.replaying.estimator import Bound, bind
 from fuselog.replay.engine.replaying.late import Late
 from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
@@ -424,7 +424,7 @@ def estimates_metadata(
     The path of the source log is relative to the estimates log, so that both can be moved together.
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    place = os.path.relpath(log.resolve(), path.resolve().parent)
+    place = reference_to(log, path)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()}, default=str)
     notes = {"log": place, "estimators": settings, **note_of(source), **replayed_note(source, order)}
     return replace(run, notes=notes)

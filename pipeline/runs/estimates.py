@@ -16,6 +16,7 @@ from fuselog.pipeline.altering.sources import alter, stated_alterations
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, open_log
 from fuselog.recorders.parsing import parse_json
+from fuselog.recorders.remote.paths import referred_to
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
 from fuselog.replay.judging.errors.evaluation import Errors, split_topic
 
@@ -33,7 +34,7 @@ def log_of_estimates(estimates: Log) -> Path:
         return estimates.path
     if named is None:
         raise BadInput(f"{estimates.path}: does not state its source log; give it with --log")
-    path = (estimates.path.parent / named).resolve()
+    path = referred_to(named, estimates.path)
     if not path.exists():
         raise BadInput(f"{estimates.path}: its source log {path} is missing; give it with --log")
     return path

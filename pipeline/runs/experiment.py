@@ -26,6 +26,7 @@ from fuselog.recorders.parameters import Parameters, build, merge
 from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.recording import Recorder
 from fuselog.recorders.registry import foreign_code, load
+from fuselog.recorders.remote.paths import RemotePath, located
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.replaying.late import parse_late
 from fuselog.replay.engine.streams.linting import of_first_messages
@@ -118,7 +119,7 @@ class Experiment(Parameters):
     @property
     def files(self) -> list[Path]:
         """Return the logs that are replayed."""
-        return [Path(file) for file in self.logs.files] if self.logs else []
+        return [located(file) for file in self.logs.files] if self.logs else []
 
     def with_absolute_files(self) -> "Experiment":
         """Return the experiment with absolute paths of logs."""
@@ -306,9 +307,16 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
     """Find the files that match patterns, without duplicates; raise BadInput if one matches none."""
     files: dict[str, None] = {}
     for pattern in patterns:
-        place = Path(os.path.normpath(folder / pattern))
+        place = located(pattern)
+        if not isinstance(place, RemotePath):
+            place = Path(os.path.normpath(folder / pattern))
         root = Path(place.anchor)
-        found = [place] if place.is_file() else sorted(root.glob(str(place.relative_to(root))))
+        if place.is_file():
+            found = [place]
+        elif isinstance(place, RemotePath):
+            found = sorted(place.glob("*.mcap"))
+        else:
+            found = sorted(root.glob(str(place.relative_to(root))))
         logs = [str(each) for each in found if len(found) == 1 or not each.match("*.estimates.mcap")]
         if not logs:
             raise BadInput(f"{where}: no log matches {place}; give files, or patterns such as *.mcap")

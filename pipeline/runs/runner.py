@@ -3,7 +3,6 @@
 A study adds its own cases, claims, tables and figures.
 """
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import LogWriter, open_log
 from fuselog.recorders.parameters import build, merge
 from fuselog.recorders.recording import import_run
+from fuselog.recorders.remote.paths import RemotePath, reference_to
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory, memory_source
 from fuselog.replay.foreign.naming import of_file
@@ -189,7 +189,7 @@ class Runner:
     def _as_seen_from(self, path: Path, log: Path) -> Path:
         """Return a path to a log that is valid after the folder has been moved to its final path."""
         there = self.setting.place / path.relative_to(self.setting.folder)
-        return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
+        return log if isinstance(log, RemotePath) else path.parent / reference_to(log, there)
 
     def _places(self, folder: str, run: int) -> tuple[Path, Path]:
         """Return the paths of a run's log and estimates."""

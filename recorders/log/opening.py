@@ -13,6 +13,7 @@ from fuselog.recorders.log.container.reading import Container, open_container
 from fuselog.recorders.log.mirrors import MIRROR_OF
 from fuselog.recorders.log.run import RECORD_NAME, RunMetadata
 from fuselog.recorders.log.schemas import Schema
+from fuselog.recorders.remote.paths import located
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
     """Open a log.
 
     Args:
-        path: an MCAP file.
+        path: an MCAP file, or its URL.
         recover: read the intact part of a truncated or damaged file, without using its index.
 
     Raises BadInput if the file is missing or not MCAP, or is incomplete and `recover` is False.
@@ -142,7 +143,8 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
     >>> log.topics["/robot1/odometry"].messages
     40
     """
-    log = Log(Path(path), open_container(Path(path), use_index=not recover))
+    place = located(path)
+    log = Log(place, open_container(place, use_index=not recover))
     if log.loss_statement and not recover:
         count = len(log.container.regions)
         raise BadInput(

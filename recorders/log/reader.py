@@ -18,6 +18,7 @@ from fuselog.recorders.log.container.sealed import PUBLISH_SPANS, noted_span
 from fuselog.recorders.log.decoding import Decoder
 from fuselog.recorders.log.opening import Log
 from fuselog.recorders.log.streams import Clock, Stream, check_stream, concatenate
+from fuselog.recorders.remote.paths import open_binary
 
 # Contains every stamp that MCAP can store.
 _ALWAYS = Span(-1, 1 << 64)
@@ -142,7 +143,7 @@ def read_blocks(
 @contextmanager
 def _reading(log: Log) -> Iterator[BinaryIO]:
     try:
-        with log.path.open("rb") as file:
+        with open_binary(log.path) as file:
             yield file
     except OSError as error:
         raise BadInput(f"{log.path}: cannot be read ({error.strerror})") from error

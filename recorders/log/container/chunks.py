@@ -55,6 +55,7 @@ _RECORDS: dict[int, Any] = {
     Opcode.STATISTICS: records.Statistics,
     Opcode.METADATA: records.Metadata,
     Opcode.METADATA_INDEX: records.MetadataIndex,
+    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex,
     Opcode.DATA_END: records.DataEnd,
 }
 

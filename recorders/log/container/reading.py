@@ -3,7 +3,8 @@
 The data section is walked record by record. Chunks listed in the summary are skipped; all others are
 opened, so that files without an index, or with an incomplete one, are read too. Messages outside chunks
 have the layout of an uncompressed chunk, and are read like one. After an incomplete record, the walk
-continues at the next record whose position an intact summary states.
+continues at the next record whose position an intact summary states. A remote file that is read by
+ranges is not walked: only the records whose positions the summary states are considered.
 Source: the MCAP specification (mcap.dev/spec).
 """
 
@@ -33,6 +34,7 @@ from fuselog.recorders.log.container.chunks import (
 )
 from fuselog.recorders.log.container.sealed import unseal
 from fuselog.recorders.log.streams import Clock
+from fuselog.recorders.remote.paths import RangeStream, copy_whole, open_binary
 
 _FOOTER = struct.Struct("<BQQQI8s")
 # The part of the footer covered by the summary's checksum.
@@ -122,6 +124,10 @@ class _Index(NamedTuple):
         return entry if entry.message_end_time else None
 
 
+class _NoIndex(Exception):
+    """An error for files that would be read by ranges, but whose records have to be found one by one."""
+
+
 class NotMcap(BadInput):
     """An error for files that are not MCAP; a command may catch it and read another format."""
 
@@ -132,10 +138,13 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
     Raises BadInput if the file is missing, unreadable, or not MCAP.
     """
     try:
-        with path.open("rb") as file:
+        with open_binary(path) as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise NotMcap(f"{path}: not an MCAP file; give a log that starts with the MCAP magic")
             return _opened(file, use_index)
+    except _NoIndex:
+        copy_whole(path, "it has no index" if use_index else "it is read without its index")
+        return open_container(path, use_index=use_index)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror})") from error
 
@@ -160,9 +169,12 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
     except Damaged as damage:
         damage_at_end = str(damage)
     index = stated if use_index else _Index({}, Counter())
+    is_walked = not isinstance(file, RangeStream)
+    if not (is_walked or index.chunks):
+        raise _NoIndex
     chunks = set()
     place = _Place(_LOST, 0, len(MAGIC))
-    for place in _data_section(file, size, summary):
+    for place in _data_section(file, size, summary) if is_walked else _stated_places(summary):
         if place.opcode == Opcode.CHUNK:
             chunks.add(place.offset)
         try:
@@ -306,6 +318,8 @@ def _stated_places(summary: _Summary) -> list[_Place]:
             places.append(_Place(Opcode.CHUNK, record.chunk_start_offset, record.chunk_length))
         elif isinstance(record, records.MetadataIndex):
             places.append(_Place(Opcode.METADATA, record.offset, record.length))
+        elif isinstance(record, records.AttachmentIndex):
+            places.append(_Place(Opcode.ATTACHMENT, record.offset, record.length))
     if summary.start is not None:
         places.append(_Place(Opcode.DATA_END, summary.start - _DATA_END_BYTES, _DATA_END_BYTES))
     return sorted(places, key=attrgetter("offset"))
