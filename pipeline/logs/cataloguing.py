@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, ClassVar
 
 from fuselog.pipeline.logs.information import fitting_of, main_span, rate
@@ -17,7 +17,6 @@ from fuselog.pipeline.runs.ensemble import Progress, no_progress
 from fuselog.pipeline.runs.executors import pool_for
 from fuselog.pipeline.selecting.catalog import (
     SUFFIX,
-    State,
     is_catalog,
     is_written,
     logs_in,
@@ -26,7 +25,7 @@ from fuselog.pipeline.selecting.catalog import (
     require_unchanged,
     rows_in,
     schema,
-    state_of,
+    state_of_log,
     table_of,
     with_columns,
     write_catalog,
@@ -36,6 +35,7 @@ from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, read_span
 from fuselog.recorders.log.impossible import YEAR_NS
+from fuselog.recorders.remote.paths import located, partly
 from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
 
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_ROWS = 40  # largest number of rows that are printed
+STATE = ("size_bytes", "modified_ns", "version")
 CATALOG = Kind(SUFFIX, "a catalog of fuselog", is_written)
 
 
@@ -59,7 +60,7 @@ class Describing:
 
     def __call__(self, log: Path, number: int, folder: Path) -> list[Row]:  # noqa: ARG002
         """Return the row of a log, without its path and state."""
-        opened = open_log(log)
+        opened = open_log(log if self.deep else partly(log))
         own, run = opened.container.regions, opened.run
         begin_ns, end_ns = read_span(opened, "log_time")
         main = main_span(opened) if end_ns - begin_ns > YEAR_NS else None
@@ -132,17 +133,17 @@ def catalogued(
         raise BadInput(f"{paths[0]}: has no logs (*.mcap) to catalogue; give a folder with logs")
     if out is None:
         return Catalogued(_rows(logs, deep=deep))
-    check_files([(out, CATALOG)], {"log": map(Path, logs)})
+    check_files([(out, CATALOG)], {"log": map(located, logs)})
     with checkpoints_of(out) as checkpoints:
         known = {row["log"]: row for row in rows_in(read_catalog(out))} if out.exists() else {}
-        states = {log: state_of(log) for log in logs}
+        states = {log: state_of_log(log) for log in logs}
         current = {
             log
             for log, row in known.items()
-            if states.get(log) == (row["size_bytes"], row["modified_ns"]) and row["is_deep"] >= deep
+            if states.get(log) == tuple(row[name] for name in STATE) and row["is_deep"] >= deep
         }
         asked = [log for log in logs if log not in current]
-        batches = batches_of(Describing(deep), list(map(Path, asked)))
+        batches = batches_of(Describing(deep), list(map(located, asked)))
         pool = pool_for(workers, scheduler, len(asked))
         found = over_logs(batches, pool, checkpoints, progress)
         counts = Counter("read again" if log in known else "new" for log in asked)
@@ -189,7 +190,12 @@ def catalog(
     """
     place = None if out is None else Path(out)
     found = catalogued(
-        list(map(Path, paths)), place, deep=deep, workers=workers, scheduler=scheduler, progress=progress
+        list(map(located, paths)),
+        place,
+        deep=deep,
+        workers=workers,
+        scheduler=scheduler,
+        progress=progress,
     )
     table = with_columns(found.table)
     return table if where is None else rows_where(table, where)
@@ -205,13 +211,14 @@ def _rows(logs: Sequence[str], *, deep: bool = False) -> "pd.DataFrame":
     """Describe logs in this process."""
     task = Describing(deep)
     return table_of(
-        [_row(log, rows_of(task, Path(log), 0, Path())[0], state_of(log), deep) for log in logs]
+        [_row(log, rows_of(task, located(log), 0, Path())[0], state_of_log(log), deep) for log in logs]
     )
 
 
-def _row(log: str, found: Row, state: State, deep: bool) -> Row:
-    own = {"log": log, "folder": Path(log).absolute().parent.name, "is_deep": deep}
-    return own | dict(zip(("size_bytes", "modified_ns"), state, strict=True)) | found
+def _row(log: str, found: Row, state: tuple[int, int, str], deep: bool) -> Row:
+    folder = PurePosixPath(log).parent if "://" in log else Path(log).absolute().parent
+    own = {"log": log, "folder": folder.name, "is_deep": deep}
+    return own | dict(zip(STATE, state, strict=True)) | found
 
 
 def select(paths: Sequence[Path], where: str | None = None, group: str | None = None) -> Selection:

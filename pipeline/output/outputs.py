@@ -102,6 +102,8 @@ def _is_of_result(path: Path) -> bool:
 
 def _identity(path: Path) -> Hashable:
     """Return a key that is the same for all names of a file, even before the file exists."""
+    if isinstance(path, RemotePath):
+        return str(path)  # its state would need a copy
     try:
         state = path.stat()
     except OSError:

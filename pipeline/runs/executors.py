@@ -29,6 +29,7 @@ from threadpoolctl import threadpool_limits
 from fuselog.recorders.compiling.compile import use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
+from fuselog.recorders.remote.paths import RemotePath, state_of
 
 # Smallest number of runs for which starting processes saves time.
 PAYING_RUNS = 1000
@@ -282,18 +283,17 @@ def _require_paths(scheduler: str, client: Any, paths: Sequence[Path]) -> None:
                 )
 
 
-def states_of(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
-    """Return size and modification time of files, zeros for folders, and None for unreadable paths."""
-    found: list[tuple[int, int] | None] = []
+def states_of(paths: Sequence[Path]) -> list[tuple[int, int, str] | None]:
+    """Return the states of files, zeros for folders, and None for unreadable paths; see `state_of`."""
+    found: list[tuple[int, int, str] | None] = []
     for path in paths:
         try:
-            state = path.stat()
-        except OSError:
+            state = (0, 0, "") if path.is_dir() else state_of(path)
+        except (BadInput, OSError):
             found.append(None)
             continue
-        is_readable = os.access(path, os.R_OK)
-        of_file = (0, 0) if path.is_dir() else (state.st_size, state.st_mtime_ns)
-        found.append(of_file if is_readable else None)
+        is_readable = isinstance(path, RemotePath) or os.access(path, os.R_OK)
+        found.append(state if is_readable else None)
     return found
 
 

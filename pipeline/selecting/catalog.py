@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parameters import flat
+from fuselog.recorders.remote.paths import RemotePath, located, state_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,7 +24,7 @@ SUFFIX = ".parquet"
 # Increased when the columns change incompatibly; stored in the metadata of the file's schema.
 FORMAT = 1
 _KEY = b"fuselog_catalog"
-State = tuple[int, int]  # size in bytes and modification time in ns; zeros if there is no such file
+GONE = (0, 0, "")  # the state of a log that cannot be reached
 
 
 def schema() -> "pa.Schema":
@@ -34,7 +35,7 @@ def schema() -> "pa.Schema":
     topic = {"topic": text, "schema": text, "encoding": text, "messages": pa.int64(), "rate_hz": number}
     finding = dict.fromkeys(("kind", "where", "severity", "sentence"), text)
     columns = {
-        text: "log folder problem scenario parameters notes sha256",
+        text: "log folder problem scenario parameters notes version sha256",
         pa.int64(): "size_bytes modified_ns begin_ns end_ns publish_begin_ns publish_end_ns messages "
         "seed run epoch_ns gaps faults",
         number: "duration_s longest_gap_s",
@@ -46,17 +47,19 @@ def schema() -> "pa.Schema":
     return pa.schema([(name, kind) for kind, names in columns.items() for name in names.split()])
 
 
-def state_of(log: str) -> State:
-    """Return the size and modification time of a log."""
+def state_of_log(log: str) -> tuple[int, int, str]:
+    """Return the size of a log, its modification time, and its version if it is at a URL."""
     try:
-        found = Path(log).stat()
-    except OSError:
-        return 0, 0
-    return found.st_size, found.st_mtime_ns
+        return state_of(located(log))
+    except (BadInput, OSError):
+        return GONE
 
 
 def logs_under(folder: Path) -> Iterator[str]:
     """Find the logs in a folder and in the folders in it, except estimates logs and kept results."""
+    if isinstance(folder, RemotePath):
+        yield from (str(each) for each in folder.rglob("*.mcap") if _is_log(each.name))
+        return
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(
             name for name in folders if not name.startswith(".") and not _is_made(Path(place, name))
@@ -194,10 +197,10 @@ def _seen(log: str, path: Path) -> str:
 
 
 def require_unchanged(table: "pd.DataFrame", catalog: Path) -> None:
-    """Raise BadInput if a log has another size or modification time than in its catalog."""
-    now = map(state_of, table["log"])
-    then = zip(table["size_bytes"], table["modified_ns"], strict=True)
-    changed = [log for log, a, b in zip(table["log"], now, then, strict=True) if a not in (b, (0, 0))]
+    """Raise BadInput if a log has another state than in its catalog."""
+    now = map(state_of_log, table["log"])
+    then = zip(table["size_bytes"], table["modified_ns"], table["version"], strict=True)
+    changed = [log for log, a, b in zip(table["log"], now, then, strict=True) if a not in (b, GONE)]
     if changed:
         others = f", like {len(changed) - 1} others" if len(changed) > 1 else ""
         raise BadInput(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fuselog.pipeline.selecting.catalog import read_catalog, require_unchanged, with_columns
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.remote.paths import located
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,7 +74,9 @@ def selected(
             f"--group: no column '{group}' in the catalog; {choices(group, [*map(str, table)])}"
         )
     bad = table["problem"].notna()
-    logs = [Path(log) for log in table["log"][~bad]]
+    logs = [located(log) for log in table["log"][~bad]]
     groups = [] if group is None else table[group][~bad].astype(str).tolist()
-    why = {Path(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)}
+    why = {
+        located(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)
+    }
     return Selection(logs, groups, why)

@@ -187,6 +187,19 @@ def size_of(path: Path) -> int:
     return path.stat().st_size if stated is None else stated
 
 
+def state_of(path: Path) -> tuple[int, int, str]:
+    """Return what changes with a file: size in bytes, modification time in ns, and a server's version.
+
+    A remote file has no modification time, and no version if its server states none. Raises OSError or
+    BadInput if the file cannot be reached.
+    """
+    if not isinstance(path, RemotePath):
+        found = path.stat()
+        return found.st_size, found.st_mtime_ns, ""
+    now = path.identity
+    return now.size or 0, 0, now.version if now.is_stated else ""
+
+
 def reference_to(log: Path, beside: Path) -> str:
     """Return the text by which the file `beside` refers to a log: a relative path, or the URL."""
     if isinstance(log, RemotePath):

@@ -122,7 +122,8 @@ def test_folders_patterns_and_archives(fuselog, site):
         assert names == ["a.estimates.mcap", "b.estimates.mcap"]
         shutil.rmtree("out")
     assert fuselog("info", f"zip://a.mcap::{day}logs.zip").code == 0
-    assert fuselog("lint", day).err == f"fuselog: {day}: cannot be read (Is a directory)\n"
+    rows = fuselog("lint", day, "--json").json["logs"]
+    assert [Path(row["log"]).name for row in rows] == ["a.mcap", "b.mcap"]
 
 
 @pytest.mark.parametrize("ranges", [True, False])
@@ -247,3 +248,23 @@ def test_missing_file_systems_name_what_to_install(fuselog, monkeypatch):
     assert "fsspec has no file system of this name" in fuselog("info", "nosuch://x/run.mcap").err
     monkeypatch.setitem(sys.modules, "fsspec", None)
     assert "pip install 'fuselog[remote]'" in fuselog("info", "https://x/run.mcap").err
+
+
+def test_a_catalog_of_urls(fuselog, site, copies):
+    """Only summaries are fetched, at most 2 % of the data; an unchanged log is asked for its version only."""
+    place = f"{site.url}/"
+    total = sum(each.stat().st_size for each in site.folder.glob("*.mcap"))
+    assert fuselog("catalog", place, "-o", "logs.parquet").code == 0
+    assert site.sent < 0.02 * total
+    sent, again = site.sent, fuselog("catalog", place, "-o", "logs.parquet", "--json").json
+    assert (again["unchanged"], copies()) == (2, [])
+    assert site.sent - sent < 1000  # the list of the folder
+    rows = {row["log"].rpartition("/")[2]: row for row in again["logs"]}
+    assert rows["large.mcap"]["messages"] == 100_000
+    replayed = fuselog("replay", "logs.parquet", "-e", "ekf", "--where", "fits_robot", "--json").json
+    assert [row["log"] for row in replayed["logs"]] == [f"{place}run.mcap"]
+    shutil.copy(site.folder / "large.mcap", site.folder / "run.mcap")
+    assert "run.mcap: changed after it was catalogued" in fuselog("lint", "logs.parquet").err
+    site.login = True
+    rows = fuselog("catalog", f"{place}run.mcap", "-o", "new.parquet", "--json").json["logs"]
+    assert rows[0]["problem"].startswith("the server sent a web page instead of the log")
