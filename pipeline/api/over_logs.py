@@ -292,7 +292,7 @@ def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval
         is_rms: whether the values are root mean squares.
     """
     of_unit = root_mean_square if is_rms else np.mean
-    own = [of_unit(values[units == unit]) for unit in dict.fromkeys(units.tolist())]
+    own = [of_unit(values[units == unit]) for unit in np.unique(units)]
     return rms_interval(own) if is_rms else mean_interval(own)
 
 
