@@ -10,13 +10,15 @@ from threading import Thread
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import fuselog as fl
 from fuselog.pipeline.api.over_logs import over_units
 from fuselog.pipeline.logs import cataloguing
 from fuselog.pipeline.runs.batches import Batch
-from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, write_catalog
+from fuselog.pipeline.selecting.catalog import rows_in, schema
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
@@ -83,8 +85,8 @@ def test_only_new_and_changed_logs_are_read_again(drives: Path, described: list[
     place = Path("logs.parquet")
     fl.catalog(drives, out=place)
     assert len(described) == 6
-    table = read_catalog(place)
-    write_catalog(place, table.assign(site=[f"site {number}" for number in range(6)]))
+    sites = pa.array([f"site {number}" for number in range(6)])
+    pq.write_table(pq.read_table(place).append_column("site", sites), place)
     fl.write(drives / "robot0" / "drive0.mcap", fl.record("landmarks", seed=9, duration_s=1.0))
     (drives / "robot1" / "drive1.mcap").unlink()
     shutil.copy(drives / "robot0" / "drive2.mcap", drives / "new.mcap")
@@ -102,6 +104,13 @@ def test_only_new_and_changed_logs_are_read_again(drives: Path, described: list[
     described.clear()
     assert rows_in(fl.catalog(drives, out=place)[deep.columns]) == rows_in(deep)
     assert not described
+
+
+def test_a_catalog_as_json(drives: Path, fuselog: Callable[..., Said]) -> None:
+    said = fuselog("catalog", drives, "--deep", "--where", "folder == 'robot1'", "--json").json
+    wanted = fl.catalog(drives, deep=True, where="folder == 'robot1'")
+    assert said == {"logs": rows_in(wanted[schema().names])}
+    assert [row["sha256"] is None for row in said["logs"]] == [False, False, True]
 
 
 def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
@@ -229,6 +238,7 @@ def test_each_log_of_a_selection_has_a_row(drives: Path, fuselog: Callable[..., 
     assert "there are only 2" in shown
 
 
+@pytest.mark.paper
 def test_a_comparison_over_logs_is_that_of_one_replay(
     drives: Path, fuselog: Callable[..., Said]
 ) -> None:
@@ -254,6 +264,7 @@ def test_a_comparison_over_logs_is_that_of_one_replay(
     assert (found["runs"], found["verdict"]) == (2, "undecided")
 
 
+@pytest.mark.paper
 def test_lint_and_check_have_a_row_for_each_log(drives: Path, fuselog: Callable[..., Said]) -> None:
     whole = fl.record("landmarks", seed=1, duration_s=4.0)
     odometry = whole["/robot1/odometry"]
@@ -288,6 +299,7 @@ def test_lint_and_check_have_a_row_for_each_log(drives: Path, fuselog: Callable[
     }
 
 
+@pytest.mark.paper
 def test_commands_on_all_logs_together_take_a_catalog(
     drives: Path, fuselog: Callable[..., Said]
 ) -> None:
