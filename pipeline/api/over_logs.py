@@ -42,6 +42,7 @@ from fuselog.pipeline.selecting.selection import Selection
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
 from fuselog.replay.engine.streams.sources import LogSource
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import (
     FEWEST_RUNS,
     Floats,
@@ -63,7 +64,8 @@ KEYS, TEXTS = (
 )
 LOG = "LOG"  # stands for the log in the words of a command
 OTHERS = (*KEYS, *TEXTS, *SIZES.values())
-PRINTED = ("nees", NIS, FAULTS, GAIN, "problem", "finding", "doubt")
+PRINTED = ("nees", NIS, FAULTS, GAIN)
+SAID = ("problem", "finding", "doubt")  # printed with the command that opens a log
 MOST_ROWS, MOST_OPENED = 10, 5  # largest numbers of rows and of commands that are printed
 
 
@@ -259,8 +261,10 @@ def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
             if not len(known):
                 continue
             outcome.measure(".".join(filter(None, (label, name, case))), number)
-            squares = Squares(name, number, aims.get(name, math.nan), (-math.inf, math.inf))
-            is_judged = name in aims and number.is_bounded
+            count_of, aim = units.nunique(), aims.get(name, math.nan)
+            has_band = name in SIZES and name in aims
+            usual = chi_square_interval(int(aim), count_of) if has_band else (-math.inf, math.inf)
+            is_judged = has_band or (name in aims and number.is_bounded)
             yield {
                 "estimator": label,
                 "case": case,
@@ -268,10 +272,10 @@ def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
                 "value": number.value,
                 "low": number.low,
                 "high": number.high,
-                "aim": squares.aim,
-                "verdict": str(squares.verdict) if is_judged else None,
+                "aim": aim,
+                "verdict": str(Squares(name, number, aim, usual).verdict) if is_judged else None,
                 "logs": known["log"].nunique(),
-                "units": units.nunique(),
+                "units": count_of,
             }
 
 
@@ -292,7 +296,7 @@ def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval
         is_rms: whether the values are root mean squares.
     """
     of_unit = root_mean_square if is_rms else np.mean
-    own = [of_unit(values[units == unit]) for unit in dict.fromkeys(units.tolist())]
+    own = [of_unit(values[units == unit]) for unit in np.unique(units)]
     return rms_interval(own) if is_rms else mean_interval(own)
 
 
@@ -319,10 +323,13 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
         say(f"the worst {MOST_ROWS} of {len(table)} rows; all are in {found.folder}/tables")
     is_bad = failed | (table[FAULTS].fillna(0) > 0) if FAULTS in table else failed | True
     for log, own in list(table[is_bad].groupby("log", sort=False))[:MOST_OPENED]:
-        known = own["estimates"].dropna().tolist() if "estimates" in own else []
-        view = ["view", *(str(found.folder / name) for name in known[:1]), "--at", "worst"]
-        words = [str(log) if word == LOG else word for word in opens]
-        say(shlex.join(["fuselog", *(view if known else words)]))
+        told = [each for name in SAID if name in own for each in own[name].dropna()]
+        written = own["estimates"].dropna().tolist() if "estimates" in own else []
+        view = ["view", *(str(found.folder / name) for name in written[:1]), "--at", "worst"]
+        words = view if written else [str(log) if word == LOG else word for word in opens]
+        for sentence in told[:1]:
+            say(f"{log}: {sentence}")
+        say(f"  {shlex.join(['fuselog', *words])}")
     rows = [
         [
             each["estimator"],

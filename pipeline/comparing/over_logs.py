@@ -45,7 +45,7 @@ def _in_common(table: pd.DataFrame) -> pd.DataFrame:
     keys = ["log", *(name for name in ("group", "estimator", "case") if name in table)]
     metrics = [name for name in table if name not in OTHERS]
     rows = table.melt([*keys, *(name for name in SIZES.values() if name in table)], metrics, "quantity")
-    rows = rows.dropna(subset=["value"]).fillna({"case": ""})
+    rows = rows.dropna(subset=["value"]).fillna({"case": ""}).sort_values("log", kind="stable")
     if "estimator" not in rows or "case" not in rows:
         return pd.DataFrame({"log": [], "estimator": []})
     all_of = rows.groupby("quantity")["estimator"].transform("nunique")

@@ -267,7 +267,7 @@ def show_catalog(
     )
     table = found.table
     if where is not None:
-        table = rows_where(with_columns(table), where)
+        table = rows_where(with_columns(table), where)[[*table]]
     rows = rows_in(table)
     if as_json:
         terminal.print_json({"logs": rows, **found.counts})

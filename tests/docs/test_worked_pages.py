@@ -48,6 +48,7 @@ WORKED = [
     "your-model",
     "timeline",
     "flight",
+    "eight-hundred",
     pytest.param("navigation", marks=pytest.mark.paper),
 ]
 FLIGHT = "sensors/sensors-data.tar.xz", "ulog/sample_logging_tagged_and_default_params.ulg"

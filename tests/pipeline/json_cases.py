@@ -14,6 +14,7 @@ from scipy.stats import chi2
 import fuselog as fl
 from fuselog.pipeline.api.estimates import judge_estimates
 from fuselog.pipeline.output.alarms import NOT_TESTED, as_alarm
+from fuselog.pipeline.selecting.catalog import rows_in, schema
 from fuselog.pipeline.sensing.foreign_files import explained
 from fuselog.recorders.log import open_log
 from tests.pipeline.json_of_files import (
@@ -355,6 +356,10 @@ CASES = [
     Case(
         "info made.rrd",
         lambda: {"path": "made.rrd", "timeline": ["made"], "entities": {"/a": 3, "/b/c": 1}},
+    ),
+    Case(
+        "catalog run.mcap",
+        lambda: {"logs": rows_in(fl.catalog("run.mcap")[schema().names])},
     ),
     Case(
         "lint grave.mcap",

@@ -10,13 +10,15 @@ from threading import Thread
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import fuselog as fl
 from fuselog.pipeline.api.over_logs import over_units
 from fuselog.pipeline.logs import cataloguing
 from fuselog.pipeline.runs.batches import Batch
-from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, write_catalog
+from fuselog.pipeline.selecting.catalog import rows_in, schema
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
@@ -83,8 +85,8 @@ def test_only_new_and_changed_logs_are_read_again(drives: Path, described: list[
     place = Path("logs.parquet")
     fl.catalog(drives, out=place)
     assert len(described) == 6
-    table = read_catalog(place)
-    write_catalog(place, table.assign(site=[f"site {number}" for number in range(6)]))
+    sites = pa.array([f"site {number}" for number in range(6)])
+    pq.write_table(pq.read_table(place).append_column("site", sites), place)
     fl.write(drives / "robot0" / "drive0.mcap", fl.record("landmarks", seed=9, duration_s=1.0))
     (drives / "robot1" / "drive1.mcap").unlink()
     shutil.copy(drives / "robot0" / "drive2.mcap", drives / "new.mcap")
@@ -102,6 +104,13 @@ def test_only_new_and_changed_logs_are_read_again(drives: Path, described: list[
     described.clear()
     assert rows_in(fl.catalog(drives, out=place)[deep.columns]) == rows_in(deep)
     assert not described
+
+
+def test_a_catalog_as_json(drives: Path, fuselog: Callable[..., Said]) -> None:
+    said = fuselog("catalog", drives, "--deep", "--where", "folder == 'robot1'", "--json").json
+    wanted = fl.catalog(drives, deep=True, where="folder == 'robot1'")
+    assert said == {"logs": rows_in(wanted[schema().names])}
+    assert [row["sha256"] is None for row in said["logs"]] == [False, False, True]
 
 
 def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
@@ -227,6 +236,108 @@ def test_each_log_of_a_selection_has_a_row(drives: Path, fuselog: Callable[..., 
     shown = fuselog("replay", "logs.parquet", "-e", "ekf", "--group", "folder", "--out", "out/other").out
     assert "fuselog info drives/robot1/drive5.mcap" in shown
     assert "there are only 2" in shown
+
+
+@pytest.mark.paper
+def test_a_comparison_over_logs_is_that_of_one_replay(
+    drives: Path, fuselog: Callable[..., Said]
+) -> None:
+    """Over single logs it has the numbers of `compare` in one pass; a group has the mean of its logs."""
+    labels = ("-e", "ekf", "-e", "dead-reckoning", "--json")
+    (drives / "robot1" / "drive5.mcap").unlink()
+    logs = sorted(drives.rglob("*.mcap"))
+    together = pd.DataFrame(fuselog("compare", *logs, *labels).json["differences"])
+    said = fuselog("compare", drives, "--workers", "1", *labels)
+    alone = pd.DataFrame(said.json["differences"])
+    keys = ["quantity", "case"]
+    both = together.merge(alone, on=keys, suffixes=("", "_alone"))
+    assert len(both) == len(alone) == len(together)
+    for name in ("first_mean", "second_mean", "difference", "low", "high", "runs"):
+        assert both[name].tolist() == pytest.approx(both[f"{name}_alone"].tolist(), nan_ok=True), name
+    rows = pd.read_parquet("out/compare/tables/logs.parquet")
+    said = fuselog("compare", drives, *labels, "--group", "folder", "--out", "out/groups")
+    found = pd.DataFrame(said.json["differences"]).set_index("quantity").loc["position_rmse_m"]
+    own = rows[rows["estimator"] == "ekf"]
+    folders = own["log"].map(lambda log: Path(log).parent.name)
+    mean = own["position_rmse_m"].groupby(folders).mean().mean()
+    assert found["first_mean"] == pytest.approx(mean, rel=1e-12)
+    assert (found["runs"], found["verdict"]) == (2, "undecided")
+
+
+@pytest.mark.paper
+def test_lint_and_check_have_a_row_for_each_log(drives: Path, fuselog: Callable[..., Said]) -> None:
+    whole = fl.record("landmarks", seed=1, duration_s=4.0)
+    odometry = whole["/robot1/odometry"]
+    silent = odometry.take(np.r_[0:15, 35 : len(odometry)])
+    fl.write(drives / "silent.mcap", {**whole.streams, silent.topic: silent}.values())
+    said = fuselog("lint", drives, "--json", "--out", "out/lint")
+    names = [Path(row["log"]).name for row in said.json["logs"]]
+    [finding] = fl.lint(drives / "silent.mcap")
+    assert said.code == 1
+    assert names[:2] == ["drive5.mcap", "silent.mcap"]
+    assert [row["faults"] for row in said.json["logs"]] == [None, 1, 0, 0, 0, 0, 0]
+    assert said.json["logs"][1]["finding"] == finding.sentence
+    assert fuselog("lint", drives / "robot0").code == 0
+    deep = fl.catalog(drives, deep=True).set_index("log").loc[str(drives / "silent.mcap")]
+    assert (deep["gaps"], deep["longest_gap_s"], deep["faults"]) == (1, pytest.approx(1.05), 1)
+    (drives / "silent.mcap").unlink()
+    fuselog("catalog", drives, "-o", "logs.parquet")
+    against = ("--against", "ekf.golden.xz", "--where")
+    line = ("check", "logs.parquet", *against)
+    assert fuselog(*line, "seed < 3", "--update", "-e", "ekf").code == 0
+    (drives / "robot1" / "drive5.mcap").unlink()
+    assert fuselog("catalog", drives, "-o", "logs.parquet").code == 0
+    assert fuselog(*line, "seed < 3").code == 0
+    said = fuselog(*line, "seed > 0 and seed < 4", "--json", "--out", "out/check")
+    rows = {Path(row["log"]).stem: row["problem"] for row in said.json["logs"]}
+    assert said.code == 1
+    assert rows == {
+        "drive0": "is missing: the golden has it",
+        "drive1": None,
+        "drive2": None,
+        "drive3": "is not in the golden; add it with --update",
+    }
+
+
+@pytest.mark.paper
+def test_commands_on_all_logs_together_take_a_catalog(
+    drives: Path, fuselog: Callable[..., Said]
+) -> None:
+    """The logs that meet the condition, while the one that cannot be read is reported."""
+    fuselog("catalog", drives, "-o", "logs.parquet")
+    chosen, logs = ("logs.parquet", "--where", "seed < 2"), sorted(drives.rglob("drive[01].mcap"))
+    said = fuselog("run", *chosen, "-e", "ekf", "--logs", "0", "--out", "out/a", "--json")
+    alone = fuselog("run", *logs, "-e", "ekf", "--logs", "0", "--out", "out/b", "--json").json
+    assert said.json["metrics"] == alone["metrics"]
+    assert "drive5.mcap: left out: it was cut off" in said.err
+    assert pd.read_parquet("out/a/tables/unreadable.parquet")["log"].tolist() == [
+        str(drives / "robot1" / "drive5.mcap")
+    ]
+    Path("mine.toml").write_text(
+        'title = "mine"\n[logs]\ncatalog = "logs.parquet"\nwhere = "seed < 2"\n[estimators.ekf]\n'
+    )
+    assert fuselog("run", "mine.toml", "--logs", "0", "--json").json["metrics"] == alone["metrics"]
+    over = ("--over", "gap_limit_s=0.1,0.2", "--out", "out/sweep", "--json")
+    swept = fuselog("sweep", *chosen, "-e", "ekf", *over).json
+    assert swept["settings"]["logs"]["files"] == [str(log) for log in logs]
+    assert fuselog("view", *chosen, "--save", "viewed").code == 0
+    assert sorted(each.stem for each in Path("viewed").glob("*.rrd")) == ["drive0", "drive1"]
+    tuned = fuselog("tune", *chosen, "-e", "ekf", "--free", "sigma_range_m", "--json").json
+    assert tuned["logs"] == [str(log) for log in logs]
+
+
+@pytest.mark.paper
+def test_a_diagnosis_has_a_row_for_each_log(drives: Path, fuselog: Callable[..., Said]) -> None:
+    log = drives / "robot1" / "drive3.mcap"
+    settings = ("-e", "ekf", "--set", "sigma_bearing_rad=0.002", "--json")
+    said = fuselog("diagnose", drives / "robot1", "--where", "seed == 3", *settings)
+    alone = fuselog("diagnose", log, *settings).json
+    rows = said.json["logs"]
+    assert [Path(row["log"]).stem for row in rows] == ["drive5", "drive3"]
+    assert rows[1]["gain"] == pytest.approx(
+        max(each["gain"] for each in alone["sentences"] if each["gain"])
+    )
+    assert alone["found"][0].endswith(rows[1]["finding"])
 
 
 def test_the_unit_of_an_interval_is_the_group() -> None:
