@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from numpy.typing import NDArray
 
 from fuselog.pipeline.output.results import RUNS as TABLE
 from fuselog.pipeline.output.results import read_table
@@ -21,6 +22,7 @@ from fuselog.pipeline.presenting.making import Kept, runs_at
 from fuselog.pipeline.presenting.segments import list_runs
 from fuselog.recorders.log import open_log, read_streams
 from fuselog.replay.timeline import catalog, viewer
+from fuselog.replay.timeline.moments import read_moments
 
 pytest.importorskip("datafusion")
 
@@ -58,7 +60,7 @@ def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
 
 
 def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
-    (server, _client, entry), table = read_back(dataset)
+    (server, *_), table = read_back(dataset)
     rows = read_table(result / TABLE)
     assert list(table.index) == [f"run-{run:04d}" for run in range(RUNS)]
     assert [each[0] for each in table["property:run:run"]] == [*range(RUNS)]
@@ -75,12 +77,44 @@ def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -
     first = rows.groupby("estimator")["position_rmse_m"].apply(lambda of: np.sqrt((of**2).mean()))
     assert first.idxmin() == "ukf"
     assert error[by_rank].is_monotonic_decreasing
-    estimates = open_log(result / "estimates" / "run-0000.mcap")
-    stream = read_streams(estimates, ["/estimates/ekf/robot1/pose"])["/estimates/ekf/robot1/pose"]
-    drawn = entry.filter_segments("run-0000").filter_contents("/map/robot1/ekf/pose")
-    shown = drawn.reader(index="utc").to_pandas().dropna(subset=["utc"])
-    assert len(shown) == len(stream)
-    assert (shown["utc"].astype("int64") == stream.publish_time_ns).all()
+    for moment in read_moments(result / "timeline.rrd"):  # of run 0
+        if moment.quantity == "nees":
+            column = catalog.column_of(moment.estimator, "worst_at_s")
+            assert table.loc["run-0000", column] == [moment.elapsed_s]
+    assert table["property:ekf:worst_at_s"].map(bool).to_list() == [True, False, False, True, False]
+    server.shutdown()
+
+
+def test_layers_have_the_values_of_the_logs(result: Path, dataset: Path) -> None:
+    """Their columns equal the estimates and the truth of the run, in the precision of a drawing."""
+    estimate, truth = (
+        read_streams(open_log(result / kind / "run-0000.mcap"), [topic])[topic]
+        for kind, topic in (
+            ("estimates", "/estimates/ekf/robot1/pose"),
+            ("logs", "/robot1/truth"),
+        )
+    )
+    (server, _client, entry), _ = read_back(dataset)
+    run = entry.filter_segments("run-0000")
+
+    def drawn(entity: str, component: str) -> NDArray[np.float64]:
+        rows = run.filter_contents(entity).reader(index="utc").to_pandas().dropna(subset=["utc"])
+        assert (rows["utc"].astype("int64") == estimate.publish_time_ns).all()
+        return np.stack([np.ravel(each.tolist()) for each in rows[f"{entity}:{component}"]])
+
+    np.testing.assert_array_equal(estimate.publish_time_ns, truth.publish_time_ns)
+    for name, states in (("ekf", estimate["mean"]), ("truth", truth["state"])):
+        entity = f"/map/robot1/{name}/pose"
+        np.testing.assert_array_equal(drawn(entity, "Arrows2D:origins"), np.float32(states[:, :2]))
+        arrows = drawn(entity, "Arrows2D:vectors")
+        headings = np.arctan2(arrows[:, 1], arrows[:, 0])
+        np.testing.assert_allclose(np.exp(1j * headings), np.exp(1j * states[:, 2]), atol=1e-6)
+    for number, name in enumerate(("x_m", "y_m")):
+        entity = f"/plots/robot1/error_{name}/ekf"
+        error = estimate["mean"][:, number] - truth["state"][:, number]
+        np.testing.assert_allclose(drawn(entity, "Measurements:values")[:, 0], error, atol=1e-12)
+        band = drawn(entity, "Measurements:variances")[:, 1]  # of 2 sigma
+        np.testing.assert_allclose(band, 4.0 * estimate["covariance"][:, 4 * number], rtol=1e-12)
     server.shutdown()
 
 
