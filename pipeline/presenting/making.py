@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from glob import glob
 from pathlib import Path
 from shlex import quote
 from time import monotonic, sleep
@@ -156,12 +157,14 @@ class Kept:
 
     def _clear(self) -> bool:
         """Remove what interrupted drawings left; return whether one is still active."""
-        left = {part.parent / part.name.split(".")[1] for part in self.folder.glob("*/.*.part")}
-        active = [place for place in left if clear_leftovers(place)]
-        for folder in {place.parent for place in left}:
+        is_active = False
+        for part in glob("*/.*.part", root_dir=self.folder):  # noqa: PTH207  # others may remove some
+            place = self.folder / Path(part).parent / Path(part).name.split(".")[1]
+            with suppress(FileNotFoundError):
+                is_active |= clear_leftovers(place)
             with suppress(OSError):
-                folder.rmdir()
-        return bool(active)
+                place.parent.rmdir()
+        return is_active
 
     def _place(self, segment: Segment) -> Path:
         parts = [part.contents for part in segment.parts]

@@ -1,11 +1,15 @@
 """Runs as a dataset: what Rerun's catalog reads back, what is kept, and what is refused."""
 
+import json
 import os
 import shutil
+import signal
 import socket
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -367,6 +371,7 @@ def test_a_folder_that_is_not_of_fuselog_is_kept(result: Path, fuselog: Fuselog,
     assert [path.name for path in other.parent.iterdir()] == ["note.txt"]
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 def test_a_full_disk_is_one_sentence(result: Path, tmp_path: Path, fuselog: Fuselog) -> None:
     """Rerun's own writer of layouts would wait forever or stay silent; nothing half is left."""
@@ -430,6 +435,46 @@ def test_without_the_extra_the_first_run_is_shown(
 
 
 @pytest.mark.paper
+@pytest.mark.unix
+def test_an_interrupted_view_leaves_nothing_half(
+    result: Path,
+    tmp_path: Path,
+    fuselog: Fuselog,
+    start_fuselog: Callable[..., subprocess.Popen[str]],
+) -> None:
+    """Drawn runs are whole; what a killed command left is removed by the next."""
+    place, saved = tmp_path / "result", tmp_path / "set"
+    shutil.copytree(result, place)
+    kept = tmp_path / "result.segments"
+    layers = {"base.rrd", "dead-reckoning.rrd", "ekf.rrd", "ukf.rrd", "layout.rbl"}
+    for number, chosen in ((signal.SIGKILL, "4"), (signal.SIGINT, "all")):  # noqa: TID251
+        process = start_fuselog("view", str(place), "--runs", chosen, "--save", str(saved))
+        deadline = monotonic() + 60
+        before = {folder for folder, *_ in os.walk(kept)}
+        while not any(
+            Path(folder).name == "new" and files and Path(folder).parent.parent.name != "all runs"
+            for folder, _, files in os.walk(kept)
+            if folder not in before
+        ):
+            assert process.poll() is None, process.communicate()
+            assert monotonic() < deadline
+            sleep(0.01)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(number)
+        said = process.communicate()[1]
+        psutil.wait_procs(workers, timeout=10)
+        assert not saved.exists()
+        drawn = [*kept.glob("run-*/[!.]*")]
+        assert len(drawn) < RUNS
+        assert all({path.name for path in each.iterdir()} == layers for each in drawn)
+    assert said.splitlines()[-1] == "fuselog: stopped"
+    assert not [*kept.rglob("*.part")]
+    assert fuselog("view", place, "--runs", "0,4", "--save", saved).code == 0
+    assert {path.name for path in (next((kept / "run-0004").iterdir())).iterdir()} == layers
+    assert len([*saved.glob("*.rrd")]) == RUNS
+
+
+@pytest.mark.paper
 def test_a_report_has_the_command_that_opens_the_worst_run(
     result: Path, fuselog: Fuselog, tmp_path: Path
 ) -> None:
@@ -439,7 +484,39 @@ def test_a_report_has_the_command_that_opens_the_worst_run(
     rows = read_table(result / TABLE).query("estimator == 'ekf'").set_index("run")
     worst = rows["position_rmse_m"].idxmax()
     command = f"fuselog view {result} --runs {worst} --at worst:ekf"
-    assert f'<code>{command}</code> <button type="button" class="copy">' in page.read_text()
+    text = page.read_text()
+    assert f'<code>{command}</code> <button type="button" class="copy">' in text
+    node = shutil.which("node")
+    if node is not None:
+        assert _copied(node, text, command) == [command, "Copied", command, "Selected"]
     runs = list_runs([result], 0.2)
     assert runs is not None
     assert [each.name for each in runs.chosen(str(worst))] == [f"run-{worst:04d}"]
+
+
+def _copied(node: str, page: str, command: str) -> list[str]:
+    """Click the button behind a command in node: what is copied, and what a refusal selects."""
+    begin = page.index('for (const button of document.querySelectorAll("button.copy"))')
+    script = page[begin : page.index("\n}\n", begin) + 2]
+    stand_in = f"""
+        const said = [], code = {{ textContent: {json.dumps(command)} }};
+        const button = {{
+            previousElementSibling: code,
+            addEventListener: (_, act) => {{ button.click = act; }},
+        }};
+        const document = {{ querySelectorAll: () => [button] }};
+        const getSelection = () => ({{ selectAllChildren: (each) => {{ selected = each; }} }});
+        let selected = null, copy = async (text) => {{ said.push(text); }};
+        const navigator = {{ clipboard: {{ writeText: (text) => copy(text) }} }};
+        {script}
+        (async () => {{
+            await button.click();
+            said.push(button.textContent);
+            copy = async () => {{ throw new Error("not permitted"); }};
+            await button.click();
+            said.push(selected.textContent, button.textContent);
+            console.log(JSON.stringify(said));
+        }})();
+    """
+    done = subprocess.run([node, "-e", stand_in], capture_output=True, text=True, check=True)
+    return list(json.loads(done.stdout))
