@@ -45,13 +45,14 @@ TABLE, RUNS = "table.rbl", "runs.json"
 _READER = TypeAdapter(Runs)
 
 
-def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
+def runs_at(paths: Sequence[Path], gap_limit_s: float, *, recover: bool = False) -> Runs | None:
     """Return the runs at paths, as they were listed before or from the results or logs.
 
     Args:
         paths: results, folders of logs, or logs and estimates logs; see `list_runs`. A comparison is
             replaced by the results that it compared.
         gap_limit_s: longest gap over which the truth of logs is interpolated.
+        recover: whether to read the intact part of damaged logs.
 
     Raises BadInput if a result that a comparison compared is gone; see `list_runs`.
     """
@@ -65,11 +66,12 @@ def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
             kept = _READER.validate_json(file.read_bytes())
             has_own_gap = all(each.name == RESULT_FILE for each in given)  # in its settings
             is_of_paths = kept.given == given and (has_own_gap or kept.gap_limit_s == gap_limit_s)
-            if is_of_paths and kept.key == file.parent.name:
+            is_allowed = recover or not any(each.damage for each in kept.segments)
+            if is_of_paths and is_allowed and kept.key == file.parent.name:
                 return kept._replace(path=paths[0])
     from fuselog.pipeline.presenting.segments import list_runs  # slow to import
 
-    found = list_runs(listed, gap_limit_s)
+    found = list_runs(listed, gap_limit_s, recover=recover)
     return found and found._replace(path=paths[0])
 
 

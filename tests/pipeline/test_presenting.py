@@ -160,7 +160,7 @@ def test_the_list_of_runs_is_kept_until_a_file_of_it_changes(
     assert listed is not None
     Kept(listed).properties()
     again: list[Sequence[Path]] = []
-    monkeypatch.setattr(segments, "list_runs", lambda paths, _: again.append(paths))
+    monkeypatch.setattr(segments, "list_runs", lambda paths, *_, **__: again.append(paths))
     monkeypatch.chdir(tmp_path)
     assert runs_at([Path("result")], 0.5) == listed._replace(path=Path("result"))
     assert again == []
@@ -369,6 +369,26 @@ def test_a_folder_that_is_not_of_fuselog_is_kept(result: Path, fuselog: Fuselog,
     assert (said.code, said.err.count("\n")) == (2, 1)
     assert "result.segments: exists and is not a dataset that fuselog wrote; move it away" in said.err
     assert [path.name for path in other.parent.iterdir()] == ["note.txt"]
+
+
+def test_logs_of_a_folder_are_recovered_and_told_apart(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """A list that was kept with damaged logs is not used where they are refused."""
+    whole = (result / "logs" / "run-0000.mcap").read_bytes()
+    for name, contents in (("old", whole), ("new", whole[: len(whole) * 2 // 3])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.mcap").write_bytes(contents)
+    logs = [tmp_path / name / "run.mcap" for name in ("old", "new")]
+    for _ in range(2):
+        said = fuselog("view", *logs, "--runs", "old-run", "--recover", "--save", tmp_path / "set")
+        assert (said.code, said.err.count("\n")) == (0, 1)
+        assert f"{logs[1]}: it was cut off" in said.err
+    names = {"new-run.rrd", "old-run.rrd", "fuselog.json", "layout.rbl"}
+    assert {path.name for path in (tmp_path / "set").iterdir()} == names
+    said = fuselog("view", *logs, "--save", tmp_path / "other")
+    assert (said.code, said.err.count("\n")) == (2, 1)
+    assert "readable with --recover" in said.err
 
 
 @pytest.mark.paper
