@@ -28,6 +28,8 @@ def view_path(paths: Sequence[Path], options: Options) -> None:
     """
     runs, segment = _runs_to_show(paths, options), None
     if runs is not None:
+        for damage in filter(None, (each.damage for each in runs.segments)):
+            warn(damage)
         chosen = runs.chosen(options.runs or "worst")
         if not options.is_of_one and (options.screenshot is None or len(chosen) > 1):
             if options.save is not None:
@@ -58,7 +60,7 @@ def _runs_to_show(paths: Sequence[Path], options: Options) -> Runs | None:
     if not is_asked and (is_shown_first or not path.is_dir()):
         return None
     try:
-        found = runs_at(paths, options.gap_limit_s)
+        found = runs_at(paths, options.gap_limit_s, recover=options.recover)
     except BadInput as error:
         if is_asked or not is_result:
             raise

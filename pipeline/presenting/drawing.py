@@ -112,11 +112,12 @@ def open_run(segment: Segment) -> tuple[Recorded, MemorySource, dict[str, str]]:
 def _open_part(part: Part) -> tuple[Recorded, Recorded]:
     """Open or make a run and its estimates."""
     if part.estimates is not None:
-        estimates = open_log(part.estimates)
-        return source_of_estimates(estimates, part.log), LogSource(estimates)
+        estimates = open_log(part.estimates, recover=part.recover)
+        source = source_of_estimates(estimates, part.log, recover=part.recover)
+        return source, LogSource(estimates)
     if part.result is None:
         assert part.log is not None
-        source = alter(LogSource(open_log(part.log)), {})
+        source = alter(LogSource(open_log(part.log, recover=part.recover)), {})
         return source, MemorySource({}, source.run or RunMetadata("unknown"), source.name)
     runner = runner_of(part.result, read_result(part.result), part.point)
     experiment = runner.experiment

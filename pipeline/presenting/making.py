@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from glob import glob
 from pathlib import Path
 from shlex import quote
 from time import monotonic, sleep
@@ -44,13 +45,14 @@ TABLE, RUNS = "table.rbl", "runs.json"
 _READER = TypeAdapter(Runs)
 
 
-def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
+def runs_at(paths: Sequence[Path], gap_limit_s: float, *, recover: bool = False) -> Runs | None:
     """Return the runs at paths, as they were listed before or from the results or logs.
 
     Args:
         paths: results, folders of logs, or logs and estimates logs; see `list_runs`. A comparison is
             replaced by the results that it compared.
         gap_limit_s: longest gap over which the truth of logs is interpolated.
+        recover: whether to read the intact part of damaged logs.
 
     Raises BadInput if a result that a comparison compared is gone; see `list_runs`.
     """
@@ -64,11 +66,12 @@ def runs_at(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
             kept = _READER.validate_json(file.read_bytes())
             has_own_gap = all(each.name == RESULT_FILE for each in given)  # in its settings
             is_of_paths = kept.given == given and (has_own_gap or kept.gap_limit_s == gap_limit_s)
-            if is_of_paths and kept.key == file.parent.name:
+            is_allowed = recover or not any(each.damage for each in kept.segments)
+            if is_of_paths and is_allowed and kept.key == file.parent.name:
                 return kept._replace(path=paths[0])
     from fuselog.pipeline.presenting.segments import list_runs  # slow to import
 
-    found = list_runs(listed, gap_limit_s)
+    found = list_runs(listed, gap_limit_s, recover=recover)
     return found and found._replace(path=paths[0])
 
 
@@ -156,12 +159,14 @@ class Kept:
 
     def _clear(self) -> bool:
         """Remove what interrupted drawings left; return whether one is still active."""
-        left = {part.parent / part.name.split(".")[1] for part in self.folder.glob("*/.*.part")}
-        active = [place for place in left if clear_leftovers(place)]
-        for folder in {place.parent for place in left}:
+        is_active = False
+        for part in glob("*/.*.part", root_dir=self.folder):  # noqa: PTH207  # others may remove some
+            place = self.folder / Path(part).parent / Path(part).name.split(".")[1]
+            with suppress(FileNotFoundError):
+                is_active |= clear_leftovers(place)
             with suppress(OSError):
-                folder.rmdir()
-        return bool(active)
+                place.parent.rmdir()
+        return is_active
 
     def _place(self, segment: Segment) -> Path:
         parts = [part.contents for part in segment.parts]

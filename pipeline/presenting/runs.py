@@ -64,6 +64,7 @@ class Part:
         run: the number of the run in the result.
         point: the number of the point, if the result is a sweep.
         settings: hash of the settings that replay the run.
+        recover: whether the intact part of damaged logs is read.
     """
 
     title: str = ""
@@ -73,6 +74,7 @@ class Part:
     run: int = 0
     point: int | None = None
     settings: str = ""
+    recover: bool = False
 
     @property
     def files(self) -> list[Path]:
@@ -83,7 +85,7 @@ class Part:
     def contents(self) -> list[Any]:
         """Return everything that determines the drawing, except the code."""
         files = [[str(path) for path in self.files], states_of(self.files)]
-        return [self.title, *files, self.run, self.settings]
+        return [self.title, *files, self.run, self.settings, self.recover]
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,11 @@ class Segment:
     of: str
     parts: tuple[Part, ...]
     properties: Properties
+
+    @property
+    def damage(self) -> str:
+        """Return what could not be read of the logs; empty if they are intact."""
+        return str(self.properties["run"].get("damage", ""))
 
     def group(self, label: str, case: str) -> str:
         """Return the name of the properties of an estimator, which may have several cases."""

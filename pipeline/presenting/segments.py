@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def list_runs(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
+def list_runs(paths: Sequence[Path], gap_limit_s: float, *, recover: bool = False) -> Runs | None:
     """Return the runs of a result, of a folder of logs, or of several of them; None if there are none.
 
     Several results of the same runs are versions of their estimates, as are several estimates logs of
@@ -41,14 +41,15 @@ def list_runs(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
     Args:
         paths: results, folders of logs, or logs and estimates logs.
         gap_limit_s: longest gap over which the truth of logs is interpolated.
+        recover: whether to read the intact part of damaged logs.
 
     Raises BadInput if a result or a log cannot be read, if one of several paths has no separate runs, or
     if they are not of the same runs.
     """
     if len(paths) > 1 and all(path.suffix == ".mcap" for path in paths):
-        runs = _of_logs(paths[0], paths, gap_limit_s)
+        runs = _of_logs(paths[0], paths, gap_limit_s, recover=recover)
     else:
-        found = {path: _runs_in(path, gap_limit_s) for path in paths}
+        found = {path: _runs_in(path, gap_limit_s, recover=recover) for path in paths}
         if len(paths) > 1 and None in found.values():
             without = next(path for path, own in found.items() if own is None)
             raise BadInput(WITHOUT_RUNS.format(without))
@@ -59,12 +60,12 @@ def list_runs(paths: Sequence[Path], gap_limit_s: float) -> Runs | None:
     return runs._replace(given=files_of(paths))
 
 
-def _runs_in(path: Path, gap_limit_s: float) -> Runs | None:
+def _runs_in(path: Path, gap_limit_s: float, *, recover: bool) -> Runs | None:
     if not path.is_dir():
         return None
     if not (path / RESULT_FILE).is_file():
         files = files_of([path])
-        return _of_logs(path, files, gap_limit_s) if files else None
+        return _of_logs(path, files, gap_limit_s, recover=recover) if files else None
     result = read_result(path)
     if "sweep" in result.settings:
         return _of_sweep(path, result)
@@ -181,7 +182,7 @@ def _segments(
     return found
 
 
-def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
+def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float, *, recover: bool) -> Runs:
     """Return a run for each log, with the estimates in all estimates logs of it as versions.
 
     Raises BadInput if a log cannot be read, or the log of estimates is missing.
@@ -190,23 +191,32 @@ def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float) -> Runs:
 
     logs: dict[Path, Path] = {}
     versions: dict[Path, list[Path]] = {}
+    losses: dict[Path, list[str | None]] = {}
     for file in map(Path.absolute, files):
-        opened = open_log(file)
-        is_estimates = "log" in (opened.run.notes if opened.run else {})
-        source = source_of_estimates(opened).log.path.absolute() if is_estimates else file
-        logs.setdefault(source.resolve(), source)
-        versions.setdefault(source.resolve(), []).extend([file] if is_estimates else [])
+        opened = [open_log(file, recover=recover)]
+        is_estimates = "log" in (opened[0].run.notes if opened[0].run else {})
+        if is_estimates:
+            opened.append(source_of_estimates(opened[0], recover=recover).log)
+        log = opened[-1].path.absolute()
+        place = log.resolve()
+        logs.setdefault(place, log)
+        versions.setdefault(place, []).extend([file] if is_estimates else [])
+        losses.setdefault(place, []).extend(each.loss_statement for each in opened)
     segments: dict[str, Segment] = {}
     for name, (place, log) in zip(_distinct([*logs.values()]), logs.items(), strict=True):
         titles = _distinct(versions[place])
         parts = [
-            Part(title=title, log=log, estimates=file)
+            Part(title=title, log=log, estimates=file, recover=recover)
             for title, file in zip(titles, versions[place], strict=True)
         ]
         parts.sort(key=lambda part: (part.title != log.stem, part.title))
         if not parts:
-            parts = [Part(log=log, estimates=log if labels_of(open_log(log)) else None)]
-        segments[name] = Segment(name, str(place), tuple(parts), {"run": {"log": str(log)}})
+            has_estimates = labels_of(open_log(log, recover=recover))
+            parts = [Part(log=log, estimates=log if has_estimates else None, recover=recover)]
+        about: dict[str, Value] = {"log": str(log)}
+        if damage := "; ".join(dict.fromkeys(filter(None, losses[place]))):
+            about["damage"] = damage
+        segments[name] = Segment(name, str(place), tuple(parts), {"run": about})
     rows = joined(_judged(segment, gap_limit_s) for segment in segments.values())
     return _sorted(path, rows, segments, gap_limit_s)
 

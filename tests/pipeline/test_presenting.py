@@ -1,17 +1,22 @@
 """Runs as a dataset: what Rerun's catalog reads back, what is kept, and what is refused."""
 
+import json
 import os
 import shutil
+import signal
 import socket
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import psutil
 import pytest
+from numpy.typing import NDArray
 
 from fuselog.pipeline.output.results import RUNS as TABLE
 from fuselog.pipeline.output.results import read_table
@@ -21,6 +26,7 @@ from fuselog.pipeline.presenting.making import Kept, runs_at
 from fuselog.pipeline.presenting.segments import list_runs
 from fuselog.recorders.log import open_log, read_streams
 from fuselog.replay.timeline import catalog, viewer
+from fuselog.replay.timeline.moments import read_moments
 
 pytest.importorskip("datafusion")
 
@@ -58,7 +64,7 @@ def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
 
 
 def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
-    (server, _client, entry), table = read_back(dataset)
+    (server, *_), table = read_back(dataset)
     rows = read_table(result / TABLE)
     assert list(table.index) == [f"run-{run:04d}" for run in range(RUNS)]
     assert [each[0] for each in table["property:run:run"]] == [*range(RUNS)]
@@ -75,12 +81,44 @@ def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -
     first = rows.groupby("estimator")["position_rmse_m"].apply(lambda of: np.sqrt((of**2).mean()))
     assert first.idxmin() == "ukf"
     assert error[by_rank].is_monotonic_decreasing
-    estimates = open_log(result / "estimates" / "run-0000.mcap")
-    stream = read_streams(estimates, ["/estimates/ekf/robot1/pose"])["/estimates/ekf/robot1/pose"]
-    drawn = entry.filter_segments("run-0000").filter_contents("/map/robot1/ekf/pose")
-    shown = drawn.reader(index="utc").to_pandas().dropna(subset=["utc"])
-    assert len(shown) == len(stream)
-    assert (shown["utc"].astype("int64") == stream.publish_time_ns).all()
+    for moment in read_moments(result / "timeline.rrd"):  # of run 0
+        if moment.quantity == "nees":
+            column = catalog.column_of(moment.estimator, "worst_at_s")
+            assert table.loc["run-0000", column] == [moment.elapsed_s]
+    assert table["property:ekf:worst_at_s"].map(bool).to_list() == [True, False, False, True, False]
+    server.shutdown()
+
+
+def test_layers_have_the_values_of_the_logs(result: Path, dataset: Path) -> None:
+    """Their columns equal the estimates and the truth of the run, in the precision of a drawing."""
+    estimate, truth = (
+        read_streams(open_log(result / kind / "run-0000.mcap"), [topic])[topic]
+        for kind, topic in (
+            ("estimates", "/estimates/ekf/robot1/pose"),
+            ("logs", "/robot1/truth"),
+        )
+    )
+    (server, _client, entry), _ = read_back(dataset)
+    run = entry.filter_segments("run-0000")
+
+    def drawn(entity: str, component: str) -> NDArray[np.float64]:
+        rows = run.filter_contents(entity).reader(index="utc").to_pandas().dropna(subset=["utc"])
+        assert (rows["utc"].astype("int64") == estimate.publish_time_ns).all()
+        return np.stack([np.ravel(each.tolist()) for each in rows[f"{entity}:{component}"]])
+
+    np.testing.assert_array_equal(estimate.publish_time_ns, truth.publish_time_ns)
+    for name, states in (("ekf", estimate["mean"]), ("truth", truth["state"])):
+        entity = f"/map/robot1/{name}/pose"
+        np.testing.assert_array_equal(drawn(entity, "Arrows2D:origins"), np.float32(states[:, :2]))
+        arrows = drawn(entity, "Arrows2D:vectors")
+        headings = np.arctan2(arrows[:, 1], arrows[:, 0])
+        np.testing.assert_allclose(np.exp(1j * headings), np.exp(1j * states[:, 2]), atol=1e-6)
+    for number, name in enumerate(("x_m", "y_m")):
+        entity = f"/plots/robot1/error_{name}/ekf"
+        error = estimate["mean"][:, number] - truth["state"][:, number]
+        np.testing.assert_allclose(drawn(entity, "Measurements:values")[:, 0], error, atol=1e-12)
+        band = drawn(entity, "Measurements:variances")[:, 1]  # of 2 sigma
+        np.testing.assert_allclose(band, 4.0 * estimate["covariance"][:, 4 * number], rtol=1e-12)
     server.shutdown()
 
 
@@ -122,7 +160,7 @@ def test_the_list_of_runs_is_kept_until_a_file_of_it_changes(
     assert listed is not None
     Kept(listed).properties()
     again: list[Sequence[Path]] = []
-    monkeypatch.setattr(segments, "list_runs", lambda paths, _: again.append(paths))
+    monkeypatch.setattr(segments, "list_runs", lambda paths, *_, **__: again.append(paths))
     monkeypatch.chdir(tmp_path)
     assert runs_at([Path("result")], 0.5) == listed._replace(path=Path("result"))
     assert again == []
@@ -333,6 +371,27 @@ def test_a_folder_that_is_not_of_fuselog_is_kept(result: Path, fuselog: Fuselog,
     assert [path.name for path in other.parent.iterdir()] == ["note.txt"]
 
 
+def test_logs_of_a_folder_are_recovered_and_told_apart(
+    result: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """A list that was kept with damaged logs is not used where they are refused."""
+    whole = (result / "logs" / "run-0000.mcap").read_bytes()
+    for name, contents in (("old", whole), ("new", whole[: len(whole) * 2 // 3])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.mcap").write_bytes(contents)
+    logs = [tmp_path / name / "run.mcap" for name in ("old", "new")]
+    for _ in range(2):
+        said = fuselog("view", *logs, "--runs", "old-run", "--recover", "--save", tmp_path / "set")
+        assert (said.code, said.err.count("\n")) == (0, 1)
+        assert f"{logs[1]}: it was cut off" in said.err
+    names = {"new-run.rrd", "old-run.rrd", "fuselog.json", "layout.rbl"}
+    assert {path.name for path in (tmp_path / "set").iterdir()} == names
+    said = fuselog("view", *logs, "--save", tmp_path / "other")
+    assert (said.code, said.err.count("\n")) == (2, 1)
+    assert "readable with --recover" in said.err
+
+
+@pytest.mark.paper
 @pytest.mark.unix
 def test_a_full_disk_is_one_sentence(result: Path, tmp_path: Path, fuselog: Fuselog) -> None:
     """Rerun's own writer of layouts would wait forever or stay silent; nothing half is left."""
@@ -396,6 +455,46 @@ def test_without_the_extra_the_first_run_is_shown(
 
 
 @pytest.mark.paper
+@pytest.mark.unix
+def test_an_interrupted_view_leaves_nothing_half(
+    result: Path,
+    tmp_path: Path,
+    fuselog: Fuselog,
+    start_fuselog: Callable[..., subprocess.Popen[str]],
+) -> None:
+    """Drawn runs are whole; what a killed command left is removed by the next."""
+    place, saved = tmp_path / "result", tmp_path / "set"
+    shutil.copytree(result, place)
+    kept = tmp_path / "result.segments"
+    layers = {"base.rrd", "dead-reckoning.rrd", "ekf.rrd", "ukf.rrd", "layout.rbl"}
+    for number, chosen in ((signal.SIGKILL, "4"), (signal.SIGINT, "all")):  # noqa: TID251
+        process = start_fuselog("view", str(place), "--runs", chosen, "--save", str(saved))
+        deadline = monotonic() + 60
+        before = {folder for folder, *_ in os.walk(kept)}
+        while not any(
+            Path(folder).name == "new" and files and Path(folder).parent.parent.name != "all runs"
+            for folder, _, files in os.walk(kept)
+            if folder not in before
+        ):
+            assert process.poll() is None, process.communicate()
+            assert monotonic() < deadline
+            sleep(0.01)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(number)
+        said = process.communicate()[1]
+        psutil.wait_procs(workers, timeout=10)
+        assert not saved.exists()
+        drawn = [*kept.glob("run-*/[!.]*")]
+        assert len(drawn) < RUNS
+        assert all({path.name for path in each.iterdir()} == layers for each in drawn)
+    assert said.splitlines()[-1] == "fuselog: stopped"
+    assert not [*kept.rglob("*.part")]
+    assert fuselog("view", place, "--runs", "0,4", "--save", saved).code == 0
+    assert {path.name for path in (next((kept / "run-0004").iterdir())).iterdir()} == layers
+    assert len([*saved.glob("*.rrd")]) == RUNS
+
+
+@pytest.mark.paper
 def test_a_report_has_the_command_that_opens_the_worst_run(
     result: Path, fuselog: Fuselog, tmp_path: Path
 ) -> None:
@@ -405,7 +504,39 @@ def test_a_report_has_the_command_that_opens_the_worst_run(
     rows = read_table(result / TABLE).query("estimator == 'ekf'").set_index("run")
     worst = rows["position_rmse_m"].idxmax()
     command = f"fuselog view {result} --runs {worst} --at worst:ekf"
-    assert f'<code>{command}</code> <button type="button" class="copy">' in page.read_text()
+    text = page.read_text()
+    assert f'<code>{command}</code> <button type="button" class="copy">' in text
+    node = shutil.which("node")
+    if node is not None:
+        assert _copied(node, text, command) == [command, "Copied", command, "Selected"]
     runs = list_runs([result], 0.2)
     assert runs is not None
     assert [each.name for each in runs.chosen(str(worst))] == [f"run-{worst:04d}"]
+
+
+def _copied(node: str, page: str, command: str) -> list[str]:
+    """Click the button behind a command in node: what is copied, and what a refusal selects."""
+    begin = page.index('for (const button of document.querySelectorAll("button.copy"))')
+    script = page[begin : page.index("\n}\n", begin) + 2]
+    stand_in = f"""
+        const said = [], code = {{ textContent: {json.dumps(command)} }};
+        const button = {{
+            previousElementSibling: code,
+            addEventListener: (_, act) => {{ button.click = act; }},
+        }};
+        const document = {{ querySelectorAll: () => [button] }};
+        const getSelection = () => ({{ selectAllChildren: (each) => {{ selected = each; }} }});
+        let selected = null, copy = async (text) => {{ said.push(text); }};
+        const navigator = {{ clipboard: {{ writeText: (text) => copy(text) }} }};
+        {script}
+        (async () => {{
+            await button.click();
+            said.push(button.textContent);
+            copy = async () => {{ throw new Error("not permitted"); }};
+            await button.click();
+            said.push(selected.textContent, button.textContent);
+            console.log(JSON.stringify(said));
+        }})();
+    """
+    done = subprocess.run([node, "-e", stand_in], capture_output=True, text=True, check=True)
+    return list(json.loads(done.stdout))

@@ -251,7 +251,7 @@ def test_missing_file_systems_name_what_to_install(fuselog, monkeypatch):
 
 
 def test_a_catalog_of_urls(fuselog, site, copies):
-    """Only summaries are fetched, at most 2 % of the data; an unchanged log is asked for its version only."""
+    """Only summaries are fetched, at most 2 % of the data; of an unchanged log only its version."""
     place = f"{site.url}/"
     total = sum(each.stat().st_size for each in site.folder.glob("*.mcap"))
     assert fuselog("catalog", place, "-o", "logs.parquet").code == 0
