@@ -19,6 +19,7 @@ from fuselog.recorders.common_streams import (
     truth_stream,
 )
 from fuselog.recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.recorders.log.streams import divide
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
 from fuselog.recorders.models.states import POSE
@@ -184,24 +185,31 @@ def _robot_streams(
     x, y, heading = robot.poses
     truth = np.stack([x, y, wrap_angle(heading)], axis=2)
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
-    streams = []
-    for run, rng in enumerate(rngs_of("prior")):
-        prior = truth[run, 0] + rng.normal(size=3) * sigma
-        streams.append(
-            [
-                prior_stream(f"{prefix}/prior", stamps_ns[0], POSE, prior, np.diag(sigma**2)),
-                truth_stream(f"{prefix}/truth", stamps_ns, POSE, truth[run]),
-                make_stream(
-                    f"{prefix}/odometry",
-                    schemas.ODOMETRY,
-                    stamps_ns[:-1],
-                    log_time_ns=logged_ns,
-                    metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
-                    forward_mps=robot.odometry[0, run],
-                    turn_radps=robot.odometry[1, run],
-                ),
-            ]
-        )
+    runs, rngs = len(truth), rngs_of("prior")
+    priors = [own[0] + rng.normal(size=3) * sigma for own, rng in zip(truth, rngs, strict=True)]
+    streams = [
+        [prior_stream(f"{prefix}/prior", stamps_ns[0], POSE, prior, np.diag(sigma**2))]
+        for prior in priors
+    ]
+    all_ns, count = np.tile(stamps_ns, runs), len(stamps_ns)
+    _add(
+        streams,
+        truth_stream(f"{prefix}/truth", all_ns, POSE, truth.reshape(-1, 3)),
+        range(0, runs * count + 1, count),
+    )
+    _add(
+        streams,
+        make_stream(
+            f"{prefix}/odometry",
+            schemas.ODOMETRY,
+            np.tile(stamps_ns[:-1], runs),
+            log_time_ns=np.tile(logged_ns, runs),
+            metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
+            forward_mps=robot.odometry[0].ravel(),
+            turn_radps=robot.odometry[1].ravel(),
+        ),
+        range(0, runs * (count - 1) + 1, count - 1),
+    )
     targets = _targets(parameters, number, drives, landmarks)
     for name, schema in SENSORS.items():
         sensor: Sensor = getattr(parameters, name)
@@ -212,17 +220,22 @@ def _robot_streams(
         view, cuts, columns = _measure(schema, sensor, seen, rngs)
         columns |= _clocks(sensor, seen.times_s, view, rngs)
         metadata = stated_numbers(sensor, "sigma_range_m", "sigma_bearing_rad")
-        for run, (first, end) in enumerate(pairwise(cuts)):
-            own = {field: column[first:end] for field, column in columns.items()}
-            streams[run].append(make_stream(f"{prefix}/{name}", schema, metadata=metadata, **own))
-            if sensor.outages_per_minute > 0:
-                outages_ns = simulation_stamps_ns(seen.outages_s[run])
-                streams[run].append(outage_stream(f"{prefix}/{name}/outages", outages_ns))
+        _add(streams, make_stream(f"{prefix}/{name}", schema, metadata=metadata, **columns), cuts)
+        if sensor.outages_per_minute > 0:
+            for together, outages_s in zip(streams, seen.outages_s, strict=True):
+                outages_ns = simulation_stamps_ns(outages_s)
+                together.append(outage_stream(f"{prefix}/{name}/outages", outages_ns))
     for together, fixes in zip(
         streams, _fix_streams(f"{prefix}/fix", parameters.fix, robot, rngs_of), strict=True
     ):
         together += fixes
     return streams
+
+
+def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int]) -> None:
+    """Add to the streams of each run its part of a stream of all runs."""
+    for together, own in zip(streams, divide(of_runs, cuts), strict=True):
+        together.append(own)
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drives, rngs_of: Rngs) -> list[list[Stream]]:
