@@ -109,18 +109,16 @@ def simulate_runs(
     half, points = 0.5 * parameters.arena_m, (parameters.landmarks, 2)
     landmarks = np.array([map_rng.uniform(-half, half, points) for map_rng in map_rngs])
     first_landmark = parameters.robots + 1
-    streams = [
-        [
-            make_stream(
-                "/landmarks",
-                schemas.LANDMARK,
-                np.full(parameters.landmarks, SIMULATION_EPOCH_NS),
-                landmark_id=np.arange(first_landmark, first_landmark + parameters.landmarks),
-                position_m=of_run,
-            )
-        ]
-        for of_run in landmarks
-    ]
+    targets = np.arange(first_landmark, first_landmark + parameters.landmarks)
+    maps = make_stream(
+        "/landmarks",
+        schemas.LANDMARK,
+        np.full(landmarks.shape[:2], SIMULATION_EPOCH_NS).ravel(),
+        landmark_id=np.tile(targets, len(rngs)),
+        position_m=landmarks.reshape(-1, 2),
+    )
+    streams: list[list[Stream]] = [[] for _ in rngs]
+    _add(streams, maps)
     by_name = [_by_name(of_runs) for of_runs in robot_rngs]
     drives = [_drive(parameters, number, rngs_of("drive")) for number, rngs_of in enumerate(by_name)]
     for number, rngs_of in enumerate(by_name, start=1):
@@ -185,31 +183,23 @@ def _robot_streams(
     x, y, heading = robot.poses
     truth = np.stack([x, y, wrap_angle(heading)], axis=2)
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
-    runs, rngs = len(truth), rngs_of("prior")
-    priors = [own[0] + rng.normal(size=3) * sigma for own, rng in zip(truth, rngs, strict=True)]
-    streams = [
-        [prior_stream(f"{prefix}/prior", stamps_ns[0], POSE, prior, np.diag(sigma**2))]
-        for prior in priors
-    ]
-    all_ns, count = np.tile(stamps_ns, runs), len(stamps_ns)
-    _add(
-        streams,
-        truth_stream(f"{prefix}/truth", all_ns, POSE, truth.reshape(-1, 3)),
-        range(0, runs * count + 1, count),
+    priors = truth[:, 0] + [rng.normal(size=3) * sigma for rng in rngs_of("prior")]
+    runs, covariance = len(truth), np.diag(sigma**2)
+    streams: list[list[Stream]] = [[] for _ in priors]
+    prior_ns, covariances = np.full(runs, stamps_ns[0]), np.tile(covariance, (runs, 1, 1))
+    _add(streams, prior_stream(f"{prefix}/prior", prior_ns, POSE, priors, covariances))
+    truth_ns = np.tile(stamps_ns, runs)
+    _add(streams, truth_stream(f"{prefix}/truth", truth_ns, POSE, truth.reshape(-1, 3)))
+    odometry = make_stream(
+        f"{prefix}/odometry",
+        schemas.ODOMETRY,
+        np.tile(stamps_ns[:-1], runs),
+        log_time_ns=np.tile(logged_ns, runs),
+        metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
+        forward_mps=robot.odometry[0].ravel(),
+        turn_radps=robot.odometry[1].ravel(),
     )
-    _add(
-        streams,
-        make_stream(
-            f"{prefix}/odometry",
-            schemas.ODOMETRY,
-            np.tile(stamps_ns[:-1], runs),
-            log_time_ns=np.tile(logged_ns, runs),
-            metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
-            forward_mps=robot.odometry[0].ravel(),
-            turn_radps=robot.odometry[1].ravel(),
-        ),
-        range(0, runs * (count - 1) + 1, count - 1),
-    )
+    _add(streams, odometry)
     targets = _targets(parameters, number, drives, landmarks)
     for name, schema in SENSORS.items():
         sensor: Sensor = getattr(parameters, name)
@@ -232,8 +222,10 @@ def _robot_streams(
     return streams
 
 
-def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int]) -> None:
-    """Add to the streams of each run its part of a stream of all runs."""
+def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int] | None = None) -> None:
+    """Add to the streams of each run its part of a stream of all runs, by default equal parts."""
+    if cuts is None:
+        cuts = [run * len(of_runs) // len(streams) for run in range(len(streams) + 1)]
     for together, own in zip(streams, divide(of_runs, cuts), strict=True):
         together.append(own)
 
@@ -317,6 +309,8 @@ def _dead(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Draw a sensor's outages (k, 2), start and end, and test which times (n,) are in one."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
+    if not count:
+        return np.empty((0, 2)), np.zeros(len(times_s), np.bool_)
     starts_s = np.sort(rng.uniform(0, duration_s, count))
     outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
     is_dead = np.any((times_s[:, None] >= outages_s[:, 0]) & (times_s[:, None] < outages_s[:, 1]), 1)

@@ -278,7 +278,7 @@ class MemorySource(_Readable):
 
     def whole(self) -> "MemorySource":
         """Return the whole recording."""
-        return replace(self, start_ns=None, end_ns=None)
+        return self if self.is_whole else replace(self, start_ns=None, end_ns=None)
 
     @property
     def is_whole(self) -> bool:
