@@ -35,24 +35,24 @@ def prior_stream(
     covariance: ArrayLike,
     stated: Mapping[str, str] | None = None,
 ) -> Stream:
-    """Make the stream with the one message from which filters start.
+    """Make the stream with the one message from which filters start, or those of several runs.
 
     Args:
         topic: name of the topic.
-        time_ns: the stamp, in ns.
+        time_ns: the stamp, in ns, or (runs,) stamps.
         components: names of the n components of the state.
-        mean: (n,) mean of the state.
+        mean: (n,) mean of the state, or (runs, n).
         covariance: (m, m) covariance of the error, with one dimension less for each rotation in the
-            state.
+            state; or (runs, m, m).
         stated: further metadata of the channel, such as parameters of the motion.
     """
     return make_stream(
         topic,
         schemas.GAUSSIAN_ESTIMATE,
-        np.reshape(time_ns, 1),
+        np.reshape(time_ns, -1),
         metadata={**state_metadata(components), **(stated or {})},
-        mean=np.reshape(mean, (1, -1)),
-        covariance=np.reshape(covariance, (1, -1)),
+        mean=np.reshape(mean, (np.size(time_ns), -1)),
+        covariance=np.reshape(covariance, (np.size(time_ns), -1)),
     )
 
 

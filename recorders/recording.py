@@ -1,7 +1,7 @@
 """Recorders: they turn parameters, or a folder of real data, into streams."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic
@@ -125,9 +125,12 @@ class Simulator(Recorder[ParametersType]):
 
     Attributes:
         simulate: function of (parameters, generator) that returns a run.
+        simulate_runs: function of (parameters, generators) that returns the same runs, faster; None if
+            each run is simulated separately.
     """
 
     simulate: Callable[[ParametersType, np.random.Generator], Recording]
+    simulate_runs: Callable[[ParametersType, list[np.random.Generator]], list[Recording]] | None = None
 
 
 @dataclass(frozen=True)
@@ -154,17 +157,31 @@ def record_run(
     >>> run.parameters["robots"]
     2
     """
+    return record_runs(scenario, values, seed, [run])[0]
+
+
+def record_runs(
+    scenario: str, values: Mapping[str, Any], seed: int, runs: Sequence[int]
+) -> list[tuple[Recording, RunMetadata]]:
+    """Simulate several runs of a scenario; see `record_run`."""
     simulator: Recorder[Any] = load("recorders", scenario, Recorder)
     if not isinstance(simulator, Simulator):
         raise BadInput(f"'{scenario}' imports real data; run: fuselog import {scenario} PATH")
-    if seed < 0 or run < 0:
-        raise BadInput(f"seed {seed}, run {run}: both must be zero or more")
+    for run in runs:
+        if seed < 0 or run < 0:
+            raise BadInput(f"seed {seed}, run {run}: both must be zero or more")
     parameters = build(simulator.parameters, values, f"scenario {scenario}")
-    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,)))
+    rngs = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,))) for run in runs]
     with foreign_code(f"scenario {scenario}"):
-        recording = simulator.simulate(parameters, generator)
-        recording = replace(recording, streams=in_plane_of_log(recording.streams))
-        return recording, _metadata(scenario, parameters, seed, run, recording)
+        if simulator.simulate_runs is not None:
+            recordings = simulator.simulate_runs(parameters, rngs)
+        else:
+            recordings = [simulator.simulate(parameters, rng) for rng in rngs]
+        placed = [replace(each, streams=in_plane_of_log(each.streams)) for each in recordings]
+        return [
+            (each, _metadata(scenario, parameters, seed, run, each))
+            for run, each in zip(runs, placed, strict=True)
+        ]
 
 
 def import_run(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Recording, RunMetadata]:

@@ -11,7 +11,7 @@ from typing import Any
 from fuselog.pipeline.runs.ensemble import Progress, Settings, no_progress, replay_blocks
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock
-from fuselog.recorders.recording import record_run
+from fuselog.recorders.recording import record_runs
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.late import Late
 from fuselog.replay.engine.replaying.replaying import Report, collect
@@ -24,6 +24,8 @@ from fuselog.replay.judging.metrics.measuring import Output, find_metrics, measu
 
 # Smallest number of bytes that are kept for a judged run, for its sums over time.
 KEPT_BYTES = 8 * TIME_BINS
+# Number of runs that are simulated together; with more, their arrays do not fit into a core's cache.
+TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -69,15 +71,16 @@ def record_ensemble(
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
-    first = record(first_run)
+    first = record([first_run])
     took_s = time.perf_counter() - begin_s
     # a replay concatenates the runs, which doubles every column; estimates need memory as well
-    need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
+    need_bytes = max(2 * runs * _size(first[0]), all_runs * KEPT_BYTES)
     all_runs = max(runs, all_runs)
     require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
     numbers = range(first_run + 1, first_run + runs)
-    others = executor.map(record, numbers) if executor else map(record, numbers)
-    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
+    parts = (numbers[at : at + TOGETHER] for at in range(0, len(numbers), TOGETHER))
+    others = chain.from_iterable(executor.map(record, parts) if executor else map(record, parts))
+    return Ensemble(progress(chain(first, others), f"recording {scenario}", runs))
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
@@ -103,8 +106,10 @@ def _size(source: MemorySource) -> int:
     )
 
 
-def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:
-    return memory_source(*record_run(scenario, parameters, seed, run))
+def _record(
+    scenario: str, parameters: Mapping[str, Any], seed: int, runs: Sequence[int]
+) -> list[MemorySource]:
+    return [memory_source(*recorded) for recorded in record_runs(scenario, parameters, seed, runs)]
 
 
 def replay_ensemble(

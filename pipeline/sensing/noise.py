@@ -29,7 +29,6 @@ Floats = NDArray[np.float64]
 # probability that a fitted curve is in this interval at each of thirty times
 _DOUBTFUL = 0.999
 _FEWEST_DEGREES = 3.0
-_CLOCKS = "publish_time_ns", "log_time_ns", "position"
 _BLOCK = 1 << 18  # number of messages that are read together
 # Meaning of a data sheet's number by its unit; {} is replaced by the unit of the column.
 _STATED = {"white": "{}/sqrt(Hz)", "walk": "{}/sqrt(s)"}
@@ -67,14 +66,13 @@ def noise(
     found: list[ColumnNoise] = []
     for topic, fields in _chosen(source, wanted).items():
         fields = fields or _numbers(source.empty(topic))
-        stream = _read(source, topic, fields)
-        grid = preparing.grid_of(stream)
-        for name in fields:
-            values = np.asarray(stream[name], float).reshape(len(stream), -1)
-            for place, column in enumerate(values.T):
+        grid, columns = _read(source, topic, fields)
+        for name in list(columns):
+            values = columns.pop(name)  # the memory of a field is released when it has been analysed
+            for place, column in enumerate(values):
                 if np.isfinite(column).any():
-                    component = "xyz"[place] if values.shape[1] == 3 else str(place)
-                    where = topic, name, component if stream[name].ndim > 1 else ""
+                    component = "xyz"[place] if len(values) == 3 else str(place)
+                    where = topic, name, component if source.empty(topic)[name].ndim > 1 else ""
                     found.append(_analysed(where, column, grid, stated.get(name), list(taus)))
     unknown = set(stated) - {each.field for each in found}
     if unknown:
@@ -147,16 +145,27 @@ def _numbers(stream: Stream) -> list[str]:
     ]
 
 
-def _read(source: Any, topic: str, fields: Sequence[str]) -> Stream:
-    """Read these fields of a topic, with at most two copies of one column in memory."""
-    empty = source.empty(topic)
-    parts = [block[topic] for block in source.blocks([topic], "publish_time", _BLOCK) if topic in block]
-    kept: dict[str, list[NDArray[Any]]] = {name: [part[name] for part in parts] for name in fields}
-    clocks = [[getattr(part, name) for part in parts] for name in _CLOCKS]
-    del parts
-    joined = {name: np.concatenate(kept.pop(name) or [empty[name]]) for name in fields}
-    times = [np.concatenate(clocks.pop(0) or [getattr(empty, name)]) for name in _CLOCKS]
-    return replace(empty, columns=joined, **dict(zip(_CLOCKS, times, strict=True)))
+def _read(source: Any, topic: str, fields: Sequence[str]) -> tuple[Grid, dict[str, Floats]]:
+    """Read the grid of a topic, and those fields (components, n) that are not NaN throughout.
+
+    Every block is copied to its place, because many arrays of blocks would leave gaps in memory.
+    """
+    most, count = source.topics[topic].messages, 0
+    stamps, position = np.empty((2, most), np.int64)
+    columns: dict[str, Floats] = {}
+    for block in source.blocks([topic], "publish_time", _BLOCK):
+        if topic in block:
+            part, rows = block[topic], slice(count, count + len(block[topic]))
+            stamps[rows], position[rows] = part.publish_time_ns, part.position
+            for name in fields:
+                values = part[name].reshape(len(part), -1).T
+                if name not in columns and np.isfinite(values).any():
+                    columns[name] = np.full((len(values), most), np.nan)
+                if name in columns:
+                    columns[name][:, rows] = values
+            count = rows.stop
+    found = {name: columns[name][:, :count] for name in fields if name in columns}
+    return preparing.grid_of(topic, stamps[:count], position[:count]), found
 
 
 def _analysed(

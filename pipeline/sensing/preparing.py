@@ -10,7 +10,6 @@ from scipy.ndimage import median_filter
 from fuselog.pipeline.sensing.fitting import fit
 from fuselog.pipeline.sensing.likelihood import Samples, likelihood, residuals
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Stream
 from fuselog.recorders.units import unit_of
 
 Floats = NDArray[np.float64]
@@ -59,34 +58,42 @@ class Drift(NamedTuple):
         return self.rate * times_s + self.offset * np.exp(-times_s / self.time_s)
 
 
-def grid_of(stream: Stream) -> Grid:
+def grid_of(topic: str, stamps: Integers, position: Integers) -> Grid:
     """Fit a grid to a topic's stamps; its step is the mean of all steps that are not gaps.
 
-    Raises BadInput if there are too few messages, stamps decrease, or too many messages are lost.
+    Args:
+        topic: name of the topic.
+        stamps: (n,), stamps in ns, in order.
+        position: (n,), position of each message in the file.
+
+    Raises BadInput if there are too few messages, stamps decrease in the file, or too many messages are
+    lost.
     """
-    stamps = stream.publish_time_ns
     span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
     if len(stamps) < FEWEST or span_s < SHORTEST_S:
         raise BadInput(
-            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; an estimate of noise needs "
+            f"{topic}: has {len(stamps)} messages in {span_s:.3g} s; an estimate of noise needs "
             f"at least {FEWEST} in {SHORTEST_S:.0f} s, and that of a random walk an hour at rest"
         )
-    written = np.diff(stamps[np.argsort(stream.position, kind="stable")])
-    if (written < 0).any():
-        raise BadInput(
-            f"{stream.topic}: its stamps go backwards {int((written < 0).sum())} times; record it with "
-            "one clock, or write it in order with fuselog cut"
-        )
+    if (np.diff(position) < 0).any():
+        back = int((np.diff(stamps[np.argsort(position, kind="stable")]) < 0).sum())
+        if back:
+            raise BadInput(
+                f"{topic}: its stamps go backwards {back} times; record it with one clock, or write it "
+                "in order with fuselog cut"
+            )
     rows = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
     steps = np.diff(stamps[rows]) * 1e-9
     median_s = float(np.median(steps))
     is_gap = steps > _GAP * median_s
     step_s = float(steps[~is_gap].mean())
-    counts = np.where(is_gap, np.maximum(np.rint(steps / step_s), 2), 1).astype(np.int64)
-    grid = Grid(step_s, np.concatenate([[0], np.cumsum(counts)]), rows)
+    places = np.ones(len(rows), np.int64)
+    places[0], places[1:][is_gap] = 0, np.maximum(np.rint(steps[is_gap] / step_s), 2)
+    np.cumsum(places, out=places)
+    grid = Grid(step_s, rows if np.array_equal(places, rows) else places, rows)  # one array, if equal
     if grid.lost > _MOST_LOST:
         raise BadInput(
-            f"{stream.topic}: {100 * grid.lost:.0f} % of the messages are lost, in "
+            f"{topic}: {100 * grid.lost:.0f} % of the messages are lost, in "
             f"{int(is_gap.sum())} gaps; record again, or select a complete part with fuselog cut"
         )
     return grid
@@ -121,6 +128,7 @@ def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
         raise BadInput(f"{name}: has {len(there)} numbers; an estimate of noise needs at least {FEWEST}")
     if np.ptp(there) == 0:
         raise BadInput(f"{name}: is constant, {there[0]:.6g}; an active sensor has noise")
+    del there
     means = block_means(values, max(1, round(1 / step_s)))
     spread, most = float(np.nanstd(means)), _STILL.get(unit_of(field), math.inf)
     size = max(20, len(values) // 200)

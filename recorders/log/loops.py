@@ -58,7 +58,7 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
         is_fixed: (size,), 0xFF for bytes that are the same in all records.
     """
     size = len(record)
-    places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
+    places = np.minimum(np.arange(0, size, 8), size - 8)
     eight = places[:, None] + np.arange(8)
     words, mask = (np.ascontiguousarray(each[eight]).view("<i8")[:, 0] for each in (record, is_fixed))
     places, words, mask = places[mask != 0], words[mask != 0], mask[mask != 0]

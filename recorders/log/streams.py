@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -336,6 +337,27 @@ def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
         columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},
         position=np.concatenate([part.position for part in parts]),
     )
+
+
+def divide(stream: Stream, cuts: Sequence[int]) -> list[Stream]:
+    """Divide a stream that holds several recordings, each with positions from zero.
+
+    Args:
+        stream: the recordings, one after the other.
+        cuts: (recordings + 1,), first message of each.
+    """
+    return [
+        Stream(
+            stream.topic,
+            stream.schema,
+            stream.publish_time_ns[first:end],
+            stream.log_time_ns[first:end],
+            {name: column[first:end] for name, column in stream.columns.items()},
+            np.arange(end - first, dtype=np.int64),
+            stream.metadata,
+        )
+        for first, end in pairwise(cuts)
+    ]
 
 
 def empty_stream(topic: str, schema: Schema, metadata: Mapping[str, str]) -> Stream:

@@ -4,8 +4,8 @@ Each odometry message states the velocity until the next message; the true veloc
 plus white noise. Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
 """
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from fuselog.recorders.common_streams import (
     truth_stream,
 )
 from fuselog.recorders.log import Schema, Stream, make_stream, schemas
+from fuselog.recorders.log.streams import divide
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
 from fuselog.recorders.models.states import POSE
@@ -31,6 +32,9 @@ from fuselog.recorders.recording import (
 )
 from fuselog.recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Rngs = Callable[[str], list[np.random.Generator]]  # the generators of runs, by name
 SENSORS = {
     "range_bearing": schemas.RANGE_BEARING,
     "range": schemas.RANGE,
@@ -49,280 +53,345 @@ NUMBERS = {
 }
 
 
-class Drive(NamedTuple):
-    """The motion of one robot: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
+class Drives(NamedTuple):
+    """The motion of one robot in several runs, at the odometry stamps that all runs share.
 
-    times_s: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    true_velocity: NDArray[np.float64]
-    odometry: NDArray[np.float64]
+    Attributes:
+        times_s: (steps + 1,).
+        poses: (3, runs, steps + 1).
+        true_velocity, odometry: (2, runs, steps).
+    """
 
-    def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Compute exact poses (n, 3) at any times within the drive."""
+    times_s: Floats
+    poses: Floats
+    true_velocity: Floats
+    odometry: Floats
+
+    def poses_at(self, times_s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Compute exact poses, each component (runs, n), at any times (n,) within the drive."""
         steps = np.searchsorted(self.times_s, times_s, side="right") - 1
-        steps = np.clip(steps, 0, len(self.true_velocity) - 1)
-        return np.stack(
-            drive(self.poses[steps].T, self.true_velocity[steps].T, times_s - self.times_s[steps]),
-            axis=1,
-        )
+        steps = np.clip(steps, 0, self.odometry.shape[2] - 1)
+        elapsed_s = times_s - self.times_s[steps]
+        return drive(self.poses[:, :, steps], self.true_velocity[:, :, steps], elapsed_s)
 
 
 class Sightings(NamedTuple):
-    """The views of one sensor: their stamps (n,), and the true values of each target seen in a view."""
+    """The views of one sensor in several runs: the true values of each target seen in a view.
 
-    times_s: NDArray[np.float64]
-    look: NDArray[np.int64]
-    target: NDArray[np.int64]
-    range_m: NDArray[np.float64]
-    bearing_rad: NDArray[np.float64]
-    outages_s: NDArray[np.float64]
+    Attributes:
+        times_s: (views,) stamps of the views of a run.
+        view: (n,) number of the view, counted through all runs.
+        cuts: (runs + 1,) first sighting of each run.
+        target: (n,) number of the target.
+        range_m, bearing_rad: (n,).
+        outages_s: for each run, (k, 2) starts and ends.
+    """
+
+    times_s: Floats
+    view: Integers
+    cuts: list[int]
+    target: Integers
+    range_m: Floats
+    bearing_rad: Floats
+    outages_s: list[Floats]
 
 
 def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recording:
     """Simulate one run; every robot and sensor has its own random generator, by name."""
-    map_rng, *robot_rngs = rng.spawn(1 + parameters.robots)
-    half = 0.5 * parameters.arena_m
-    landmarks = map_rng.uniform(-half, half, (parameters.landmarks, 2))
+    return simulate_runs(parameters, [rng])[0]
+
+
+def simulate_runs(
+    parameters: LandmarksParameters, rngs: Sequence[np.random.Generator]
+) -> list[Recording]:
+    """Simulate several runs together, each with its generator; see `simulate`."""
+    map_rngs, *robot_rngs = zip(*(rng.spawn(1 + parameters.robots) for rng in rngs), strict=True)
+    half, points = 0.5 * parameters.arena_m, (parameters.landmarks, 2)
+    landmarks = np.array([map_rng.uniform(-half, half, points) for map_rng in map_rngs])
     first_landmark = parameters.robots + 1
-    streams = [
-        make_stream(
-            "/landmarks",
-            schemas.LANDMARK,
-            np.full(parameters.landmarks, SIMULATION_EPOCH_NS),
-            landmark_id=np.arange(first_landmark, first_landmark + parameters.landmarks),
-            position_m=landmarks,
-        )
-    ]
-    by_name = [partial(named_generator, robot_rng, numbers=NUMBERS) for robot_rng in robot_rngs]
-    drives = [_drive(parameters, number, rng_of("drive")) for number, rng_of in enumerate(by_name)]
-    for number, rng_of in enumerate(by_name, start=1):
-        streams += _robot_streams(parameters, number, drives, landmarks, rng_of)
-    return Recording(streams)
+    targets = np.arange(first_landmark, first_landmark + parameters.landmarks)
+    maps = make_stream(
+        "/landmarks",
+        schemas.LANDMARK,
+        np.full(landmarks.shape[:2], SIMULATION_EPOCH_NS).ravel(),
+        landmark_id=np.tile(targets, len(rngs)),
+        position_m=landmarks.reshape(-1, 2),
+    )
+    streams: list[list[Stream]] = [[] for _ in rngs]
+    _add(streams, maps)
+    by_name = [_by_name(of_runs) for of_runs in robot_rngs]
+    drives = [_drive(parameters, number, rngs_of("drive")) for number, rngs_of in enumerate(by_name)]
+    for number, rngs_of in enumerate(by_name, start=1):
+        robot = _robot_streams(parameters, number, drives, landmarks, rngs_of)
+        for together, own in zip(streams, robot, strict=True):
+            together += own
+    return [Recording(together) for together in streams]
 
 
-def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generator) -> Drive:
+def _by_name(robot_rngs: Sequence[np.random.Generator]) -> Rngs:
+    return lambda name: [named_generator(rng, name, NUMBERS) for rng in robot_rngs]
+
+
+def _drive(parameters: LandmarksParameters, number: int, rngs: Sequence[np.random.Generator]) -> Drives:
     """Drive around the arena on a wavering circle."""
     steps = max(1, round(parameters.duration_s * parameters.odometry_rate_hz))
     step_s = 1.0 / parameters.odometry_rate_hz
     times_s = np.arange(steps + 1, dtype=np.float64) * step_s
-    radius_m = parameters.arena_m * rng.uniform(0.25, 0.35)
-    phase, period_s = rng.uniform(0, 2 * np.pi), rng.uniform(12, 20)
-    forward = np.full(steps, parameters.speed_mps)
+    circles, noise, starts = [], np.empty((2, len(rngs), steps)), []
+    for rng, own in zip(rngs, noise.swapaxes(0, 1), strict=True):
+        circles.append([rng.uniform(0.25, 0.35), rng.uniform(0, 2 * np.pi), rng.uniform(12, 20)])
+        own[:] = rng.normal(size=(steps, 2)).T
+        starts.append([rng.uniform(0, 2 * np.pi)])
+    radius_m, phase, period_s = np.array(circles).T[:, :, None]
+    radius_m, start = parameters.arena_m * radius_m, np.array(starts)
+    forward = np.full((len(rngs), steps), parameters.speed_mps)
     turn = forward / radius_m * (1 + 0.6 * np.sin(2 * np.pi * times_s[:-1] / period_s + phase))
-    odometry = np.stack([forward, turn if number % 2 == 0 else -turn], axis=1)
-    density = [parameters.forward_noise_density, parameters.turn_noise_density]
-    noise = rng.normal(size=(steps, 2)) * density / np.sqrt(step_s)
-    scale = np.array([1 + parameters.forward_scale_error, 1.0])
-    true_velocity: NDArray[np.float64] = (
-        odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    odometry = np.stack([forward, turn if number % 2 == 0 else -turn])
+    density = np.array([parameters.forward_noise_density, parameters.turn_noise_density])
+    noise = noise * density[:, None, None] / np.sqrt(step_s)
+    scale, bias = np.array(
+        [[1 + parameters.forward_scale_error, 1.0], [0.0, parameters.turn_bias_radps]]
     )
-    start = rng.uniform(0, 2 * np.pi)
-    turned = np.cumsum(true_velocity[:, 1] * step_s)
-    heading: NDArray[np.float64] = start + np.pi / 2 + np.append(0.0, turned)
+    true_velocity: Floats = odometry * scale[:, None, None] + bias[:, None, None] + noise
+    heading = start + np.pi / 2 + _summed(true_velocity[1] * step_s)
     if number % 2:
         heading += np.pi
-    origin = np.zeros((3, steps))
-    origin[2] = heading[:-1]
-    moves = drive(origin, true_velocity.T, step_s)
-    x = radius_m * np.cos(start) + np.append(0.0, np.cumsum(moves[0]))
-    y = radius_m * np.sin(start) + np.append(0.0, np.cumsum(moves[1]))
-    poses: NDArray[np.float64] = np.stack([x, y, heading], axis=1)
-    return Drive(times_s, poses, true_velocity, odometry)
+    x, y, _ = drive((0.0, 0.0, heading[:, :-1]), true_velocity, step_s)
+    poses = radius_m * np.cos(start) + _summed(x), radius_m * np.sin(start) + _summed(y), heading
+    return Drives(times_s, np.stack(poses), true_velocity, odometry)
+
+
+def _summed(steps: Floats) -> Floats:
+    """Sum steps (runs, n) from zero: (runs, n + 1)."""
+    sums = np.zeros((len(steps), steps.shape[1] + 1))
+    np.cumsum(steps, axis=1, out=sums[:, 1:])
+    return sums
 
 
 def _robot_streams(
     parameters: LandmarksParameters,
     number: int,
-    drives: list[Drive],
-    landmarks: NDArray[np.float64],
-    rng_of: Callable[[str], np.random.Generator],
-) -> list[Stream]:
+    drives: list[Drives],
+    landmarks: Floats,
+    rngs_of: Rngs,
+) -> list[list[Stream]]:
+    """Simulate the streams of a robot, for each run."""
     robot = drives[number - 1]
     prefix = f"/robot{number}"
     stamps_ns = simulation_stamps_ns(robot.times_s)
-    truth = robot.poses.copy()
-    truth[:, 2] = wrap_angle(truth[:, 2])
+    logged_ns = simulation_stamps_ns(robot.times_s[:-1] + parameters.odometry_latency_s)
+    x, y, heading = robot.poses
+    truth = np.stack([x, y, wrap_angle(heading)], axis=2)
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
-    prior = truth[0] + rng_of("prior").normal(size=3) * sigma
-    streams = [
-        prior_stream(f"{prefix}/prior", stamps_ns[0], POSE, prior, np.diag(sigma**2)),
-        truth_stream(f"{prefix}/truth", stamps_ns, POSE, truth),
-        make_stream(
-            f"{prefix}/odometry",
-            schemas.ODOMETRY,
-            stamps_ns[:-1],
-            log_time_ns=simulation_stamps_ns(robot.times_s[:-1] + parameters.odometry_latency_s),
-            metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
-            forward_mps=robot.odometry[:, 0],
-            turn_radps=robot.odometry[:, 1],
-        ),
-    ]
+    priors = truth[:, 0] + [rng.normal(size=3) * sigma for rng in rngs_of("prior")]
+    runs, covariance = len(truth), np.diag(sigma**2)
+    streams: list[list[Stream]] = [[] for _ in priors]
+    prior_ns, covariances = np.full(runs, stamps_ns[0]), np.tile(covariance, (runs, 1, 1))
+    _add(streams, prior_stream(f"{prefix}/prior", prior_ns, POSE, priors, covariances))
+    truth_ns = np.tile(stamps_ns, runs)
+    _add(streams, truth_stream(f"{prefix}/truth", truth_ns, POSE, truth.reshape(-1, 3)))
+    odometry = make_stream(
+        f"{prefix}/odometry",
+        schemas.ODOMETRY,
+        np.tile(stamps_ns[:-1], runs),
+        log_time_ns=np.tile(logged_ns, runs),
+        metadata=stated_numbers(parameters, "forward_noise_density", "turn_noise_density"),
+        forward_mps=robot.odometry[0].ravel(),
+        turn_radps=robot.odometry[1].ravel(),
+    )
+    _add(streams, odometry)
     targets = _targets(parameters, number, drives, landmarks)
     for name, schema in SENSORS.items():
         sensor: Sensor = getattr(parameters, name)
         if sensor.rate_hz == 0:
             continue
-        sensor_rng = rng_of(name)
-        seen = _look(sensor, robot, targets, sensor_rng)
-        look, columns = _measure(schema, sensor, seen, sensor_rng)
-        streams.append(
-            make_stream(
-                f"{prefix}/{name}",
-                schema,
-                **_clocks(sensor, seen.times_s, look, sensor_rng),
-                metadata=stated_numbers(sensor, "sigma_range_m", "sigma_bearing_rad"),
-                **columns,
-            )
-        )
+        rngs = rngs_of(name)
+        seen = _look(sensor, robot, targets, rngs)
+        view, cuts, columns = _measure(schema, sensor, seen, rngs)
+        columns |= _clocks(sensor, seen.times_s, view, rngs)
+        metadata = stated_numbers(sensor, "sigma_range_m", "sigma_bearing_rad")
+        _add(streams, make_stream(f"{prefix}/{name}", schema, metadata=metadata, **columns), cuts)
         if sensor.outages_per_minute > 0:
-            streams.append(
-                outage_stream(f"{prefix}/{name}/outages", simulation_stamps_ns(seen.outages_s))
-            )
-    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rng_of)
+            for together, outages_s in zip(streams, seen.outages_s, strict=True):
+                outages_ns = simulation_stamps_ns(outages_s)
+                together.append(outage_stream(f"{prefix}/{name}/outages", outages_ns))
+    for together, fixes in zip(
+        streams, _fix_streams(f"{prefix}/fix", parameters.fix, robot, rngs_of), strict=True
+    ):
+        together += fixes
+    return streams
 
 
-def _fix_streams(
-    topic: str, receiver: Fixes, robot: Drive, rng_of: Callable[[str], np.random.Generator]
-) -> list[Stream]:
-    """Simulate fixes in the plane or on the earth with their covariance, and their outages."""
+def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int] | None = None) -> None:
+    """Add to the streams of each run its part of a stream of all runs, by default equal parts."""
+    if cuts is None:
+        cuts = [run * len(of_runs) // len(streams) for run in range(len(streams) + 1)]
+    for together, own in zip(streams, divide(of_runs, cuts), strict=True):
+        together.append(own)
+
+
+def _fix_streams(topic: str, receiver: Fixes, robot: Drives, rngs_of: Rngs) -> list[list[Stream]]:
+    """Simulate fixes in the plane or on the earth with their covariance, and their outages, by run."""
     if receiver.rate_hz == 0:
-        return []
-    rng = rng_of("fix")
-    times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
-    outages_s, is_dead = _dead(receiver, times_s, robot.times_s[-1], rng)
-    places = robot.pose_at(times_s)[:, :2] + receiver.sigma_m * rng.normal(size=(len(times_s), 2))
-    times_s, places = times_s[~is_dead], places[~is_dead]
-    fixes = fix_stream(topic, simulation_stamps_ns(times_s), places, receiver.sigma_m**2)
-    if receiver.origin_deg is not None:
-        latitude, longitude, altitude = out_of_tangent_plane(places.T, receiver.origin_deg)
-        names = "origin_latitude_deg", "origin_longitude_deg"
-        fixes = make_stream(
-            topic,
-            schemas.GEODETIC_FIX,
-            fixes.publish_time_ns,
-            metadata=dict(zip(names, map(repr, receiver.origin_deg), strict=True)),
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            altitude_m=altitude,
-            covariance_m2=fixes["covariance_m2"],
-        )
-    outages = outage_stream(f"{topic}/outages", simulation_stamps_ns(outages_s))
-    return [fixes, outages] if receiver.outages_per_minute > 0 else [fixes]
+        return [[] for _ in range(robot.poses.shape[1])]
+    all_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
+    x, y, _ = robot.poses_at(all_s)
+    streams = []
+    for true, rng in zip(np.stack([x, y], axis=2), rngs_of("fix"), strict=True):
+        outages_s, is_dead = _dead(receiver, all_s, robot.times_s[-1], rng)
+        places = true + receiver.sigma_m * rng.normal(size=(len(all_s), 2))
+        times_s, places = all_s[~is_dead], places[~is_dead]
+        fixes = fix_stream(topic, simulation_stamps_ns(times_s), places, receiver.sigma_m**2)
+        if receiver.origin_deg is not None:
+            latitude, longitude, altitude = out_of_tangent_plane(places.T, receiver.origin_deg)
+            names = "origin_latitude_deg", "origin_longitude_deg"
+            fixes = make_stream(
+                topic,
+                schemas.GEODETIC_FIX,
+                fixes.publish_time_ns,
+                metadata=dict(zip(names, map(repr, receiver.origin_deg), strict=True)),
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                altitude_m=altitude,
+                covariance_m2=fixes["covariance_m2"],
+            )
+        streams.append([fixes])
+        if receiver.outages_per_minute > 0:
+            streams[-1].append(outage_stream(f"{topic}/outages", simulation_stamps_ns(outages_s)))
+    return streams
 
 
 def _targets(
-    parameters: LandmarksParameters,
-    number: int,
-    drives: list[Drive],
-    landmarks: NDArray[np.float64],
-) -> Mapping[int, Drive | NDArray[np.float64]]:
-    """Return the possible targets of robot `number`: points, and moving robots, by number."""
-    seen: dict[int, Drive | NDArray[np.float64]] = {}
+    parameters: LandmarksParameters, number: int, drives: list[Drives], landmarks: Floats
+) -> Mapping[int, Drives | Floats]:
+    """Return the possible targets of robot `number`, by number: moving robots, and points (runs, 2)."""
+    seen: dict[int, Drives | Floats] = {}
     if parameters.robots_see_each_other:
         seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
-    return seen | dict(enumerate(landmarks, start=parameters.robots + 1))
+    return seen | dict(enumerate(landmarks.swapaxes(0, 1), start=parameters.robots + 1))
 
 
 def _look(
     sensor: Sensor,
-    robot: Drive,
-    targets: Mapping[int, Drive | NDArray[np.float64]],
-    rng: np.random.Generator,
+    robot: Drives,
+    targets: Mapping[int, Drives | Floats],
+    rngs: Sequence[np.random.Generator],
 ) -> Sightings:
     """View all targets in range and field of view at the sensor's rate, except dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
-    outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
-    pose = robot.pose_at(times_s)
-    places = np.empty((2, len(targets), len(times_s)))
-    for place, each in zip(places.swapaxes(0, 1), targets.values(), strict=True):
-        place[:] = each.pose_at(times_s)[:, :2].T if isinstance(each, Drive) else each[:, None]
-    distance, bearing = range_bearing(pose.T[:, None, :], places)
+    places = np.empty((2, len(rngs), len(times_s), len(targets)))
+    for place, each in zip(np.moveaxis(places, 3, 0), targets.values(), strict=True):
+        place[:] = each.poses_at(times_s)[:2] if isinstance(each, Drives) else each.T[:, :, None]
+    pose = np.stack(robot.poses_at(times_s))[:, :, :, None]
+    distance, bearing = range_bearing(pose, places)
     bearing = wrap_angle(bearing)
     half_view = np.radians(sensor.field_of_view_deg) / 2
-    visible = (distance <= sensor.maximum_range_m) & (np.abs(bearing) <= half_view) & ~dead
-    visible &= rng.uniform(size=visible.shape) >= sensor.dropout_probability
-    look, target = np.nonzero(visible.T)
-    numbers = np.array(list(targets), dtype=np.int64)
-    return Sightings(
-        times_s, look, numbers[target], distance.T[look, target], bearing.T[look, target], outages_s
-    )
+    visible = (distance <= sensor.maximum_range_m) & (np.abs(bearing) <= half_view)
+    outages_s = []
+    for own, rng in zip(visible, rngs, strict=True):
+        outages, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
+        outages_s.append(outages)
+        own &= ~dead[:, None]
+        is_lost = rng.uniform(size=own.shape[::-1]) < sensor.dropout_probability
+        own &= ~is_lost.T
+    run, view, target = np.nonzero(visible)
+    view += run * len(times_s)
+    cuts = np.searchsorted(run, range(len(rngs) + 1)).tolist()
+    numbers = np.array(list(targets), dtype=np.int64)[target]
+    return Sightings(times_s, view, cuts, numbers, distance[visible], bearing[visible], outages_s)
 
 
 def _dead(
     sensor: Sensor | Fixes,
-    times_s: NDArray[np.float64],
+    times_s: Floats,
     duration_s: float,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Draw a sensor's outages (k, 2), start and end, and test which times (n,) are in one."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
+    if not count:
+        return np.empty((0, 2)), np.zeros(len(times_s), np.bool_)
     starts_s = np.sort(rng.uniform(0, duration_s, count))
     outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
     is_dead = np.any((times_s[:, None] >= outages_s[:, 0]) & (times_s[:, None] < outages_s[:, 1]), 1)
     return outages_s, is_dead
 
 
-def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
+def _drawn(seen: Sightings, rngs: Sequence[np.random.Generator]) -> tuple[Floats, Floats, Floats]:
+    """Draw for every sighting (n,) a standard normal number, and two that are uniform in [0, 1)."""
+    noise, place, chance = np.empty((3, len(seen.view)))
+    for rng, (first, end) in zip(rngs, pairwise(seen.cuts), strict=True):
+        rng.standard_normal(out=noise[first:end])
+        rng.random(out=place[first:end])
+        rng.random(out=chance[first:end])
+    return noise, place, chance
+
+
+def _range(sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator]) -> Floats:
     """Measure ranges with bias, noise, and outliers anywhere in the sensor's range."""
-    measured = true_m + sensor.bias_range_m + rng.normal(size=len(true_m)) * sensor.sigma_range_m
-    wild = rng.uniform(0, sensor.maximum_range_m, len(true_m))
-    is_outlier = rng.uniform(size=len(true_m)) < sensor.outlier_probability
-    return np.abs(np.where(is_outlier, wild, measured))
+    noise, place, chance = _drawn(seen, rngs)
+    measured = seen.range_m + sensor.bias_range_m + noise * sensor.sigma_range_m
+    is_outlier = chance < sensor.outlier_probability
+    return np.abs(np.where(is_outlier, sensor.maximum_range_m * place, measured))
 
 
-def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
+def _bearing(sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator]) -> Floats:
     """Measure bearings with bias, noise, and outliers in any direction."""
-    noise = rng.normal(size=len(true_rad)) * sensor.sigma_bearing_rad
-    wild = rng.uniform(-np.pi, np.pi, len(true_rad))
-    is_outlier = rng.uniform(size=len(true_rad)) < sensor.outlier_probability
-    return wrap_angle(np.where(is_outlier, wild, true_rad + sensor.bias_bearing_rad + noise))
+    noise, place, chance = _drawn(seen, rngs)
+    measured = seen.bearing_rad + sensor.bias_bearing_rad + noise * sensor.sigma_bearing_rad
+    is_outlier = chance < sensor.outlier_probability
+    wrapped: Floats = wrap_angle(np.where(is_outlier, -np.pi + 2 * np.pi * place, measured))
+    return wrapped
 
 
 def _clocks(
-    sensor: Sensor, times_s: NDArray[np.float64], look: NDArray[np.int64], rng: np.random.Generator
-) -> dict[str, NDArray[np.int64]]:
+    sensor: Sensor, times_s: Floats, view: Integers, rngs: Sequence[np.random.Generator]
+) -> dict[str, Integers]:
     """Make the three clocks of every message; messages of one view share them."""
-    delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
+    jitter_s = np.concatenate([rng.exponential(size=len(times_s)) for rng in rngs])
+    delay_s = sensor.latency_s + sensor.latency_jitter_s * jitter_s
+    all_s = np.tile(times_s, len(rngs))
     return {
-        "publish_time_ns": simulation_stamps_ns(times_s + sensor.stamp_offset_s)[look],
-        "log_time_ns": simulation_stamps_ns(times_s + delay_s)[look],
-        "sensor_time_ns": simulation_stamps_ns(times_s + sensor.clock_offset_s)[look],
+        "publish_time_ns": simulation_stamps_ns(all_s + sensor.stamp_offset_s)[view],
+        "log_time_ns": simulation_stamps_ns(all_s + delay_s)[view],
+        "sensor_time_ns": simulation_stamps_ns(all_s + sensor.clock_offset_s)[view],
     }
 
 
 def _measure(
-    schema: Schema, sensor: Sensor, seen: Sightings, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
-    """Return the view of every message, and the messages' columns."""
+    schema: Schema, sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator]
+) -> tuple[Integers, list[int], dict[str, NDArray]]:
+    """Return the view of every message, the first message of each run, and the messages' columns."""
     names = [entry.name for entry in schema]
     columns: dict[str, NDArray] = {"target_id": seen.target}
     if "range_m" in names:
-        columns["range_m"] = _range(sensor, seen.range_m, rng)
+        columns["range_m"] = _range(sensor, seen, rngs)
     if schema is schemas.RELATIVE_BEARING:
-        bearing = _bearing(sensor, seen.bearing_rad, rng)
-        first, second = _pairs(seen)
+        bearing = _bearing(sensor, seen, rngs)
+        first, second = _pairs(seen.view)
         columns = {
             "first_id": seen.target[first],
             "second_id": seen.target[second],
             "angle_rad": wrap_angle(bearing[first] - bearing[second]),
         }
-        return seen.look[first], columns
+        return seen.view[first], np.searchsorted(first, seen.cuts).tolist(), columns
     if "bearing_rad" in names:
-        columns["bearing_rad"] = _bearing(sensor, seen.bearing_rad, rng)
-    return seen.look, columns
+        columns["bearing_rad"] = _bearing(sensor, seen, rngs)
+    return seen.view, seen.cuts, columns
 
 
-def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of all pairs of targets that share a view."""
-    first, second = np.triu_indices(int(np.bincount(seen.look).max(initial=0)), k=1)
-    count = np.bincount(seen.look, minlength=len(seen.times_s))
+def _pairs(view: Integers) -> tuple[Integers, Integers]:
+    """Return the rows of all pairs of targets that share a view (n,)."""
+    count = np.bincount(view)
+    first, second = np.triu_indices(int(count.max(initial=0)), k=1)
     start = np.cumsum(count) - count
-    look, pair = np.nonzero(second < count[:, None])
-    return start[look] + first[pair], start[look] + second[pair]
+    of_view, pair = np.nonzero(second < count[:, None])
+    return start[of_view] + first[pair], start[of_view] + second[pair]
 
 
 LANDMARKS = Simulator(
     "robots with odometry drive among landmarks; range, bearing and relative-bearing sensors, fixes",
     LandmarksParameters,
     simulate,
+    simulate_runs,
 )

@@ -16,7 +16,7 @@ from fuselog.recorders.recording import record_run
 
 REPEATS = 7
 LEAST = "import numpy, pydantic.main, rich.table, google.protobuf.message"
-MAIN = "import sys; from fuselog.pipeline.command_line import main; sys.exit(main(sys.argv[1:]))"
+MAIN = "from fuselog.pipeline.command_line import main; main()"
 COMMANDS = {
     "--help": ["--help"],
     "info of a minute's log": ["info", "run.mcap"],

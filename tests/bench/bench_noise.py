@@ -16,7 +16,7 @@ import numpy as np
 import fuselog as fl
 
 HOURS, STEP_S = 10, 0.005
-CPU_S, PEAK_GB = 60.0, 2.0
+CPU_S, PEAK_GB = 60.0, 1.0
 WHITE, WALK = {"specific_force_mps2": 1e-2, "turn_rate_radps": 1e-3}, 0.01  # of the white noise
 # the kernel counts the parent's memory as the child's, but for what /proc says of itself
 CODE = """import sys

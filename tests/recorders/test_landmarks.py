@@ -10,7 +10,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas
 from fuselog.recorders.models.geodesy import into_tangent_plane
 from fuselog.recorders.models.planar import drive, range_bearing, wrap_angle
-from fuselog.recorders.recording import SIMULATION_EPOCH_NS, named_generator, record_run
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, named_generator, record_run, record_runs
 from fuselog.recorders.simulators import landmarks
 from fuselog.recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
@@ -77,6 +77,31 @@ def test_sensors_draw_as_before_they_had_generators_by_name() -> None:
     for name, number in landmarks.NUMBERS.items():
         own = named_generator(np.random.default_rng(5), name, landmarks.NUMBERS)
         assert own.random() == children[number].random()
+
+
+@pytest.mark.parametrize("landmarks", [5, 0])
+def test_runs_that_are_simulated_together_equal_the_same_runs_alone(landmarks: int) -> None:
+    sensor = {"rate_hz": 3.0, "maximum_range_m": 5.0, "dropout_probability": 0.2}
+    sensor |= {"outlier_probability": 0.2, "outages_per_minute": 10.0, "latency_jitter_s": 0.1}
+    names = ("range_bearing", "range", "bearing", "relative_bearing")
+    values = {
+        "duration_s": 7.0,
+        "robots": 2,
+        "robots_see_each_other": True,
+        "landmarks": landmarks,
+        "fix": {"rate_hz": 1.0, "outages_per_minute": 10.0},
+        **dict.fromkeys(names, sensor),
+    }
+    recorded = record_runs("landmarks", values, 7, [3, 1, 4])
+    for run, (together, metadata) in zip((3, 1, 4), recorded, strict=True):
+        alone, stated = record_run("landmarks", values, 7, run)
+        assert metadata == stated
+        for stream, own in zip(together.streams, alone.streams, strict=True):
+            assert (stream.topic, stream.metadata) == (own.topic, own.metadata)
+            clocks = stream.publish_time_ns, stream.log_time_ns, stream.position
+            assert_array_equal(clocks, [own.publish_time_ns, own.log_time_ns, own.position])
+            for name, column in own.columns.items():
+                assert stream[name].tobytes() == column.tobytes(), (run, own.topic, name)
 
 
 def test_noise_and_bias_are_gaussian_as_stated():

@@ -14,7 +14,7 @@ import numpy as np
 from fuselog.recorders.log import Clock, Stream, schemas
 from fuselog.replay.engine.arrays import AnyArray
 from fuselog.replay.engine.replaying.attribution import Attribution
-from fuselog.replay.engine.streams.blocks import Ragged
+from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
 from fuselog.replay.engine.streams.failures import sentences_of
 
 # Messages that drive a motion are not measurements and have no innovations.
@@ -101,16 +101,18 @@ class Usage:
                 self.begins_ns = np.minimum(before, begins_ns)
             if ragged.stream.schema.full_name == LANDMARK:
                 self.given[topic] += len(ragged)
-                for run in range(ragged.runs):
-                    self._note_map(topic, ragged.of_run(run))
+                self._note_maps(topic, ragged)
 
-    def _note_map(self, topic: str, stream: Stream) -> None:
-        """Record landmarks for which the map states two positions."""
-        order = np.argsort(stream["landmark_id"], kind="stable")
-        number, place = stream["landmark_id"][order], stream["position_m"][order]
-        apart_m = np.where(np.diff(number) == 0, np.linalg.norm(np.diff(place, axis=0), axis=1), 0.0)
+    def _note_maps(self, topic: str, ragged: Ragged) -> None:
+        """Record the landmark of the last run whose map states two positions for a landmark."""
+        run, number = run_of_rows(ragged.offsets), ragged["landmark_id"]
+        order = np.lexsort((number, run))
+        run, number, place = run[order], number[order], ragged["position_m"][order]
+        is_same = (np.diff(run) == 0) & (np.diff(number) == 0)
+        apart_m = np.where(is_same, np.linalg.norm(np.diff(place, axis=0), axis=1), 0.0)
         if apart_m.any():
-            worst = int(np.argmax(apart_m))
+            last = run[np.flatnonzero(apart_m)[-1]]
+            worst = int(np.argmax(np.where(run[:-1] == last, apart_m, 0.0)))
             self.doubtful[topic] = (
                 f"landmark {number[worst]} is stated at two positions, {apart_m[worst]:.3g} m apart"
             )

@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, Stream
+from fuselog.recorders.log.impossible import possible
 from fuselog.replay.engine.streams.blocks import (
     Block,
     Findings,
@@ -136,11 +137,19 @@ class Ensemble(list[SourceType]):
         """Return topics of recordings, with each run sorted by a clock."""
         for topic in topics:
             if (topic, order) not in self._kept:
-                together = gather([source.stream_of(topic) for source in self._recordings])
+                together = self._together(topic)
                 if not is_in_order(together, order):
                     together = gather([source.in_order(topic, order) for source in self._recordings])
                 self._kept[topic, order] = together
         return {topic: self._kept[topic, order] for topic in topics}
+
+    def _together(self, topic: str) -> Ragged:
+        """Concatenate a topic of recordings as recorded, without impossible messages."""
+        if all(topic in source.streams and source.main_span is None for source in self._recordings):
+            together = gather([source.streams[topic] for source in self._recordings])
+            if not possible(together.stream, None)[1]:  # faster than to test each run
+                return together
+        return gather([source.stream_of(topic) for source in self._recordings])
 
 
 def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:

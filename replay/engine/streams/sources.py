@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Protocol, Self
 
 import numpy as np
@@ -277,7 +278,7 @@ class MemorySource(_Readable):
 
     def whole(self) -> "MemorySource":
         """Return the whole recording."""
-        return replace(self, start_ns=None, end_ns=None)
+        return self if self.is_whole else replace(self, start_ns=None, end_ns=None)
 
     @property
     def is_whole(self) -> bool:
@@ -331,10 +332,10 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     ranks = np.empty(sum(map(len, streams)), np.int64)
     times = [stream.log_time_ns for stream in streams]
     ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
-    cuts = np.cumsum([len(stream) for stream in streams])[:-1]
+    cuts = accumulate(map(len, streams), initial=0)
     placed = [
-        replace(stream, position=rank)
-        for stream, rank in zip(streams, np.split(ranks, cuts), strict=True)
+        replace(stream, position=ranks[first:end])
+        for stream, (first, end) in zip(streams, pairwise(cuts), strict=True)
     ]
     return MemorySource(
         {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -80,16 +81,28 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
         wanted: components whose kinds are used if the channel states none.
         where: name of the topic in messages.
     """
-    names = [name for name in stated.get("components", "").split(",") if name]
-    listed = stated.get("kinds", "")
-    kinds = listed.split(",") if listed else [wanted.get(name, "linear") for name in names]
-    if len(set(names)) < len(names) or len(kinds) != len(names) or not are_kinds(kinds):
+    listed = stated.get("components", ""), stated.get("kinds", "")
+    found = _parsed(*listed, tuple(wanted.items()))
+    if found is None:
         raise BadInput(
-            f"{where}: invalid components '{stated.get('components', '')}' with kinds '{listed}': give "
+            f"{where}: invalid components '{listed[0]}' with kinds '{listed[1]}': give "
             "each component a unique name and a kind; an axis needs two adjacent components, a "
             "quaternion four"
         )
-    return dict(zip(names, cast("list[Kind]", kinds), strict=True))
+    return dict(found)
+
+
+@lru_cache(maxsize=256)
+def _parsed(
+    components: str, listed: str, wanted: tuple[tuple[str, Kind], ...]
+) -> tuple[tuple[str, Kind], ...] | None:
+    """Parse names and kinds for `stated_components`; None if they are invalid."""
+    names = [name for name in components.split(",") if name]
+    asked = dict(wanted)
+    kinds = listed.split(",") if listed else [asked.get(name, "linear") for name in names]
+    if len(set(names)) < len(names) or len(kinds) != len(names) or not are_kinds(kinds):
+        return None
+    return tuple(zip(names, cast("list[Kind]", kinds), strict=True))
 
 
 def in_body_axes(stream: Stream) -> Stream:

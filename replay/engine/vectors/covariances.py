@@ -28,35 +28,52 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     >>> normalized_error_squared(errors, np.diag([1.0, 4.0])).tolist()
     [2.0, 0.25]
     """
+    return errors_squared(error, covariance, 0)[0]
+
+
+def errors_squared(error: Array, covariance: Array, leading: int) -> tuple[Array, Array]:
+    """Compute the NEES or NIS of all components and of the first few; see `normalized_error_squared`.
+
+    Args:
+        error: (..., n), in the units of the components.
+        covariance: (..., n, n).
+        leading: number of first components.
+
+    Returns both (...); the second is NaN without leading components.
+    """
     size = error.shape[-1]
-    leading = np.broadcast_shapes(error.shape[:-1], covariance.shape[:-2])
-    found = np.full(leading, np.nan)
+    shape = np.broadcast_shapes(error.shape[:-1], covariance.shape[:-2])
+    found = np.full((2, *shape), np.nan)
     if size and found.size:
-        errors = np.broadcast_to(error, (*leading, size)).reshape(-1, size)
-        covariances = np.broadcast_to(covariance, (*leading, size, size)).reshape(-1, size, size)
+        errors = np.broadcast_to(error, (*shape, size)).reshape(-1, size)
+        covariances = np.broadcast_to(covariance, (*shape, size, size)).reshape(-1, size, size)
         errors, covariances = (np.ascontiguousarray(each, float) for each in (errors, covariances))
-        _fill_squares(errors, covariances, np.empty((size, size)), np.empty(size), found.reshape(-1))
-    return found[()]
+        work = np.empty((size, size)), np.empty(size)
+        _fill_squares(errors, covariances, leading, *work, found.reshape(2, -1))
+    return found[0][()], found[1][()]
 
 
 def fill_squares(
-    errors: Array, covariances: Array, factor: Array, whitened: Array, found: Array
+    errors: Array, covariances: Array, leading: int, factor: Array, whitened: Array, found: Array
 ) -> None:
     """Compute |L^-1 e|^2 of errors (n, d) with the Cholesky factors L of covariances (n, d, d).
 
     Args:
         errors: (n, d).
         covariances: (n, d, d).
+        leading: number of components of the second result; their factor is a part of L.
         factor: (d, d), work space.
         whitened: (d,), work space.
-        found: (n,), filled.
+        found: (2, n), filled; the second row only if there are leading components.
     """
     for each in range(len(errors)):
         factorise(covariances[each], factor)
         for row in range(len(factor)):
             error = 0.0 if np.isinf(covariances[each, row, row]) else errors[each, row]
             whitened[row] = (error - dot(factor[row], whitened, row)) / factor[row, row]
-        found[each] = dot(whitened, whitened, len(whitened))
+        found[0, each] = dot(whitened, whitened, len(whitened))
+        if leading:
+            found[1, each] = dot(whitened, whitened, leading)
 
 
 def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:

@@ -113,35 +113,84 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
         truth: (n, components).
         kinds: one for each component.
     """
-    parts = []
+    error = np.empty((len(estimate), sum(TANGENT_WIDTHS[kind] for kind, _ in manifold_blocks(kinds))))
+    scalars, row = [], 0
     for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):
             relative = compose(conjugate(truth[:, columns]), estimate[:, columns])
-            parts.append(rotation_vector(relative))
+            error[:, row : row + TANGENT_WIDTHS[kind]] = rotation_vector(relative)
         else:
-            change = estimate[:, columns] - truth[:, columns]
-            parts.append(wrap_angle(change) if kind == "angle" else change)
-    return np.concatenate(parts, axis=1) if parts else np.empty((len(estimate), 0))
+            scalars.append((columns.start, row, kind == "angle"))
+        row += TANGENT_WIDTHS[kind]
+    _subtract(estimate, truth, np.array(scalars, np.int64).reshape(-1, 3), error)
+    return error
 
 
-def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
-    """Interpolate between states (n, components) along the shortest way, with weights (n,).
+def between(
+    state: Floats,
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    weight: Floats,
+    kinds: Sequence[str],
+) -> Floats:
+    """Interpolate between pairs of states along the shortest way, with weights (n,).
 
     Args:
-        left: (n, components).
-        right: (n, components).
+        state: (m, components).
+        left, right: (n,), rows of the states.
         weight: (n,), from 0 for left to 1 for right.
         kinds: one for each component.
     """
-    value = np.empty(left.shape)
+    value, scalars = np.empty((len(weight), state.shape[1])), []
     for kind, columns in manifold_blocks(kinds):
-        here, there = left[:, columns], right[:, columns]
-        value[:, columns] = (
-            _slerp(here, there, weight)
-            if kind in ("axis", "quaternion")
-            else here + weight[:, None] * difference(there, here, [kind])
-        )
+        if kind in ("axis", "quaternion"):
+            value[:, columns] = _slerp(state[left, columns], state[right, columns], weight)
+        else:
+            scalars.append((columns.start, kind == "angle"))
+    _interpolate(state, left, right, weight, np.array(scalars, np.int64).reshape(-1, 2), value)
     return value
+
+
+def subtract(estimate: Floats, truth: Floats, scalars: NDArray[np.int64], error: Floats) -> None:
+    """Subtract linear components and angles; see `difference`.
+
+    Args:
+        estimate, truth: (n, components).
+        scalars: (m, 3), for each, its column, that of its error, and whether it is an angle.
+        error: (n, tangent components), filled in these columns.
+    """
+    for row in range(len(error)):
+        for each in range(len(scalars)):
+            change = estimate[row, scalars[each, 0]] - truth[row, scalars[each, 0]]
+            error[row, scalars[each, 1]] = wrap_angle(change) if scalars[each, 2] else change
+
+
+def interpolate(
+    state: Floats,
+    left: NDArray[np.int64],
+    right: NDArray[np.int64],
+    weight: Floats,
+    scalars: NDArray[np.int64],
+    value: Floats,
+) -> None:
+    """Interpolate linear components and angles; see `between`.
+
+    Args:
+        state: (m, components).
+        left, right: (n,).
+        weight: (n,).
+        scalars: (m, 2), for each, its column, and whether it is an angle.
+        value: (n, components), filled in these columns.
+    """
+    for row in range(len(value)):
+        for each in range(len(scalars)):
+            here = state[left[row], scalars[each, 0]]
+            change = state[right[row], scalars[each, 0]] - here
+            change = wrap_angle(change) if scalars[each, 1] else change
+            value[row, scalars[each, 0]] = here + weight[row] * change
+
+
+_subtract, _interpolate = compiled(subtract), compiled(interpolate)
 
 
 def truth_at(
@@ -202,7 +251,7 @@ def states_of_runs(
     left, right = np.zeros((2, len(time_ns)), np.int64)
     weight = np.empty(len(time_ns))
     _bracket(times, starts, time_ns, offsets, gap_limit_s * 1e9, left, right, weight)
-    return between(state[left], state[right], weight, kinds)
+    return between(state, left, right, weight, kinds)
 
 
 def bracket(

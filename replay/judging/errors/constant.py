@@ -5,9 +5,10 @@ minimises e_k - d, and a lever arm l, which minimises e_k - R(h_k) l. Only merge
 """
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, errors_at
@@ -39,70 +40,21 @@ class Constant(NamedTuple):
 
 
 @dataclass
-class FrameSums:
-    """Sums of errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
+class ConstantSums:
+    """Sums of the position errors e of a stream of estimates, with weights W = P^-1 and times t.
 
     Attributes:
-        count: n.
-        error, weighted: (axes,) sums of e and W e.
-        weight: (axes, axes) sum of W.
-        squared, nees: sums of e' e and e' W e.
-        time, time_squared: sums of t and t^2.
-        timed: (axes,) sum of t e.
+        axes: number of position components; errors in the plane have no error and no weight in z.
+        count: number of errors.
+        numbers: (4,) sums of e' e, e' W e, t and t^2.
+        frames: (2, 15) sums in the fixed frame and in the body's: e, W e and t e, and xx, xy, xz, yy, yz
+            and zz of W.
     """
 
+    axes: int = 0
     count: int = 0
-    error: Any = 0.0
-    weighted: Any = 0.0
-    weight: Any = 0.0
-    squared: float = 0.0
-    nees: float = 0.0
-    time: float = 0.0
-    time_squared: float = 0.0
-    timed: Any = 0.0
-
-    def add(self, error: Floats, weight: Floats, time_s: Floats) -> None:
-        """Add errors, weights and times."""
-        weighted = np.einsum("ijn,jn->in", weight, error)
-        self.count += error.shape[1]
-        self.error = self.error + error.sum(axis=1)
-        self.weighted = self.weighted + weighted.sum(axis=1)
-        self.weight = self.weight + weight.sum(axis=2)
-        self.squared += float(np.vdot(error, error))
-        self.nees += float(np.vdot(error, weighted))
-        self.time += float(time_s.sum())
-        self.time_squared += float(time_s @ time_s)
-        self.timed = self.timed + error @ time_s
-
-    def merge(self, other: "FrameSums") -> None:
-        """Add the sums of other runs."""
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
-
-    def constant(self, *, turns: bool) -> Constant | None:
-        """Return the mean error if it dominates, is constant and explains the NEES; otherwise None."""
-        if not self.count or not self.squared:
-            return None
-        mean = self.error / self.count
-        nees = self.nees / self.count
-        rest = nees + (mean @ self.weight @ mean - 2.0 * mean @ self.weighted) / self.count
-        left = self.squared - self.count * mean @ mean
-        spread = self.time_squared - self.time**2 / self.count
-        slope = self.timed - self.time * mean
-        drifts = spread > 0.0 and slope @ slope > DRIFTS * spread * left
-        share = self.count * float(mean @ mean) / self.squared
-        explains = rest < HALVED * nees and rest < max(EXPLAINED * len(mean), TENTH * nees)
-        if share <= SHARE or drifts or not explains:
-            return None
-        return Constant(turns, mean, share, nees, max(float(rest), 0.0))
-
-
-@dataclass
-class ConstantSums:
-    """Sums of the position errors of a stream of estimates, in the fixed frame and the body's frame."""
-
-    fixed: FrameSums = field(default_factory=FrameSums)
-    turned: FrameSums = field(default_factory=FrameSums)
+    numbers: Floats = field(default_factory=lambda: np.zeros(4))
+    frames: Floats = field(default_factory=lambda: np.zeros((2, 15)))
 
     def add(self, errors: Errors) -> None:
         """Add a block. Bounds have no errors; estimates without a position have no origin."""
@@ -112,19 +64,20 @@ class ConstantSums:
         known = np.isfinite(errors.nees)
         if not known.all():
             errors = errors_at(errors, known)
-        error = np.array([errors.error[:, axis] for axis in place])
-        covariance = np.array([[errors.covariance[:, i, j] for j in place] for i in place])
-        weight = _inverse(covariance)
-        self.fixed.add(error, weight, errors.elapsed_s)
-        if errors.heading_rad is not None:
-            weight = weight.swapaxes(0, 1).copy()  # symmetric, except for rounding
-            _turn(np.cos(errors.heading_rad), np.sin(errors.heading_rad), error, weight)
-            self.turned.add(error, weight, errors.elapsed_s)
+        self.axes, self.count = len(place), self.count + len(errors.nees)
+        heading_rad = errors.heading_rad
+        if heading_rad is None:
+            heading_rad = np.zeros(len(errors.nees))
+        turn = np.cos(heading_rad), np.sin(heading_rad)
+        of_rows = errors.error, errors.covariance, *turn, errors.elapsed_s
+        _add_sums(*of_rows, np.array(place), self.numbers, self.frames)
 
     def merge(self, other: "ConstantSums") -> None:
         """Add the sums of other runs."""
-        self.fixed.merge(other.fixed)
-        self.turned.merge(other.turned)
+        self.axes = self.axes or other.axes
+        self.count += other.count
+        self.numbers += other.numbers
+        self.frames += other.frames
 
     def found(self) -> Constant | None:
         """Find a constant error, if any, in the frame in which it explains more of the error.
@@ -132,46 +85,111 @@ class ConstantSums:
         If the body never rotates, the frames cannot be distinguished, and the error is treated as a
         different origin.
         """
-        fixed, turned = self.fixed.constant(turns=False), self.turned.constant(turns=True)
+        fixed, turned = self._constant(turns=False), self._constant(turns=True)
         if fixed is None or turned is None:
             return fixed or turned
         return turned if turned.share > fixed.share else fixed
 
+    def _constant(self, *, turns: bool) -> Constant | None:
+        """Return the mean error if it dominates, is constant and explains the NEES; otherwise None."""
+        count, (squared, nees, time, time_squared) = self.count, self.numbers.tolist()
+        error, weighted, timed, *_ = self.frames[int(turns)].reshape(5, 3)
+        weight = self.frames[int(turns), 9:][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        if not count or not squared:
+            return None
+        mean, nees = error / count, nees / count
+        rest = nees + (mean @ weight @ mean - 2.0 * mean @ weighted) / count
+        left = squared - count * mean @ mean
+        spread = time_squared - time**2 / count
+        slope = timed - time * mean
+        drifts = spread > 0.0 and slope @ slope > DRIFTS * spread * left
+        share = count * float(mean @ mean) / squared
+        explains = rest < HALVED * nees and rest < max(EXPLAINED * self.axes, TENTH * nees)
+        if share <= SHARE or drifts or not explains:
+            return None
+        return Constant(turns, mean[: self.axes], share, nees, max(float(rest), 0.0))
 
-def _inverse(covariance: Floats) -> Floats:
-    """Invert covariances (axes, axes, n); an infinite variance has weight zero."""
-    if len(covariance) > 2:
-        finite = np.where(np.isfinite(covariance), covariance, 1e300)
-        return np.moveaxis(np.linalg.inv(np.moveaxis(finite, 2, 0)), 0, 2)
-    (a, b), (_, c) = covariance
-    if not np.isfinite(a + c).all():
-        a, c = (np.where(np.isfinite(each), each, 1e150) for each in (a, c))
-        b = np.where(np.isfinite(b), b, 0.0)
-    weight, determinant = np.empty(covariance.shape), a * c - b * b
-    weight[0, 0], weight[1, 1] = c / determinant, a / determinant
-    weight[0, 1] = weight[1, 0] = -b / determinant
-    return weight
 
-
-def turn(cosine: Floats, sine: Floats, error: Floats, weight: Floats) -> None:
-    """Rotate errors (axes, n) and weights (axes, axes, n) into the frames of bodies, in place.
+def add_sums(
+    errors: Floats,
+    covariances: Floats,
+    cosine: Floats,
+    sine: Floats,
+    time_s: Floats,
+    place: NDArray[np.int64],
+    numbers: Floats,
+    frames: Floats,
+) -> None:
+    """Add position errors to the sums in both frames; an infinite variance has weight zero.
 
     Args:
+        errors, covariances: (n, d) and (n, d, d).
         cosine, sine: (n,) of the headings.
-        error: (axes, n).
-        weight: (axes, axes, n).
+        time_s: (n,).
+        place: (axes,), components of the position.
+        numbers, frames: the sums, see `ConstantSums`.
     """
-    axes = len(error)
-    for row in range(len(cosine)):
+    i, j, k = place[0], place[1], place[len(place) - 1]
+    for row in range(len(errors)):
+        x, y, z = errors[row, i], errors[row, j], 0.0
+        a, b, c = covariances[row, i, i], covariances[row, i, j], covariances[row, j, j]
+        p, q, zz = 0.0, 0.0, 0.0
+        if len(place) > 2:
+            z, p, q = errors[row, k], covariances[row, i, k], covariances[row, j, k]
+            zz = 1.0 / covariances[row, k, k]
+        if np.isinf(a) or np.isinf(c):
+            b, p, q = 0.0, 0.0 if np.isinf(a) else p, 0.0 if np.isinf(c) else q
+            a, c = min(a, 1e150), min(c, 1e150)
+        if zz == 0.0:
+            p, q = 0.0, 0.0
+        a, b, c = a - p * p * zz, b - p * q * zz, c - q * q * zz
+        determinant = a * c - b * b
+        xx, xy, yy = c / determinant, -b / determinant, a / determinant
+        xz, yz = -(xx * p + xy * q) * zz, -(xy * p + yy * q) * zz
+        zz -= (xz * p + yz * q) * zz
+        time = time_s[row]
+        numbers[0] += x * x + y * y + z * z
+        numbers[1] += add_error(frames[0], time, x, y, z, xx, xy, xz, yy, yz, zz)
+        numbers[2] += time
+        numbers[3] += time * time
         c, s = cosine[row], sine[row]
-        x, y = error[0, row], error[1, row]
-        error[0, row], error[1, row] = c * x + s * y, c * y - s * x
-        for axis in range(axes):
-            x, y = weight[axis, 0, row], weight[axis, 1, row]
-            weight[axis, 0, row], weight[axis, 1, row] = c * x + s * y, c * y - s * x
-        for axis in range(axes):
-            x, y = weight[0, axis, row], weight[1, axis, row]
-            weight[0, axis, row], weight[1, axis, row] = c * x + s * y, c * y - s * x
+        x, y, xz, yz = c * x + s * y, c * y - s * x, c * xz + s * yz, c * yz - s * xz
+        both, apart = 2.0 * c * s * xy, c * s * (yy - xx) + (c * c - s * s) * xy
+        xx, yy = c * c * xx + both + s * s * yy, s * s * xx - both + c * c * yy
+        add_error(frames[1], time, x, y, z, xx, apart, xz, yy, yz, zz)
 
 
-_turn = compiled(turn)
+def add_error(
+    sums: Floats,
+    time_s: float,
+    x: float,
+    y: float,
+    z: float,
+    xx: float,
+    xy: float,
+    xz: float,
+    yy: float,
+    yz: float,
+    zz: float,
+) -> float:
+    """Add an error e = (x, y, z) and its weight W to the sums in a frame (15,), and return e' W e."""
+    u, v, w = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+    sums[0] += x
+    sums[1] += y
+    sums[2] += z
+    sums[3] += u
+    sums[4] += v
+    sums[5] += w
+    sums[6] += time_s * x
+    sums[7] += time_s * y
+    sums[8] += time_s * z
+    sums[9] += xx
+    sums[10] += xy
+    sums[11] += xz
+    sums[12] += yy
+    sums[13] += yz
+    sums[14] += zz
+    return x * u + y * v + z * w
+
+
+_add_sums = compiled(add_sums)

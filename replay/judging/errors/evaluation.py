@@ -8,7 +8,7 @@ Estimation with Applications to Tracking and Navigation, 5.4.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from fuselog.replay.engine.vectors.components import (
     match_tangent,
     stated_components,
 )
-from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.covariances import errors_squared
 from fuselog.replay.engine.vectors.tangent import (
     WIDTHS,
     are_kinds,
@@ -76,6 +76,7 @@ class Errors:
         is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
             the smallest possible squared errors.
         heading_rad: (n,) the true heading; None if truth and estimate have none.
+        position_nees: (n,) NEES of the position; None if it was not computed together with `nees`.
     """
 
     estimator: str
@@ -93,8 +94,9 @@ class Errors:
     components_without_truth: tuple[str, ...] = ()
     is_bound: bool = False
     heading_rad: Floats | None = None
+    position_nees: Floats | None = None
 
-    @property
+    @cached_property
     def squared(self) -> Floats:
         """Return squared errors (n, d), or smallest possible ones for a bound; infinite on overflow."""
         with np.errstate(over="ignore"):
@@ -122,6 +124,7 @@ class Errors:
 
 # The fields of `Errors` with one entry per estimate.
 PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
+MAY_BE_NONE = ("heading_rad", "position_nees")
 
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
@@ -131,9 +134,9 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
         errors: errors of an ensemble.
         rows: (n,), whether a row is selected.
     """
-    columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
-    heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
-    return replace(errors, **columns, heading_rad=heading_rad)
+    given: dict[str, Any] = {name: getattr(errors, name) for name in (*PER_ROW, *MAY_BE_NONE)}
+    columns = {name: each[rows] for name, each in given.items() if each is not None}
+    return replace(errors, **columns)
 
 
 class Innovations(NamedTuple):
@@ -286,8 +289,9 @@ def errors_of(
     truth = states_of_runs(there, time_ns, offsets, kinds, gap_limit_s)
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, judged, where)
-    mean = stream["mean"].reshape(len(stream), len(components))[:, columns]
-    error = np.ascontiguousarray(difference(mean, truth, kinds))  # its layout decides how sums round
+    mean = stream["mean"].reshape(len(stream), len(components))
+    mean = mean if columns == list(range(len(components))) else mean[:, columns]
+    error = difference(mean, truth, kinds)
     tangent = tangent_components(names, kinds)
     size = len(tangent_components(list(components), list(components.values())))
     is_known = over_columns(np.logical_and, np.isfinite(error))
@@ -301,7 +305,9 @@ def errors_of(
     if rows != list(range(size)):
         covariance = covariance[:, rows][:, :, rows]
     is_bound = BOUND in stream.metadata
-    nees = normalized_error_squared(error[known], covariance)
+    places = [index for index, (name, _) in enumerate(tangent) if name in POSITION]
+    leading = len(places) if places == list(range(len(places))) else 0
+    nees, position_nees = errors_squared(error[known], covariance, leading)
     return Errors(
         *split_topic(stream.topic),
         tuple(name for name, _ in tangent),
@@ -317,6 +323,7 @@ def errors_of(
         lacking,
         is_bound,
         _heading_of(truth[known], judged),
+        position_nees if leading else None,
     )
 
 

@@ -109,8 +109,10 @@ def _add_nees(state: Consistent, errors: Errors) -> Consistent:
     state.missing += len(finite) - len(nees)
     state.components = len(errors.components)
     if errors.position and len(errors.position) < len(errors.components):
-        block = errors.covariance[:, errors.position][:, :, errors.position]
-        squared = normalized_error_squared(errors.error[:, errors.position], block)
+        squared = errors.position_nees
+        if squared is None:
+            block = errors.covariance[:, errors.position][:, :, errors.position]
+            squared = normalized_error_squared(errors.error[:, errors.position], block)
         known = squared[np.isfinite(squared)]
         state.places += len(known)
         state.of_places += float(known.sum())

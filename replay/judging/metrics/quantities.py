@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.judging.errors.constant import ConstantSums
@@ -83,7 +84,19 @@ def fill_columns(
         columns[row, 3 + size], columns[row, 4 + size] = trace, of_square
 
 
-_fill_columns = compiled(fill_columns)
+def fill_innovations(
+    accepted: NDArray[np.bool_], degrees: Integers, squared: Floats, stated: Floats, columns: Floats
+) -> None:
+    """Fill the rows (n, 5) to sum for innovations (n,); see `OfRuns`."""
+    for row in range(len(columns)):
+        is_accepted = accepted[row]
+        columns[row, 0], columns[row, 1] = float(is_accepted), float(degrees[row])
+        columns[row, 2] = float(degrees[row]) if is_accepted else 0.0
+        columns[row, 3] = squared[row]
+        columns[row, 4] = stated[row] if is_accepted else 0.0
+
+
+_fill_columns, _fill_innovations = compiled(fill_columns), compiled(fill_innovations)
 
 
 class OfRuns(NamedTuple):
@@ -114,11 +127,9 @@ class InnovationSums:
     def add(self, innovations: Innovations) -> None:
         """Add a block."""
         stated, accepted = innovations.log_likelihood, innovations.accepted
-        accepted_likelihood = np.where(accepted, np.nan if stated is None else stated, 0.0)
-        degrees = innovations.degrees
         columns = np.empty((len(accepted), len(OfRuns._fields) - 1))
-        columns[:, 0], columns[:, 1], columns[:, 2] = accepted, degrees, degrees * accepted
-        columns[:, 3], columns[:, 4] = innovations.squared, accepted_likelihood
+        stated = np.full(len(columns), np.nan) if stated is None else stated
+        _fill_innovations(accepted, innovations.degrees, innovations.squared, stated, columns)
         self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
 
     def merge(self, other: "InnovationSums") -> None:

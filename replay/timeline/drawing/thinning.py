@@ -11,7 +11,7 @@ from fuselog.recorders.log import Clock, Field, RunMetadata, Stream, Topic, sche
 from fuselog.recorders.log.impossible import Rejections
 from fuselog.replay.engine.streams.failures import join_streams
 from fuselog.replay.engine.streams.sources import Source, is_sensed
-from fuselog.replay.judging.errors.evaluation import PER_ROW, Errors, Floats, errors_at
+from fuselog.replay.judging.errors.evaluation import MAY_BE_NONE, PER_ROW, Errors, Floats, errors_at
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 
 Times = NDArray[np.int64]
@@ -160,9 +160,9 @@ def curves_of(stream: Stream) -> Iterator[tuple[Field, Floats]]:
 def _joined_errors(parts: Sequence[Errors]) -> Errors:
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_ROW
-    }
+    } | dict.fromkeys(MAY_BE_NONE)
     count = sum(part.without_truth for part in parts)
-    return replace(parts[-1], without_truth=count, heading_rad=None, **joined)
+    return replace(parts[-1], without_truth=count, **joined)
 
 
 class Thin:

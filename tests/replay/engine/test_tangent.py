@@ -73,10 +73,10 @@ def test_interpolation_is_slerp_by_the_short_way():
     generator = np.random.default_rng(1)
     ends = Rotation.random(2, rng=generator)
     weight = np.linspace(0.0, 1.0, 7)
-    left, right = (np.tile(end, (7, 1)) for end in as_array(ends))
+    left, right = np.zeros(7, int), np.ones(7, int)
     expected = as_array(Slerp([0.0, 1.0], ends)(weight))
     for sign in (1.0, -1.0):
-        found = between(left, sign * right, weight, QUATERNION)
+        found = between(as_array(ends) * [[1.0], [sign]], left, right, weight, QUATERNION)
         np.testing.assert_allclose(np.abs((found * expected).sum(axis=1)), 1.0, atol=1e-14)
 
 
@@ -95,7 +95,7 @@ def test_kinds_of_one_state_stand_side_by_side():
         "line_rad",
     ]
     states = np.array([[1.0, 1, 0, 0, 0, 3.0, 1, 0], [3.0, 0, 1, 0, 0, -3.0, 0, 1]])
-    half = between(states[:1], states[1:], np.array([0.5]), mixed)[0]
+    half = between(states, np.array([0]), np.array([1]), np.array([0.5]), mixed)[0]
     np.testing.assert_allclose(half[:5], [2.0, 0.5**0.5, 0.5**0.5, 0, 0], atol=1e-12)
     assert abs(half[5]) == pytest.approx(np.pi)
 

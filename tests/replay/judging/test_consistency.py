@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fuselog.replay.engine.vectors.covariances import normalized_error_squared
+from fuselog.replay.engine.vectors.covariances import errors_squared, normalized_error_squared
 from fuselog.replay.judging.consistency.consistency import (
     component_error_squared,
     dilution_of_precision,
@@ -33,6 +33,20 @@ def test_singular_covariance_is_nan_and_the_rest_goes_on() -> None:
     nees = normalized_error_squared(np.array([[1.0, 2.0]]), covariance)
     np.testing.assert_allclose(nees, [np.nan, np.nan, 1e9 + 1.0, 5.0])
     assert np.isnan(normalized_error_squared(np.empty((1, 0)), np.empty((1, 0, 0)))).all()
+
+
+def test_the_nees_of_leading_components_is_that_of_their_block() -> None:
+    """To the last bit, also if the whole covariance is singular."""
+    rng = np.random.default_rng(4)
+    factor, error = rng.normal(size=(50, 4, 4)), rng.normal(size=(50, 4))
+    covariance = factor @ factor.swapaxes(1, 2)
+    covariance[0, 3], covariance[0, :, 3] = covariance[0, 2], covariance[0, :, 2]
+    covariance[1, 1, 1] = np.inf
+    whole, leading = errors_squared(error, covariance, 2)
+    assert np.isnan(whole[0])
+    block = covariance[:, :2, :2]
+    np.testing.assert_array_equal(whole, normalized_error_squared(error, covariance))
+    np.testing.assert_array_equal(leading, normalized_error_squared(error[:, :2], block))
 
 
 def test_ellipse_area() -> None:

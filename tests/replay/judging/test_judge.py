@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 
 from fuselog.recorders.log import Clock, Schema, Stream, make_stream, schemas
 from fuselog.recorders.recording import record_run
@@ -19,13 +20,14 @@ from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.failures import reason_stream
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.judging.diagnostics import Diagnostics
-from fuselog.replay.judging.errors.constant import _inverse
+from fuselog.replay.judging.errors.constant import _add_sums
 from fuselog.replay.judging.errors.evaluation import chi_square_interval, rmse_interval
 from fuselog.replay.judging.errors.moments import Moments, worst_of
 from fuselog.replay.judging.errors.truths import Truths
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.sums import BinnedSums
 
+Floats = NDArray[np.float64]
 GAP_S = 0.2
 
 
@@ -329,4 +331,41 @@ def test_an_infinite_variance_weighs_nothing(axes: int) -> None:
         given[axis, axis] = np.inf
         rest = np.ix_(*2 * [np.arange(axes) != axis])
         wanted[rest] = np.linalg.inv(covariance[rest])
-        assert_allclose(_inverse(given[..., None])[..., 0], wanted, atol=1e-12)
+        weight = constant_sums(np.zeros((1, axes)), given[None], np.zeros(1), np.zeros(1))[0][-1]
+        assert_allclose(weight[:axes, :axes], wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_sums_of_a_constant_error_are_those_of_errors_in_both_frames(axes: int) -> None:
+    rng = np.random.default_rng(2)
+    error, heading_rad, time_s = rng.normal(size=(6, axes)), rng.uniform(-3, 3, 6), rng.uniform(0, 9, 6)
+    factor = rng.normal(size=(6, axes, axes))
+    covariance = factor @ factor.swapaxes(1, 2) + 0.1 * np.eye(axes)
+    for headings, found in zip(
+        (np.zeros(6), heading_rad), constant_sums(error, covariance, heading_rad, time_s), strict=True
+    ):
+        turn = np.tile(np.eye(axes), (6, 1, 1))
+        turn[:, :2, :2] = np.moveaxis(
+            [[np.cos(headings), np.sin(headings)], [-np.sin(headings), np.cos(headings)]], 2, 0
+        )
+        own = np.einsum("nij,nj->ni", turn, error)
+        weight = turn @ np.linalg.inv(covariance) @ turn.swapaxes(1, 2)
+        weighted = np.einsum("nij,nj->ni", weight, own)
+        numbers = np.vdot(own, own), np.vdot(own, weighted), time_s.sum(), time_s @ time_s
+        assert_allclose(found[0], numbers, rtol=1e-9)
+        assert_allclose(found[1][:axes], own.sum(axis=0), rtol=1e-9)
+        assert_allclose(found[2][:axes], weighted.sum(axis=0), rtol=1e-9)
+        assert_allclose(found[3][:axes], time_s @ own, rtol=1e-9)
+        assert_allclose(found[4][:axes, :axes], weight.sum(axis=0), rtol=1e-9)
+
+
+def constant_sums(
+    error: Floats, covariance: Floats, heading_rad: Floats, time_s: Floats
+) -> list[tuple[Floats, ...]]:
+    """The numbers and the sums of e, W e, t e and W in the fixed frame and in the body's frame."""
+    numbers, frames = np.zeros(4), np.zeros((2, 15))
+    place = np.arange(error.shape[1])
+    turn = np.cos(heading_rad), np.sin(heading_rad)
+    _add_sums(error, covariance, *turn, time_s, place, numbers, frames)
+    places = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+    return [(numbers, *each[:9].reshape(3, 3), each[9:][places]) for each in frames]
