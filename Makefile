@@ -29,9 +29,11 @@ test: .venv/with-test
 test-fast: .venv/with-test
 	$(MAKE) -j2 fast-tests lint
 
-# one thread per process: with more threads, the matrix products of NumPy, SciPy and scikit-learn block one another
+# one thread per process: with more threads, the matrix products of NumPy, SciPy and scikit-learn block one another,
+# and kernels of short logs take longer to hand over than to run
 all-tests fast-tests keep-numbers: export OPENBLAS_NUM_THREADS = 1
 all-tests fast-tests keep-numbers: export OMP_NUM_THREADS = 1
+all-tests fast-tests keep-numbers: export NUMBA_NUM_THREADS = 1
 
 all-tests: .venv/with-test
 	$(BIN)/pytest -n logical --dist loadfile

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
-from fuselog.recorders.compiling.compile import use_cores
+from fuselog.recorders.compiling.compile import core_count, use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
 from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
 from fuselog.recorders.remote.paths import RemotePath, state_of
@@ -123,9 +123,9 @@ def inline_pool() -> Iterator[WorkerPool]:
 
 @contextmanager
 def threads() -> Iterator[WorkerPool]:
-    """Open a pool of threads, one per core, for work whose kernels run in parallel."""
-    count = os.cpu_count() or 1
-    with ThreadPoolExecutor(count) as pool:
+    """Open a pool of threads, one per core for kernels, for work whose kernels run in parallel."""
+    count = core_count()
+    with InlineExecutor() if count == 1 else ThreadPoolExecutor(count) as pool:
         yield WorkerPool(pool, count)
 
 

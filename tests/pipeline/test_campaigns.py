@@ -262,6 +262,14 @@ CORES_THERE = (
 )
 
 
+@pytest.fixture
+def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No variable states the number of cores, as in a user's shell."""
+    for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.usefixtures("all_cores")
 def test_a_worker_uses_one_core() -> None:
     """Also in SciPy, whose library is another than NumPy's and is loaded later."""
     with processes(1)() as pool:
@@ -475,10 +483,9 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, monkeypatch):
 
 
 @pytest.mark.paper
-def test_a_dask_worker_uses_one_core_also_when_it_was_started_again(monkeypatch) -> None:
+@pytest.mark.usefixtures("all_cores")
+def test_a_dask_worker_uses_one_core_also_when_it_was_started_again() -> None:
     distributed = pytest.importorskip("distributed")
-    for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        monkeypatch.delenv(name, raising=False)
     with pool_for(None, "local:1", RUNS)() as pool:
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
         distributed.get_client().restart()

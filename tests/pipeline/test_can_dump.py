@@ -74,12 +74,11 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
 
 
 @pytest.mark.paper
-def test_two_faults_of_the_dump_are_named_first(fuselog: Callable[..., Any], tmp_path: Path) -> None:
-    """The settings are all in the first three sentences; of more faults test_battery.py tells."""
-    car = FAULTS["lever (2, .6) m"](FAULTS["speed x 3.6"](drive(3)))
-    found = fl.diagnose(imported(car, tmp_path, fuselog), "ekf").sentences
-    told = " ".join(each.setting for each in found[:3])
-    first = dict(each.split("=") for each in told.split())
-    right = {"/odometry.forward_scale": 1 / 3.6, "lever_x_m": 2.0, "lever_y_m": 0.6}
-    for key, value in right.items():
-        assert float(first[key]) == pytest.approx(value, rel=0.4)
+def test_the_fault_of_the_dump_is_named_first(fuselog: Callable[..., Any], tmp_path: Path) -> None:
+    """`test_battery.py` has all other faults, and several at once."""
+    car = FAULTS["lever (2, .6) m"](drive(3))
+    found = fl.diagnose(imported(car, tmp_path, fuselog), "ekf").sentences[0]
+    told = {
+        key: float(value) for key, _, value in (each.partition("=") for each in found.setting.split())
+    }
+    assert told == pytest.approx({"lever_x_m": 2.0, "lever_y_m": 0.6}, rel=0.4)

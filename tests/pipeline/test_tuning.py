@@ -1,6 +1,5 @@
 """Tuning: the reference sheet's numbers, what logs cannot tell, and what is refused."""
 
-import os
 import pickle
 import re
 import shlex
@@ -487,11 +486,11 @@ def test_folds_and_a_grid(seen: list[fl.MemorySource]) -> None:
 
 @pytest.mark.paper
 def test_any_number_of_cores_finds_the_same(
-    seen: list[fl.MemorySource], monkeypatch: pytest.MonkeyPatch
+    seen: list[fl.MemorySource], on_cores: Callable[[int], None]
 ) -> None:
     found = []
     for cores in (1, 5):
-        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        on_cores(cores)
         tuned = fl.tune(seen, "ekf", ["sigma_range_m", "bias_range_m"], set={"sigma_range_m": 0.5})
         found.append((tuned.found.optimum.tobytes(), tuned.standard_errors.tobytes()))
     assert found[0] == found[1]
