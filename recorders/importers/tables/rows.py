@@ -234,20 +234,14 @@ class Rows:
         is_odd = np.isinf(found)
         if self.table.is_text:
             is_odd |= np.isnan(found) & cells.is_valid().to_numpy(zero_copy_only=False)
-        self._tell(
-            f"{self.path.name}: {column}",
-            "cells that are not numbers, read as missing",
-            int(is_odd.sum()),
-        )
+        self._tell_missing(column, "cells that are not numbers", is_odd)
         return np.where(is_odd, np.nan, found)
 
     def _prepared(self, column: str, found: NDArray, sides: pa.Array | None) -> NDArray:
         """Remove codes of missing values from a column (n,), convert minutes, and apply hemispheres."""
         for code in self._missing.get(column, []):
             is_missing = found == code
-            self._tell(
-                f"{self.path.name}: {column}", f"{code:g}, read as missing", int(is_missing.sum())
-            )
+            self._tell_missing(column, f"{code:g}", is_missing)
             found = np.where(is_missing, np.nan, found)
         if column in self._in_minutes:
             size = np.abs(found)
@@ -271,11 +265,7 @@ class Rows:
                     f"says '{letters[row]}'; remove it from hemispheres if it already has signs"
                 )
             unknown = ~(is_south | is_north) & np.isfinite(found)
-            self._tell(
-                f"{self.path.name}: {column}",
-                "without a hemisphere, read as missing",
-                int(unknown.sum()),
-            )
+            self._tell_missing(column, "without a hemisphere", unknown)
             found = np.where(is_south, -np.abs(found), np.where(is_north, found, np.nan))
         return found
 
@@ -607,6 +597,9 @@ class Rows:
         )
 
     # Notes.
+
+    def _tell_missing(self, column: str, what: str, which: NDArray[np.bool_]) -> None:
+        self._tell(f"{self.path.name}: {column}", f"{what}, read as missing", int(which.sum()))
 
     def _tell(self, subject: str, fact: str, count: int) -> None:
         if count:
