@@ -75,8 +75,7 @@ def compare_candidates(
     if save is not None:
         found.draw(save)
         written.append(save)
-    for note in found.notes:
-        warn(note)
+    warn(*found.notes)
     if worse:
         warn("worse than the first: " + ", ".join(f"{each.second} in {each.quantity}" for each in worse))
     if as_json:
@@ -96,12 +95,9 @@ def compare_candidates(
         columns = [title.format(first=first, second=second) for title in COLUMNS.values()]
         title = " ".join(filter(None, (str(case_), f"{second} against {first}")))
         print_table(columns, rows[list(COLUMNS)].to_numpy().tolist(), title)
-    for sentence in found.sentences:
-        say(sentence)
-    for sentence in [NOT_TESTED] if found.stress is None else found.stress.sentences:
-        say(sentence)
-    for path in written:
-        say(str(path))
+    say(*found.sentences)
+    say(*([NOT_TESTED] if found.stress is None else found.stress.sentences))
+    say(*map(str, written))
     if not labels and all(each.is_dir() or each.suffix == ".mcap" for each in given):
         say(f"to see the runs with all of them: fuselog view {shlex.join(map(str, given))}")
     return not worse
