@@ -52,5 +52,4 @@ def show_ellipsoid(
         )
         return
     print_table(("parameter", "value", "95 % from", "to"), table.to_numpy().tolist())
-    for sentence in [*found.notes, *written]:
-        say(sentence)
+    say(*found.notes, *written)

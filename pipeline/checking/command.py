@@ -107,8 +107,7 @@ def check_path(
             }
         )
         return not done.found
-    for sentence in done.sentences:
-        say(sentence)
+    say(*done.sentences)
     if done.found:
         say(f"{len(done.found)} of {sum(done.fields.values())} fields differ from {golden}")
     else:

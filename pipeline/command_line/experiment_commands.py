@@ -115,8 +115,7 @@ def run_named(
     print_metrics(result.metrics, result.bounds, table, str(details))
     print_others(result.alarms)
     print_claims(result.claims)
-    for words in [word for each in result.stress for word in each.words]:
-        say(words)
+    say(*(word for each in result.stress for word in each.words))
     if not result.stress and result.settings.get("estimators"):
         say(NOT_TESTED)
     say(f"{done.folder}: {', '.join(result.contents)}")

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from fuselog.pipeline.api.over_logs import Replaying, campaign_of
-from fuselog.pipeline.comparing.comparing import Differences, compare
+from fuselog.pipeline.comparing.comparing import Differences, Paired, compare
 from fuselog.pipeline.comparing.groups import recorded_labels, with_logs_of_folders
 from fuselog.pipeline.comparing.over_logs import compare_over_logs
-from fuselog.pipeline.comparing.paired import Paired
 from fuselog.pipeline.output.alarms import NOT_TESTED
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.terminal import print_json, print_table, progress, say, warn
@@ -127,8 +126,7 @@ def _show(
     as_json: bool,
 ) -> None:
     """Print the differences, the verdicts and the notes."""
-    for note in found.notes:
-        warn(note)
+    warn(*found.notes)
     if worse:
         warn("worse than the first: " + ", ".join(f"{each.second} in {each.quantity}" for each in worse))
     if as_json:
@@ -148,9 +146,6 @@ def _show(
         columns = [title.format(first=first, second=second) for title in COLUMNS.values()]
         title = " ".join(filter(None, (str(case_), f"{second} against {first}")))
         print_table(columns, rows[list(COLUMNS)].to_numpy().tolist(), title)
-    for sentence in found.sentences:
-        say(sentence)
-    for sentence in stress_tests:
-        say(sentence)
-    for path in written:
-        say(str(path))
+    say(*found.sentences)
+    say(*stress_tests)
+    say(*map(str, written))

@@ -5,70 +5,48 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from fuselog.recorders.log import Clock, RunMetadata, Stream, Topic
-from fuselog.recorders.log.impossible import Rejections
-from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.streams.sources import DerivedSource
 
 
 @dataclass(frozen=True)
-class Renamed:
+class Renamed(DerivedSource):
     """A source that reads the estimates of one label on demand, under another name."""
 
-    estimates: Source
     label: str
-    of: str
-
-    @property
-    def name(self) -> str:
-        """Return the name of the estimates."""
-        return self.estimates.name
+    to: str
 
     @property
     def run(self) -> RunMetadata:
         """Return the run's description."""
-        return self.estimates.run or RunMetadata("unknown", epoch_ns=self.epoch_ns)
-
-    @property
-    def epoch_ns(self) -> int:
-        """Return the run's time zero."""
-        return self.estimates.epoch_ns
-
-    @property
-    def start_ns(self) -> int | None:
-        """Return the start of the span."""
-        return self.estimates.start_ns
-
-    @property
-    def rejections(self) -> Rejections:
-        """Return the counts of messages that were rejected when the estimates were read."""
-        return self.estimates.rejections
+        return self.of.run or RunMetadata("unknown", epoch_ns=self.epoch_ns)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
         """Return the label's topics."""
         return {
             self._new(name): replace(topic, name=self._new(name))
-            for name, topic in self.estimates.topics.items()
+            for name, topic in self.of.topics.items()
             if name.startswith(f"/estimates/{self.label}/")
         }
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
         """Read whole topics, in publish-time order."""
-        return self._renamed(self.estimates.read([self._old(topic) for topic in topics]))
+        return self._renamed(self.of.read([self._old(topic) for topic in topics]))
 
     def empty(self, topic: str) -> Stream:
         """Return the topic without its messages."""
-        return replace(self.estimates.empty(self._old(topic)), topic=topic)
+        return replace(self.of.empty(self._old(topic)), topic=topic)
 
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Yield successive blocks of topics."""
         own = [self._old(topic) for topic in topics]
-        return map(self._renamed, self.estimates.blocks(own, order, block_messages))
+        return map(self._renamed, self.of.blocks(own, order, block_messages))
 
     def whole(self) -> "Renamed":
         """Return the whole run, not limited to a span."""
-        return replace(self, estimates=self.estimates.whole())
+        return replace(self, of=self.of.whole())
 
     def _renamed(self, streams: Mapping[str, Stream]) -> dict[str, Stream]:
         return {
@@ -76,7 +54,7 @@ class Renamed:
         }
 
     def _new(self, topic: str) -> str:
-        return f"/estimates/{self.of}/{topic.removeprefix(f'/estimates/{self.label}/')}"
+        return f"/estimates/{self.to}/{topic.removeprefix(f'/estimates/{self.label}/')}"
 
     def _old(self, topic: str) -> str:
-        return f"/estimates/{self.label}/{topic.removeprefix(f'/estimates/{self.of}/')}"
+        return f"/estimates/{self.label}/{topic.removeprefix(f'/estimates/{self.to}/')}"

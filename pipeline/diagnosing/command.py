@@ -108,8 +108,7 @@ def diagnose_log(
                 for row in found.tried.to_dict("records")
             ],
         )
-    for sentence in [*found.told, *found.notes, *written]:
-        say(sentence)
+    say(*found.told, *found.notes, *written)
 
 
 def diagnose_selection(

@@ -1,6 +1,7 @@
 """Tests of whether NIS and NEES are those of a consistent filter."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +32,8 @@ def unseen_errors(done: Replay, *, has_causes: bool) -> Iterator[Finding]:
     if has_causes:
         remedy = "fix the causes above first, then check again"
     for each in unseen(done.judge):
-        words = f"{each.case or 'the estimate'}: {each.evidence}"
-        yield Finding("unseen error", _truth(each.case), "", each.nees, words, otherwise=remedy)
+        words = f"{each.part or 'the estimate'}: {each.evidence}"
+        yield replace(each, where=_truth(each.part), part="", evidence=words, otherwise=remedy)
 
 
 def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) -> dict[str, str]:

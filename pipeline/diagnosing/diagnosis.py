@@ -58,8 +58,7 @@ from fuselog.pipeline.runs.estimates import (
     source_of_estimates,
     stated_estimators,
 )
-from fuselog.pipeline.tuning.measured import until_last_measured
-from fuselog.pipeline.tuning.objective import for_likelihood
+from fuselog.pipeline.tuning.objective import for_likelihood, until_last_measured
 from fuselog.pipeline.tuning.tuning import OPEN, gate_of
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers

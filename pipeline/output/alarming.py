@@ -67,21 +67,7 @@ class _Range(NamedTuple):
         return OF_DIVERGENCE if self.of.has_diverged else REASONS[self.of.verdict]
 
 
-class Unseen(NamedTuple):
-    """An error of an estimator, such as a slowly changing bias, that its innovations do not show."""
-
-    estimator: str
-    case: str
-    nees: float
-    evidence: str
-
-    @property
-    def name(self) -> str:
-        """Return the estimator and the case."""
-        return _name(self.estimator, self.case)
-
-
-def unseen(judge: Judge) -> Iterator[Unseen]:
+def unseen(judge: Judge) -> Iterator[Finding]:
     """Find errors that innovations do not show: the NEES is too large, also relative to a usual NIS."""
     for key, (_, high) in judge.bounds.items():
         estimator, quantity, case = split_metric(key)
@@ -93,7 +79,7 @@ def unseen(judge: Judge) -> Iterator[Unseen]:
                 f"NEES is {nees:.3g} (consistent up to {high:.3g}), but NIS is only {nis:.3g} per "
                 "component: the state follows an error that the innovations do not show"
             )
-            yield Unseen(estimator, case, nees, evidence)
+            yield Finding("unseen error", estimator, case, nees, evidence)
 
 
 def alarms_of(

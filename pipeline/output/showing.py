@@ -2,13 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from fuselog.pipeline.output.results import Bounds, MetricValue
 from fuselog.pipeline.output.terminal import PrintedTable, format_value, printed, tables_of
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MOST_SENTENCES = 5
 
@@ -63,7 +60,6 @@ def shown_metrics(
     sentences: Sequence[str],
     metrics: Mapping[str, MetricValue],
     bounds: Mapping[str, Bounds],
-    runs: "pd.DataFrame | None" = None,
 ) -> Shown:
     """Format metrics for display; if there are several cases, show their medians."""
-    return Shown(title, sentences, tables_of(metrics, bounds, runs, most_cases=1))
+    return Shown(title, sentences, tables_of(metrics, bounds, most_cases=1))

@@ -107,9 +107,10 @@ def status() -> Iterator[Callable[[str], None]]:
         yield show
 
 
-def say(text: str) -> None:
-    """Print a line without line breaks, so that paths stay whole."""
-    out.print(printable(text), soft_wrap=True)
+def say(*texts: str) -> None:
+    """Print lines without line breaks, so that paths stay whole."""
+    for text in texts:
+        out.print(printable(text), soft_wrap=True)
 
 
 def say_next(*words: str) -> None:
@@ -117,9 +118,10 @@ def say_next(*words: str) -> None:
     say(f"next: {shlex.join(['fuselog', *words])}")
 
 
-def warn(text: str) -> None:
-    """Print a line on standard error."""
-    err.print(printable(f"fuselog: {text}"), soft_wrap=True)
+def warn(*texts: str) -> None:
+    """Print lines on standard error."""
+    for text in texts:
+        err.print(printable(f"fuselog: {text}"), soft_wrap=True)
 
 
 def warn_of_losses(logs: "Iterable[Log]") -> None:

@@ -32,8 +32,7 @@ def show_noise(
         if as_json:
             print_json({"path": str(log), "notes": sentences})
         else:
-            for sentence in sentences:
-                say(sentence)
+            say(*sentences)
         return
     check_outputs(out, None, {"log": [log]})
     with status() as show:
@@ -55,5 +54,4 @@ def show_noise(
         )
         return
     print_table(("column", "term", "value", "95 % from", "to"), table.to_numpy().tolist())
-    for sentence in [*found.notes, *written]:
-        say(sentence)
+    say(*found.notes, *written)

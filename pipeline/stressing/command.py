@@ -58,8 +58,7 @@ def stress_logs(
         rows = found.table.replace({np.nan: None}).to_dict("records")
         print_json({"sentences": found.sentences, "changes": rows})
         return
-    for sentence in found.sentences:
-        say(sentence)
+    say(*found.sentences)
     for each in found.stressed:
         shown = [
             [CHANGES[row["change"]].words, *(_shown(row[name]) for name in COLUMNS)] for row in each.rows

@@ -93,8 +93,7 @@ def tune_logs(
     if len(found.correlation) > 1:
         rows = found.correlation.reset_index().to_numpy().tolist()
         print_table(("correlation", *found.correlation), rows)
-    for sentence in found.notes:
-        say(sentence)
+    say(*found.notes)
     for each in found.replays:
         print_metrics(plain(each.judge.metrics), each.judge.bounds, each.judge.runs_table)
     say(f"{out / SETTINGS}: settings for --settings; {out}: tables, figures, timeline, result.json")

@@ -45,6 +45,9 @@ By = Literal["likelihood", "nis", "nees", "rmse"]
 NOISE = "noise"  # key of the cost of a log's control noise, next to the topics of estimates
 INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
+# time in s for which controls are kept, so that the last measurement is between two controls
+BEYOND_NS = 1_000_000_000
+
 
 class Run(NamedTuple):
     """A log that is replayed repeatedly.
@@ -513,3 +516,31 @@ def _failures(outputs: Mapping[str, Ragged]) -> list[str]:
         if rows.stream.schema.full_name == FAILURE
         for sentence in sentences_of(rows.stream)
     ]
+
+
+def until_last_measured(
+    source: LogSource | MemorySource, bound: Sequence[Bound]
+) -> LogSource | MemorySource:
+    """Cut a log a second after its last measurement if the controls continue for longer.
+
+    Missing estimates after this time are not a failure.
+    """
+    readings = [
+        (each, each.reading())
+        for each in bound
+        if isinstance(each, Recursive) and each.reading is not None
+    ]
+    controls = {topic for _, reading in readings for topic in reading.controls}
+    measured = {topic for each, _ in readings for topic in each.streams} - controls
+    if len(readings) < len(bound) or not controls or not measured:
+        return source
+    ends_ns = [
+        int(stream.publish_time_ns.max())
+        for topic in sorted(measured)
+        for stream in source.read([topic]).values()
+        if len(stream)
+    ]
+    if not ends_ns or max(ends_ns) + BEYOND_NS >= source.extent("publish_time")[1]:
+        return source
+    end_ns = max(ends_ns) + BEYOND_NS
+    return replace(source, end_ns=end_ns if source.end_ns is None else min(end_ns, source.end_ns))

@@ -288,10 +288,10 @@ class Tuning:
         """Report large errors, such as a slowly changing bias, that the innovations do not show."""
         for replayed in self.replays:
             for each in unseen(replayed.judge):
-                if not each.estimator.startswith(START):
+                if not each.where.startswith(START):
                     yield (
-                        f"{each.name}: {each.evidence}; estimate slowly changing errors, such as a "
-                        "sensor's bias, as states"
+                        f"{each.where} {each.part}".rstrip() + f": {each.evidence}; estimate slowly "
+                        "changing errors, such as a sensor's bias, as states"
                     )
 
     def _notes_of_others(self) -> Iterator[str]:

@@ -28,7 +28,6 @@ from fuselog.pipeline.tuning.confidence import (
     with_noise,
 )
 from fuselog.pipeline.tuning.information import conditions, in_words, information, undetermined
-from fuselog.pipeline.tuning.measured import until_last_measured
 from fuselog.pipeline.tuning.objective import (
     CRITERIA,
     Best,
@@ -38,6 +37,7 @@ from fuselog.pipeline.tuning.objective import (
     is_innovation,
     log_in_memory,
     silent,
+    until_last_measured,
 )
 from fuselog.pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from fuselog.pipeline.tuning.search import (

@@ -22,8 +22,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from fuselog.recorders.importers.ros.choosing import RosParameters
 from fuselog.recorders.importers.ros.importer import read
-from fuselog.recorders.importers.ros.parameters import RosParameters
 from fuselog.recorders.recording import import_log
 from tests.bench.timing import cpu_seconds
 

@@ -31,7 +31,7 @@ from fuselog.pipeline.diagnosing.hypotheses.listing import hypotheses
 from fuselog.pipeline.diagnosing.joint import Supposed, fit
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.runs.trials import Trial
-from fuselog.pipeline.tuning.measured import until_last_measured
+from fuselog.pipeline.tuning.objective import until_last_measured
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.models.orientation import heading

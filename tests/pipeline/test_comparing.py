@@ -17,9 +17,8 @@ import tomli_w
 
 import fuselog as fl
 from fuselog.pipeline.comparing.candidates import _stored
-from fuselog.pipeline.comparing.comparing import Differences
+from fuselog.pipeline.comparing.comparing import ALL, Differences, Paired, under_stress
 from fuselog.pipeline.comparing.groups import unlike_runs
-from fuselog.pipeline.comparing.paired import ALL, Paired, under_stress
 from fuselog.pipeline.comparing.renamed import Renamed
 from fuselog.pipeline.output.alarms import Stressing
 from fuselog.replay.judging.errors.differences import Difference

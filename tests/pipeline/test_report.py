@@ -32,10 +32,17 @@ from fuselog.pipeline.output.charts import (
     level,
 )
 from fuselog.pipeline.output.claims import Claim
-from fuselog.pipeline.output.report import _figure, _legend, write_report
+from fuselog.pipeline.output.report import (
+    DARK,
+    LIGHT,
+    _figure,
+    _legend,
+    contrast,
+    text_colours,
+    write_report,
+)
 from fuselog.pipeline.output.report.first_run import Followed
 from fuselog.pipeline.output.report.kinds import opening, run_sentences
-from fuselog.pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
 from fuselog.pipeline.output.report.scene import typical_second
 from fuselog.pipeline.output.results import Outcome, Result, read_result, result_folder, write_outcome
 from fuselog.recorders.errors import BadInput

@@ -12,10 +12,9 @@ import pytest
 from scipy.stats import chi2
 
 from fuselog.pipeline.output.claims import Claim
-from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps
+from fuselog.pipeline.output.report import _named, kinds, sheet, sweeps, title_of
 from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.report.kinds import how_many_differ, opening
-from fuselog.pipeline.output.report.naming import title_of
 from fuselog.pipeline.output.report.sheet import sheets, table_of_pairs
 from fuselog.pipeline.output.report.story import Story, gauge, story
 from fuselog.pipeline.output.results import Measured, MetricTable, Result

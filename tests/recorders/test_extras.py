@@ -9,7 +9,7 @@ import pytest
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.families.directional.broad import _datasets
-from fuselog.recorders.importers.tables.plane import _onto_map
+from fuselog.recorders.importers.tables.rows import _onto_map
 from fuselog.replay.families.directional.distributions.torus_mixtures import fit_wrapped_mixture
 from fuselog.replay.families.sets.regions.moving_sets import from_rings
 

@@ -25,10 +25,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.importers.ros import importer
+from fuselog.recorders.importers.ros.choosing import RosParameters
 from fuselog.recorders.importers.ros.files.bags import open_bag
 from fuselog.recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
 from fuselog.recorders.importers.ros.messages import TYPES
-from fuselog.recorders.importers.ros.parameters import RosParameters
 from fuselog.recorders.log import Stream, open_log, read_streams
 from fuselog.recorders.models.inertial import from_mounting
 from fuselog.recorders.recording import import_log, import_run

@@ -179,10 +179,7 @@ def _fixes(run: FirstRun) -> list[Series]:
         if not run.case or topic.startswith(f"/{run.case}/")
     ]
     found = [each["position_m"][:, :2] for each in run.source.read(topics).values() if len(each)]
-    if not found:
-        return []
-    points = np.concatenate(found)
-    return [_dots("fixes", points)]
+    return _dots("fixes", found)
 
 
 def _clouds(run: FirstRun) -> list[Series]:
@@ -284,15 +281,14 @@ def _detections(source: LogSource) -> list[Series]:
         origin = scan.metadata.get(ORIGIN, "")
         fix = source.read([origin])[origin] if origin in source.topics else None
         found.append(detected_places(scan, detected, fix))
-    if not found:
-        return []
-    points = np.concatenate(found)
-    return [_dots("detections", points)]
+    return _dots("detections", found)
 
 
-def _dots(label: str, points: Floats) -> Series:
-    """Draw measured positions (n, 2) as dots, at most as many as a picture can show."""
-    return path(label, points[thinned(len(points), MOST_FIXES)], "dots", reference=True)
+def _dots(label: str, parts: Sequence[Floats]) -> list[Series]:
+    """Draw measured positions, each (n, 2), as dots, at most as many as a picture can show."""
+    points = np.concatenate([*parts, np.empty((0, 2))])
+    rows = thinned(len(points), MOST_FIXES)
+    return [path(label, points[rows], "dots", reference=True)] if parts else []
 
 
 def _ways(source: LogSource) -> list[Floats]:

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.importers.ros.choosing import choose, stream_names
+from fuselog.recorders.importers.ros.choosing import RosParameters, choose, stream_names
 from fuselog.recorders.importers.ros.files.bags import Bag, open_bag
 from fuselog.recorders.importers.ros.files.raw import Batch, Connection
 from fuselog.recorders.importers.ros.layouts import Messages, Undecodable, by_size
 from fuselog.recorders.importers.ros.messages import CHILD_FRAME, Part, as_estimate, as_truth, stamps_ns
-from fuselog.recorders.importers.ros.parameters import RosParameters
 from fuselog.recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
 from fuselog.recorders.importers.ros.transforms import Chain, Mountings, Pair, Transforms, transforms_of
 from fuselog.recorders.importers.stamps import to_ns

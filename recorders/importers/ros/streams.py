@@ -18,8 +18,8 @@ from fuselog.recorders.importers.mapping import (
     off_unit,
     with_unit_quaternions,
 )
+from fuselog.recorders.importers.ros.choosing import Clock
 from fuselog.recorders.importers.ros.messages import SIGMAS, Part
-from fuselog.recorders.importers.ros.parameters import Clock
 from fuselog.recorders.log import Schema, Stream, make_stream
 from fuselog.recorders.log.planes import Origin, is_planar
 

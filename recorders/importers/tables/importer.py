@@ -30,8 +30,7 @@ from fuselog.recorders.importers.tables.mapping import (
     read_mapping,
     shipped,
 )
-from fuselog.recorders.importers.tables.plane import Plane
-from fuselog.recorders.importers.tables.rows import ReadCounts, Rows
+from fuselog.recorders.importers.tables.rows import Plane, ReadCounts, Rows
 from fuselog.recorders.log import Stream, make_stream
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Blocks, Importer

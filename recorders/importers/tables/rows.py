@@ -3,8 +3,9 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fuselog.recorders.errors import BadInput, some_of
+from fuselog.recorders.extras import extra
 from fuselog.recorders.importers.mapping import (
     NOT_UNIT,
     SCALED,
@@ -37,7 +39,6 @@ from fuselog.recorders.importers.tables.files import (
     texts_in,
 )
 from fuselog.recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
-from fuselog.recorders.importers.tables.plane import Plane
 from fuselog.recorders.importers.tables.times import (
     REMEDY,
     Order,
@@ -49,6 +50,7 @@ from fuselog.recorders.importers.tables.times import (
 )
 from fuselog.recorders.log import Stream, make_stream
 from fuselog.recorders.log.planes import FRAME, is_planar
+from fuselog.recorders.models.geodesy import into_tangent_plane
 from fuselog.recorders.units import conversion
 
 PLACE = ("east_m", "north_m", "up_m")
@@ -60,6 +62,63 @@ _MOST_VEHICLES = 1000
 _LOOKED_AT = 1000
 # The column for stamps from a separate file.
 _STAMP = "\0stamp"
+
+Floats = NDArray[np.float64]
+
+
+class Plane(NamedTuple):
+    """A conversion to east, north and up from an origin, in the tangent plane or on a map projection.
+
+    If the mapping states the origin, all positions of the log are in this plane.
+    """
+
+    origin: Origin
+    projection: str | None = None
+    is_stated: bool = False
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Return the metadata for channels of streams in the plane."""
+        stated = {f"origin_{name}": repr(value) for name, value in self.origin}
+        # a model would take a stated origin as that of a tangent plane
+        return stated if self.projection is None else {"projection": self.projection}
+
+    def place(
+        self, latitude_deg: Floats, longitude_deg: Floats, altitude_m: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Compute east, north and up (n,) in m from positions on WGS 84.
+
+        Raises BadInput if pyproj is needed but not installed, or does not know the projection.
+        """
+        here = self.origin
+        if self.projection is None:
+            touch = (here.latitude_deg, here.longitude_deg, here.altitude_m)
+            east, north, up = into_tangent_plane((latitude_deg, longitude_deg, altitude_m), touch)
+            return np.asarray(east), np.asarray(north), np.asarray(up)
+        onto_map = _onto_map(self.projection)
+        east, north = onto_map.transform(longitude_deg, latitude_deg)
+        zero_east, zero_north = onto_map.transform(here.longitude_deg, here.latitude_deg)
+        is_on_map = np.isfinite(east) & np.isfinite(latitude_deg)
+        place = np.where(is_on_map, [east - zero_east, north - zero_north], np.nan)
+        return place[0], place[1], altitude_m - here.altitude_m
+
+
+@cache
+def _onto_map(projection: str) -> Any:
+    with extra("maps", f"projection {projection}"):
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError
+    try:
+        crs = CRS.from_user_input(projection)
+    except CRSError:
+        raise BadInput(
+            f"pyproj knows no projection '{projection}'; give one such as EPSG:25832"
+        ) from None
+    if not crs.is_projected:
+        raise BadInput(
+            f"projection {projection}: has no east and north in m; give a projected one: EPSG:25832"
+        )
+    return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 
 
 class Rows:
@@ -234,20 +293,14 @@ class Rows:
         is_odd = np.isinf(found)
         if self.table.is_text:
             is_odd |= np.isnan(found) & cells.is_valid().to_numpy(zero_copy_only=False)
-        self._tell(
-            f"{self.path.name}: {column}",
-            "cells that are not numbers, read as missing",
-            int(is_odd.sum()),
-        )
+        self._tell_missing(column, "cells that are not numbers", is_odd)
         return np.where(is_odd, np.nan, found)
 
     def _prepared(self, column: str, found: NDArray, sides: pa.Array | None) -> NDArray:
         """Remove codes of missing values from a column (n,), convert minutes, and apply hemispheres."""
         for code in self._missing.get(column, []):
             is_missing = found == code
-            self._tell(
-                f"{self.path.name}: {column}", f"{code:g}, read as missing", int(is_missing.sum())
-            )
+            self._tell_missing(column, f"{code:g}", is_missing)
             found = np.where(is_missing, np.nan, found)
         if column in self._in_minutes:
             size = np.abs(found)
@@ -271,11 +324,7 @@ class Rows:
                     f"says '{letters[row]}'; remove it from hemispheres if it already has signs"
                 )
             unknown = ~(is_south | is_north) & np.isfinite(found)
-            self._tell(
-                f"{self.path.name}: {column}",
-                "without a hemisphere, read as missing",
-                int(unknown.sum()),
-            )
+            self._tell_missing(column, "without a hemisphere", unknown)
             found = np.where(is_south, -np.abs(found), np.where(is_north, found, np.nan))
         return found
 
@@ -607,6 +656,9 @@ class Rows:
         )
 
     # Notes.
+
+    def _tell_missing(self, column: str, what: str, which: NDArray[np.bool_]) -> None:
+        self._tell(f"{self.path.name}: {column}", f"{what}, read as missing", int(which.sum()))
 
     def _tell(self, subject: str, fact: str, count: int) -> None:
         if count:

@@ -68,6 +68,33 @@ class Source(Protocol):
         """Return the impossible messages that were left out of everything read so far."""
 
 
+@dataclass(frozen=True)
+class DerivedSource:
+    """Base of sources that read another source `of`, with its name, time zero, span and rejections."""
+
+    of: Source
+
+    @property
+    def name(self) -> str:
+        """Return the name of the other source."""
+        return self.of.name
+
+    @property
+    def epoch_ns(self) -> int:
+        """Return the time zero of its run."""
+        return self.of.epoch_ns
+
+    @property
+    def start_ns(self) -> int | None:
+        """Return the start of its span."""
+        return self.of.start_ns
+
+    @property
+    def rejections(self) -> Rejections:
+        """Return the impossible messages that were left out of what it has read."""
+        return self.of.rejections
+
+
 def is_sensed(source: Source, topic: str) -> bool:
     """Test whether `topic` of `source` is recorded sensor data in columns, not estimates or images."""
     if topic.startswith("/estimates/"):

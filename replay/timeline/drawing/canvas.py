@@ -333,14 +333,14 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
     return extremes(_spans(time_ns, rows // 2), values)
 
 
-def thin_scatter(count: int, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a scatter plot to draw: all rows, or a random selection of `rows`, in order.
+def thin_scatter(count: int) -> NDArray[np.int64]:
+    """Return the rows of a scatter plot to draw: all rows, or a random selection, in order.
 
     Extremes, as for a curve, would leave out the points in between, which are the majority.
     """
-    if count <= rows:
+    if count <= DRAWN_ROWS:
         return np.arange(count)
-    return np.sort(np.random.default_rng(0).choice(count, rows, replace=False))
+    return np.sort(np.random.default_rng(0).choice(count, DRAWN_ROWS, replace=False))
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:

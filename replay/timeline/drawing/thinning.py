@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fuselog.recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
-from fuselog.recorders.log.impossible import Rejections
 from fuselog.replay.engine.streams.failures import join_streams
-from fuselog.replay.engine.streams.sources import Source, is_sensed
+from fuselog.replay.engine.streams.sources import DerivedSource, Source, is_sensed
 from fuselog.replay.judging.errors.evaluation import MAY_BE_NONE, PER_ROW, Errors, Floats, errors_at
 from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
 
@@ -207,36 +206,15 @@ class Thin:
 
 
 @dataclass(frozen=True)
-class Held:
+class Held(DerivedSource):
     """Source with some topics already in memory, thinned or incomplete."""
 
-    of: Source
     streams: Mapping[str, Stream]
-
-    @property
-    def name(self) -> str:
-        """Return the name of the source."""
-        return self.of.name
 
     @property
     def run(self) -> RunMetadata | None:
         """Return the run metadata of the source."""
         return self.of.run
-
-    @property
-    def epoch_ns(self) -> int:
-        """Return the epoch of the source."""
-        return self.of.epoch_ns
-
-    @property
-    def start_ns(self) -> int | None:
-        """Return the start of the source's span."""
-        return self.of.start_ns
-
-    @property
-    def rejections(self) -> Rejections:
-        """Return the messages that the source rejected."""
-        return self.of.rejections
 
     @property
     def topics(self) -> Mapping[str, Topic]:

@@ -22,9 +22,9 @@ from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.streams.sources import memory_source
 from fuselog.replay.engine.vectors.tangent import tangent_components
 from fuselog.replay.foreign.description import TopicRead
-from fuselog.replay.foreign.files.estimates import read_estimates
 from fuselog.replay.foreign.naming import Allowed
 from fuselog.replay.foreign.processes.isolation import Program
+from fuselog.replay.foreign.programs import read_estimates
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
 

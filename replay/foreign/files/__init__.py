@@ -1,4 +1,0 @@
-"""Input files of programs that read a log, and the files that they write.
-
-Begin with `estimates`.
-"""
