@@ -41,7 +41,7 @@ from fuselog.replay.inference.kalman.steps import (
     Steps,
     UpdateRun,
 )
-from fuselog.replay.inference.linear_algebra.tuples import filling
+from fuselog.replay.inference.linear_algebra.tuples import filling, range_of
 from fuselog.replay.inference.model.bound_model import BoundModel
 from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.parameters import number_fields
@@ -114,8 +114,14 @@ def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Step
     def predict(run: int, belief: ModeBelief, interval: Interval, memory: InteractingMemory) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
-        fill_rates(memory.rates, rates_of(interval.parameters))
-        fill_transition(memory.rates, interval.duration_s, memory.transition)
+        rates = rates_of(interval.parameters)
+        is_new = memory.duration_s[0] != interval.duration_s
+        for each in range_of(modes * (modes - 1)):
+            is_new |= memory.rates[each] != rates[each]
+        if is_new:
+            memory.duration_s[0] = interval.duration_s
+            fill_rates(memory.rates, rates)
+            fill_transition(memory.rates, interval.duration_s, memory.transition)
         to_common_tangent(mean, covariance, probability, memory.mixture)
         fill_weights(probability, log_probability, memory)
         for mode in range(modes):
@@ -138,6 +144,7 @@ def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Step
             inner,
             rates=np.empty(modes * (modes - 1)),
             transition=np.empty((modes, modes)),
+            duration_s=np.full(1, np.nan),
             weights=np.empty((modes, modes)),
             predicted=np.empty(modes),
             mixture=mixture_memory(bound_model, modes),

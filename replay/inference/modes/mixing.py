@@ -64,15 +64,17 @@ class InteractingMemory(NamedTuple):
 
     Attributes:
         filters: memory of every mode's filter.
-        rates, transition: (M (M - 1),), and Pi (M, M).
+        rates, transition: (M (M - 1),), and Pi (M, M) over the duration.
+        duration_s: (1,); NaN before the first one.
         weights: (M, M) row j has the weights of all modes in the mixture of mode j.
-        predicted: (M,) logarithms of c, the predicted probabilities.
+        predicted: (M,) c, the predicted probabilities, or their logarithms if they are tiny.
         mixture: memory for the modes' Gaussians.
     """
 
     filters: tuple[CoreMemory, ...]
     rates: Floats
     transition: Floats
+    duration_s: Floats
     weights: Floats
     predicted: Floats
     mixture: MixtureMemory
@@ -201,15 +203,16 @@ def mixing_weights(modes: int) -> FillWeights:
             for begin in range(modes):
                 weights[end, begin] = probability[begin] * memory.transition[begin, end]
                 total += weights[end, begin]
+            predicted[end] = total
             if total < TINY:
                 predicted[end] = weigh_by_logarithms(end, log_probability, memory)
                 continue
-            predicted[end] = np.log(total)
             for begin in range(modes):
                 weights[end, begin] /= total
         for mode in range(modes):
-            log_probability[mode] = predicted[mode]
-            probability[mode] = np.exp(predicted[mode])
+            is_tiny = predicted[mode] <= 0.0
+            log_probability[mode] = predicted[mode] if is_tiny else np.log(predicted[mode])
+            probability[mode] = np.exp(predicted[mode]) if is_tiny else predicted[mode]
 
     return fill_weights
 

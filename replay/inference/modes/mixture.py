@@ -192,7 +192,8 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
             log_probability[mode] += numbers[mode, 1]
             highest = max(highest, log_probability[mode])
         for mode in range(len(probability)):
-            probability[mode] = np.exp(log_probability[mode] - highest)
+            below = highest - log_probability[mode]
+            probability[mode] = 1.0 if below == 0.0 else np.exp(-below)
             total += probability[mode]
         likelihood: float = highest + np.log(total)
         for mode in range(len(probability)):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +31,33 @@ class Points:
     keys: Integers
     places: Floats
 
+    @cached_property
+    def _places(self) -> Floats:
+        """The positions, and NaN, which is selected by row -1."""
+        return np.concatenate([self.places, np.full((1, self.places.shape[1]), np.nan)])
+
+    @cached_property
+    def _by_number(self) -> Integers:
+        """The rows by run and number, or -1 (runs, numbers); empty if most of them would be missing."""
+        keys, first = np.unique(self.keys, return_index=True)
+        runs, numbers = keys >> 32, keys & 0xFFFFFFFF
+        shape = (runs.max(initial=-1) + 1, numbers.max(initial=-1) + 1)
+        if np.prod(shape) > 16 * len(keys):
+            return np.empty((0, 0), np.int64)
+        found = np.full(shape, -1)
+        found[runs, numbers] = first
+        return found
+
     def rows(self, run: Integers, number: Integers) -> Integers:
         """Return the rows of the points with these numbers in these runs; -1 for missing points."""
+        runs, numbers = self._by_number.shape
+        if (
+            runs
+            and number.min(initial=0) >= 0
+            and number.max(initial=0) < numbers
+            and run.max(initial=0) < runs
+        ):
+            return self._by_number[run, number]
         keys = (run << 32) + number
         if len(self.keys) == 0:
             return np.full(len(keys), -1)
@@ -41,8 +66,7 @@ class Points:
 
     def at(self, rows: Integers) -> Floats:
         """Return the positions (m, d) in rows that `rows` returned; NaN for -1."""
-        nowhere = np.full((1, self.places.shape[1]), np.nan)  # selected by row -1
-        return np.concatenate([self.places, nowhere])[rows]
+        return self._places.take(rows, axis=0)
 
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
@@ -250,26 +274,28 @@ def sensor_table(
     else:
         parts = [without_covariance_of(sensor, ragged)]
     reference: list[Floats] = []
+    numbers = [stream[each.of].astype(np.int64) for each in sensor.maps]
     if sensor.maps:
-        target = stream[sensor.maps[0].of].astype(np.int64)
+        target = numbers[0]
         run = run_of_rows(ragged.offsets)
-    for each in sensor.maps:
+    for each, number_of in zip(sensor.maps, numbers, strict=True):
         places = context.points[each.topic]
-        rows = places.rows(run, stream[each.of].astype(np.int64))
+        rows = places.rows(run, number_of)
         source[rows < 0] = NOTHING
         reference.append(places.at(rows))
     if sensor.control is not None:  # see `fill_control`
         reference.append(np.full((len(stream), len(sensor.control.components)), np.nan))
     reference += [_field(stream, name, size) for name, size in sensor.fields.items()]
     if sensor.is_numbered:
-        reference.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
+        reference.append(np.stack(numbers, axis=1).astype(float))
     parts[1:1] = reference
     source[without_covariance] = NOTHING
-    filled = sum(part.shape[1] for part in parts)
-    if filled < width:
-        parts.append(np.full((len(stream), width - filled), np.nan))
-    data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-    return Table(np.ascontiguousarray(data), source, target, without_covariance)
+    data, filled = np.empty((len(stream), width)), 0
+    for part in parts:
+        data[:, filled : filled + part.shape[1]] = part
+        filled += part.shape[1]
+    data[:, filled:] = np.nan
+    return Table(data, source, target, without_covariance)
 
 
 def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:

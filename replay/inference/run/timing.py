@@ -127,6 +127,8 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
         events: n events of all runs.
         chosen: (n,) whether each event is selected.
     """
+    if chosen.all():
+        return events
     places = np.flatnonzero(chosen)
     columns: Columns = (column.take(places, axis=0) for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
@@ -175,19 +177,24 @@ def interpolate_control(
         at = begin + np.flatnonzero(is_control[begin:end])
         if not len(at):
             continue
-        inside = slice(begin, at[-1] + 1)
-        times_ns, wanted_ns = (events.time_ns[rows] - events.time_ns[begin] for rows in (at, inside))
+        inside = np.arange(begin, at[-1] + 1)
+        times_ns = events.time_ns[at] - events.time_ns[begin]
+        if np.all(np.diff(times_ns) > 0):  # messages of the control keep their own
+            inside = inside[~is_control[inside]]
+        wanted_ns = events.time_ns[inside] - events.time_ns[begin]
         for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
         for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
             data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
-        ready[inside], waiting[begin : at[-1]] = True, False
+        ready[begin : at[-1] + 1], waiting[begin : at[-1]] = True, False
     again = events._replace(wants_estimate=events.wants_estimate & ~ready)  # one estimate suffices
     return select_events(events._replace(data=data), ready), select_events(again, waiting)
 
 
 def fill_control(bound_model: BoundModel, events: FilterEvents) -> FilterEvents:
     """Copy the interpolated control to the events of sensors that read it."""
+    if all(sensor.control is None for sensor in bound_model.sensors):
+        return events
     data = events.data.copy()
     for number, sensor in enumerate(bound_model.sensors):
         if sensor.control is not None:

@@ -18,6 +18,7 @@ from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from fuselog.replay.inference.run.events import Points
 from fuselog.replay.inference.run.recursion import no_results
 from fuselog.replay.inference.run.timing import add_output_times, output_times
 from tests.replay.inference import vehicle_a, wheel
@@ -370,3 +371,16 @@ def test_what_memory_holds_before_it_is_written_changes_nothing(
     for topic, ragged in found[0].items():
         for name, column in ragged.stream.columns.items():
             assert_array_equal(column, found[1][topic][name], err_msg=f"{topic} {name}")
+
+
+@pytest.mark.parametrize("last", [3, 4_000_000_000])
+def test_points_are_found_by_run_and_number(last: int) -> None:
+    """Of two points with one number the first is taken; numbers may be far apart."""
+    keys = np.array([1, 2, 2, last, (2 << 32) + 1])
+    points = Points(keys, np.arange(10.0).reshape(5, 2))
+    run = np.array([0, 0, 0, 0, 0, 1, 2, 2, 3])
+    number = np.array([last, 2, 0, -1, 7, 1, 1, 2, 1])
+    for asked in (slice(0, 3), slice(0, 8), slice(None), slice(0, 0)):
+        rows = points.rows(run[asked], number[asked])
+        assert rows.tolist() == [3, 1, -1, -1, -1, -1, 4, -1, -1][asked]
+    assert_array_equal(points.at(np.array([-1, 2])), [[np.nan, np.nan], [4.0, 5.0]])
