@@ -61,13 +61,13 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
     """Raise BadInput if a folder that would be replaced is a link or a root, or contains an input."""
     folder = settled(folder)
     if not folder.name:
-        raise BadInput(f"{folder}: is the root of a file system; give a folder in it with --out")
+        raise BadInput(f"{folder}: is the root of a file system; give a folder in it")
     _refuse_link(folder)
     for role, paths in inputs.items():
         for path in paths:
             place = path if isinstance(path, RemotePath) else Path(os.path.realpath(path))
             if _identity(folder) in map(_identity, (place, *place.parents)):
-                raise BadInput(f"{folder}: the {role} {path} is in it; give another folder with --out")
+                raise BadInput(f"{folder}: the {role} {path} is in it; give another folder")
 
 
 def check_outputs(

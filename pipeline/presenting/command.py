@@ -1,7 +1,7 @@
 """The command `fuselog view`: runs as a dataset in Rerun, or one log or run as a timeline."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +9,10 @@ from shlex import quote
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import progress, say, status, warn
-from fuselog.pipeline.presenting.making import TABLE, Kept, Made, runs_at
+from fuselog.pipeline.presenting.making import TABLE, Kept, Made, require_ours, runs_at
 from fuselog.pipeline.presenting.options import Options
 from fuselog.pipeline.presenting.runs import LAYOUT, WITHOUT_RUNS, Runs, Segment
-from fuselog.pipeline.runs.executors import PoolFactory, inline_pool, processes
+from fuselog.pipeline.runs.executors import inline_pool, processes
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.timeline.catalog import EXTRA, PROPERTIES, Dataset, has_catalog, serve_dataset
 from fuselog.replay.timeline.viewer import Listener, screenshot, serving, showing
@@ -34,7 +34,7 @@ def view_path(paths: Sequence[Path], options: Options) -> None:
         if not options.is_of_one and (options.screenshot is None or len(chosen) > 1):
             if options.save is not None:
                 _save_dataset(runs, chosen, options.save)
-            else:
+            if options.save is None or options.screenshot is not None or options.web:
                 _show_dataset(runs, chosen, options)
             return
         if len(chosen) != 1:
@@ -42,6 +42,8 @@ def view_path(paths: Sequence[Path], options: Options) -> None:
                 f"{runs.path}: --at, --start, --end, --focus, --connect and --save FILE.rrd are about "
                 "one run; choose it with --runs NUMBER"
             )
+        if options.port is not None:
+            raise BadInput(f"--port {options.port}: one run needs no server of a dataset; leave it out")
         segment, options = chosen[0], replace(options, gap_limit_s=runs.gap_limit_s)
     from fuselog.pipeline.presenting.timeline import view_timeline  # slow to import
 
@@ -81,8 +83,11 @@ def _save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
     from fuselog.pipeline.output.outputs import check_folder  # slow to import
 
     check_folder(folder, {"input": [runs.path]})
+    require_ours(folder, "give another folder")
     kept = Kept(runs)
-    made = _all_made(kept, chosen)
+    for _ in _draw(kept, chosen):
+        pass
+    made = kept.made()
     kept.save(folder, made)
     say(f"{folder}: {len(runs.segments)} runs, {runs.order}; {len(made)} with streams and estimates")
     say(f"to serve it: rerun server --host 127.0.0.1 -d {quote(str(folder))}")
@@ -109,7 +114,6 @@ def _show_dataset(runs: Runs, chosen: Sequence[Segment], options: Options) -> No
             drawn = [each for each in made if each.segment in chosen] or made
             for each in drawn[:1]:
                 dataset.lay_out(each.folder / LAYOUT)
-        missing = _missing(chosen, made)
         say(f"{runs.path}: {len(runs.segments)} runs, {runs.order}; {dataset.url}")
         if options.screenshot is not None:
             with status() as told:
@@ -118,10 +122,10 @@ def _show_dataset(runs: Runs, chosen: Sequence[Segment], options: Options) -> No
             say(str(options.screenshot))
             return
         if len(chosen) == 1:  # it is what is opened, so it has to be there
-            _add(dataset, kept, missing, None)
+            _add(dataset, kept, chosen, None)
         address = dataset.url_of(chosen[0].name) if len(chosen) == 1 else dataset.url
         with _viewer(runs, address, web=options.web) as listener:
-            _add(dataset, kept, _missing(chosen, kept.made()), listener)
+            _add(dataset, kept, chosen, listener)
             listener.process.wait()
 
 
@@ -135,13 +139,10 @@ def _viewer(runs: Runs, address: str, *, web: bool) -> AbstractContextManager[Li
     return serving(announce, address=address)
 
 
-def _add(dataset: Dataset, kept: Kept, missing: Sequence[Segment], listener: Listener | None) -> None:
-    """Draw runs and add them to a dataset, until its viewer is closed."""
-    if not missing:
-        return
-    with closing(kept.make(missing, _pool(missing))) as making:
-        for each in progress(making, "drawing runs", len(missing)):
-            _tell(each)
+def _add(dataset: Dataset, kept: Kept, chosen: Sequence[Segment], listener: Listener | None) -> None:
+    """Draw the chosen runs and add them to a dataset, until its viewer is closed."""
+    with closing(_draw(kept, chosen)) as drawing:
+        for each in drawing:
             dataset.add(each.layers)
             if not dataset.has_layout or listener is None:
                 dataset.lay_out(each.folder / LAYOUT)
@@ -149,23 +150,15 @@ def _add(dataset: Dataset, kept: Kept, missing: Sequence[Segment], listener: Lis
                 return
 
 
-def _all_made(kept: Kept, chosen: Sequence[Segment]) -> list[Made]:
-    """Draw the chosen runs that are not drawn yet, and return all drawn runs."""
-    missing = _missing(chosen, kept.made())
-    for each in progress(kept.make(missing, _pool(missing)), "drawing runs", len(missing)):
-        _tell(each)
-    return kept.made()
-
-
-def _missing(chosen: Sequence[Segment], made: Sequence[Made]) -> list[Segment]:
-    drawn = {each.segment.name for each in made}
-    return [segment for segment in chosen if segment.name not in drawn]
-
-
-def _pool(missing: Sequence[Segment]) -> PoolFactory:
-    return inline_pool if len(missing) < PAYING_SEGMENTS else processes(os.cpu_count() or 1)
-
-
-def _tell(made: Made) -> None:
-    for warning in made.warnings:
-        warn(warning)
+def _draw(kept: Kept, chosen: Sequence[Segment]) -> Generator[Made]:
+    """Draw the chosen runs that are not drawn yet, and warn of differences from the result."""
+    drawn = {each.segment.name for each in kept.made()}
+    missing = [segment for segment in chosen if segment.name not in drawn]
+    if not missing:
+        return
+    open_pool = inline_pool if len(missing) < PAYING_SEGMENTS else processes(os.cpu_count() or 1)
+    with closing(kept.make(missing, open_pool)) as making:
+        for each in progress(making, "drawing runs", len(missing)):
+            for warning in each.warnings:
+                warn(warning)
+            yield each

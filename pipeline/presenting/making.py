@@ -106,7 +106,7 @@ class Kept:
     def __init__(self, runs: Runs) -> None:
         self._runs = runs
         self.folder = _place_of(runs.path)
-        _require_ours(self.folder, "move it away")
+        require_ours(self.folder, "move it away")
         with whole_file(self.folder / MARKER) as new:
             new.write_text(json.dumps({"of": runs.path.resolve().name}) + "\n", encoding="utf-8")
         self._clear()
@@ -177,7 +177,7 @@ class Kept:
         """Write the dataset to a folder, one file for each segment, for `rerun server -d FOLDER`."""
         drawn = {each.segment.name: each for each in made}
         properties = self.properties()
-        with whole_folder(folder, lambda found: _require_ours(found, "give another folder")) as new:
+        with whole_folder(folder, lambda found: require_ours(found, "give another folder")) as new:
             for segment in self._runs.segments:
                 file = f"{file_name(segment.name)}.rrd"
                 if segment.name not in drawn:
@@ -210,7 +210,7 @@ def _text(segment: Segment, runs: Runs) -> str:
     return f"{about}\n\nIf nothing is drawn below, this command adds it: `{command}`"
 
 
-def _require_ours(folder: Path, remedy: str) -> None:
+def require_ours(folder: Path, remedy: str) -> None:
     """Raise BadInput unless a folder is missing, is empty, or was written by this module."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
