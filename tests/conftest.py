@@ -53,6 +53,13 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def collect() -> Callable[[], int]:
+    """Collect what is left of a test; going through what other tests left takes a second."""
+    gc.freeze()
+    return gc.collect
+
+
+@pytest.fixture
 def on_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
     """Have kernels use a number of cores, until the test ends."""
     before = core_count()

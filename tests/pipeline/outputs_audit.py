@@ -43,6 +43,8 @@ QUICK = {
     "replay": "replay run.mcap -e dead-reckoning",
     "replay --save": "replay run.mcap -e dead-reckoning -o new.mcap",
     "tune": "tune run.mcap -e ekf --free sigma_range_m",
+    "calibrate": "calibrate run.mcap -e ekf --fixed forward_scale --fixed turn_scale "
+    "--fixed turn_bias_radps --fixed bias_bearing_rad",
     "check --against": "check run.mcap -e dead-reckoning --update",
     "check --junit": "check run.mcap --against dead.golden.xz",
     "evaluate": "evaluate est.mcap --log run.mcap",

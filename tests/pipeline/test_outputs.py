@@ -382,7 +382,7 @@ import os, sys
 with open(os.environ["SHADOWED"], "a") as told:
     print(__file__, *sys.argv, file=told)
 """
-# Starts workers as `--workers 2` and `--scheduler local:1` do, then runs commands one after another,
+# Starts a worker as `--workers` and `--scheduler local:1` do, then runs commands one after another,
 # with the path that the console script has.
 DRIVER = """
 import json, sys
@@ -391,7 +391,7 @@ from fuselog.pipeline.command_line import main
 from fuselog.pipeline.runs.executors import dask, processes
 if __name__ == "__main__":
     Figure.draw = lambda *_: None
-    for workers in (processes(2), dask("local:1")):
+    for workers in (processes(1), dask("local:1")):
         with workers() as pool:
             assert pool.executor.submit(abs, -1).result() == 1
     print(json.dumps([main(words) for words in json.load(sys.stdin)]))

@@ -1,7 +1,6 @@
 """The public interface: `import fuselog`, and its functions in place of the commands."""
 
 import ast
-import gc
 import json
 import re
 import subprocess
@@ -76,15 +75,15 @@ def test_the_page_works_as_written(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.paper
-def test_estimates_last_as_long_as_any_of_them_is_referred_to() -> None:
+def test_estimates_last_as_long_as_any_of_them_is_referred_to(collect: Callable[[], int]) -> None:
     """Also in one line, where nothing refers to the replay; the folder goes with the last of them."""
     log = fl.record("landmarks", seed=3, duration_s=2.0)
     estimates = fl.replay(log, "ekf").estimates[0]
-    gc.collect()
+    collect()
     assert len(estimates[POSE]) > 0
     place = estimates.log.path  # type: ignore[union-attr]
     del estimates
-    gc.collect()
+    collect()
     assert not place.exists()
 
 
@@ -403,20 +402,20 @@ def test_what_cannot_be_used_is_one_sentence(
 
 @pytest.mark.paper
 def test_estimates_are_kept_as_long_as_the_replay(
-    recordings: list[fl.MemorySource], caplog: pytest.LogCaptureFixture
+    recordings: list[fl.MemorySource], caplog: pytest.LogCaptureFixture, collect: Callable[[], int]
 ) -> None:
     """Two at once do not disturb each other, and neither leaves anything behind."""
     first, second = (fl.replay(recordings[0], "ekf") for _ in range(2))
     places = [done.estimates[0].log.path for done in (first, second)]
     estimates = second.estimates[0]
     del first
-    gc.collect()
+    collect()
     assert [place.parent.exists() for place in places] == [False, True]
     del second
-    gc.collect()
+    collect()
     assert len(estimates[POSE])
     del estimates
-    gc.collect()
+    collect()
     assert not places[1].parent.parent.exists()
     assert caplog.records == []
 

@@ -1,7 +1,7 @@
 """Smoothers against the reference sheet, dense least squares, and their own filters."""
 
-import gc
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -401,7 +401,10 @@ def test_blocks_are_the_whole(
 
 
 def test_nodes_beyond_what_memory_may_hold_lie_on_disk(
-    uncompiled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    uncompiled: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    collect: Callable[[], int],
 ) -> None:
     """Bit for bit the same, and no file is left, be it that the way back fails."""
     source = vehicle_a.source(vehicle_a.simulate(8)[0][:60])
@@ -427,7 +430,7 @@ def test_nodes_beyond_what_memory_may_hold_lie_on_disk(
     fails = True
     with pytest.raises((RuntimeError, BadInput), match="the way back"):
         outputs(VEHICLE_A, "smoother", [source], 16)
-    gc.collect()
+    collect()
     assert not any(tmp_path.iterdir())
 
 
