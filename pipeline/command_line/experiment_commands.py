@@ -32,7 +32,7 @@ from fuselog.pipeline.runs.experiment import (
     require_campaign,
 )
 from fuselog.pipeline.runs.settings import read_settings
-from fuselog.pipeline.runs.sweeps import DRAWN, Sampling, parse_over
+from fuselog.pipeline.runs.sweeps import DRAWN, parse_over
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import merge, parse_settings
 from fuselog.recorders.remote.paths import located
@@ -176,30 +176,19 @@ def sweep_named(
     over: Mapping[str, Any],
     *,
     swept: Sequence[str],
-    samples: int | None,
-    sampling: Sampling,
-    out: Path | None,
-    workers: int | None,
-    scheduler: str | None,
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
     where: str | None,
+    **options: Any,
 ) -> None:
-    """Run an experiment, or replay logs as one, at many points, and print its metrics at each."""
+    """Run an experiment, or replay logs as one, at many points, and print its metrics at each.
+
+    The other options are those of `sweep`.
+    """
     overs = [parse_over(text) for text in swept]
     stated, values = _stated_experiment(named, labels, over, settings_file, settings, where)
-    done = sweep(
-        stated,
-        overs,
-        samples=samples,
-        sampling=sampling,
-        out=out,
-        workers=workers,
-        scheduler=scheduler,
-        set=values,
-        progress=progress,
-    )
+    done = sweep(stated, overs, set=values, progress=progress, **options)
     result = done.result
     if as_json:
         print_json(result.model_dump(mode="json"))

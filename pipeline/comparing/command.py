@@ -38,22 +38,19 @@ def compare_candidates(
     labels: Sequence[str],
     *,
     truth: Path | None,
-    case: str | None,
-    margin: float,
     out: Path | None,
     save: Path | None,
     recover: bool,
-    stress: bool,
-    gap_limit_s: float,
     as_json: bool,
     fail_if_worse: bool,
     settings_file: Path | None,
     settings: Sequence[str],
+    **options: Any,
 ) -> bool:
     """Compare candidates, print tables and verdicts, and write the result folder and the timeline.
 
-    Returns False if `fail_if_worse` is set and a candidate is worse than the first (see
-    `Differences.worse`), otherwise True.
+    The other options are those of `compare`. Returns False if `fail_if_worse` is set and a candidate is
+    worse than the first (see `Differences.worse`), otherwise True.
     """
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     alterations, own = split_texts(settings)
@@ -66,13 +63,10 @@ def compare_candidates(
         *candidates,
         estimators=[*recorded, *({label: values} for label, values in chosen.items())],
         truth=truth,
-        case=case,
-        margin=margin,
-        gap_limit_s=gap_limit_s,
         set=alterations,
         recover=recover,
-        stress=stress,
         progress=progress,
+        **options,
     )
     worse = found.worse() if fail_if_worse else []
     written = []

@@ -1,8 +1,8 @@
 """Output of `fuselog tune`, and functions that `calibrate` shares with it."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators, split_texts
-from fuselog.pipeline.tuning.objective import Best, By
+from fuselog.pipeline.tuning.objective import Best
 from fuselog.pipeline.tuning.outcome import SETTINGS, Tuning
 from fuselog.pipeline.tuning.tuning import tune
 from fuselog.recorders.errors import BadInput
@@ -23,28 +23,21 @@ def tune_logs(
     logs: Sequence[Path],
     *,
     label: str,
-    free: Sequence[str] = (),
-    search: Callable[..., Tuning] | None = None,
-    by: By | None = None,
+    search: Callable[..., Tuning] = tune,
     bounds: Sequence[str],
-    grid: int = 1,
     held_out: Sequence[Path],
-    folds: int,
     out: Path,
-    workers: int | None,
-    scheduler: str | None,
     model: str | None,
     recover: bool,
-    gap_limit_s: float,
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
     where: str | None = None,
+    **options: Any,
 ) -> None:
     """Tune on logs, write the result folder, and print the names of the logs and the result.
 
-    If `search` is given, it determines the free parameters and the criterion, and `free`, `by` and
-    `grid` are ignored.
+    The other options are those of `search`.
     """
     chosen_logs, others = logs_meant(logs, where), logs_meant(held_out)
     logs, held_out = chosen_logs.logs, others.logs
@@ -59,18 +52,14 @@ def tune_logs(
     if not as_json:
         say(f"tuning on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
-        find = search or partial(tune, free=free, by=by, grid=grid)
-        found = find(
+        found = search(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             chosen,
             set=alterations,
             bounds=pairs_of("--bound", bounds, _ends, "NAME=LOW:HIGH, for example sigma_range_m=0.01:1"),
             validate=[LogSource(open_log(path, recover=recover)) for path in held_out],
-            folds=folds,
-            gap_limit_s=gap_limit_s,
-            workers=workers,
-            scheduler=scheduler,
             on_best=lambda best: show(progress_of(best)),
+            **options,
         )
     saved = found.save(out)
     parameters = found.parameters.replace({np.nan: None}).to_dict("records")
