@@ -355,7 +355,7 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
         (f"{SEEN}.range_matrix=1", "range_m is not a vector of three entries"),
         (f"{SEEN}.range_sign=2", "settings of a topic are"),
         ("/robot1/truth.covers=most", "expected some or all"),
-        (f"{SEEN}.covers=some", "only truths cover targets"),
+        (f"{SEEN}.covers=some", "this setting applies only to truths"),
         (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
         (f"{SEEN}.exchanged={ODOMETRY}", "only topics of the same type can be swapped"),
         ("/landmarks.exchanged=3", "expected two numbers, such as 3,9, or another topic"),

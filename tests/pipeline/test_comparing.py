@@ -201,7 +201,7 @@ def test_what_is_not_alike_is_said(logs: list[Path], estimates: Path, fuselog: F
     said = fuselog("compare", estimates, folder, "-e", "ekf", "--json")
     assert said.code == 0
     notes = " ".join(said.json["notes"])
-    assert "only estimates has 2 runs, left out: landmarks, seed 2, run 6" in notes
+    assert "left out, because only estimates has them: 2 runs, landmarks, seed 2, run 6" in notes
     assert "estimator.sigma_range_m" in notes
     assert {row["runs"] for row in said.json["differences"]} == {6}
 

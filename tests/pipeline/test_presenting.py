@@ -26,7 +26,7 @@ from fuselog.pipeline.presenting.making import Kept, runs_at
 from fuselog.pipeline.presenting.segments import list_runs
 from fuselog.recorders.log import open_log, read_streams
 from fuselog.replay.timeline import catalog, viewer
-from fuselog.replay.timeline.moments import read_moments
+from fuselog.replay.timeline.show import read_moments
 
 pytest.importorskip("datafusion")
 

@@ -79,7 +79,7 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
     assert told.doubts == ["the covariances of c, which are too small"]
     [difference] = told.differences
     assert re.match(
-        r"The error of c is 0\.98\d m larger than that of [ab], in the mean over runs \(95 % 0\.9\d+ "
+        r"The error of c is 0\.98\d m larger than that of [ab] on average over the runs \(95 % 0\.9\d+ "
         r"to 1\.0\d m\)\.",
         difference,
     )

@@ -131,7 +131,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
         {"t": (np.rint(1e6 * (STAMPS_S - STAMPS_S[0])).astype(np.int64) + 2**32 - 10**8) % 2**32},
         "time = { column = 't', unit = 'us', order = 'any', zero = '2026-01-01' }",
         [FIX],
-        "its clock was restarted, .*`rollover` of `time`",
+        "its clock was restarted .*`rollover` of `time`",
     ),
     "several vehicles": (
         {"t": np.tile(STAMPS_S[:200], 2), "lat": LATITUDE + 0.02 * (np.arange(400) >= 200)},

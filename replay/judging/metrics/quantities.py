@@ -87,7 +87,15 @@ def fill_columns(
 def fill_innovations(
     accepted: NDArray[np.bool_], degrees: Integers, squared: Floats, stated: Floats, columns: Floats
 ) -> None:
-    """Fill the rows (n, 5) to sum for innovations (n,); see `OfRuns`."""
+    """Fill the rows to sum for innovations; see `OfRuns`.
+
+    Args:
+        accepted: (n,), whether the gate accepted the innovation.
+        degrees: (n,), number of measured components.
+        squared: (n,) NIS.
+        stated: (n,) log-likelihood; NaN if it is not stated.
+        columns: (n, 5), filled.
+    """
     for row in range(len(columns)):
         is_accepted = accepted[row]
         columns[row, 0], columns[row, 1] = float(is_accepted), float(degrees[row])

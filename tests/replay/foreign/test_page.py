@@ -87,8 +87,8 @@ def test_a_state_by_other_names_is_told_those_of_the_truth(
     fl.write("run.mcap", fl.record("vehicles", vehicles=1, duration_s=3.0))
     both = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
     one = (
-        "north is not judged: /vehicle1/truth lacks it; position_rmse_m covers only x_m, and not "
-        "y_m, which /vehicle1/truth has"
+        "north is not judged: /vehicle1/truth lacks it; position_rmse_m covers only x_m; "
+        "/vehicle1/truth also has y_m"
     )
     for label, renamed, said in (
         ("east", {"x_m": "east", "y_m": "north"}, both),

@@ -178,7 +178,7 @@ def moments_of(variance: list[float], correlation: float) -> CircularMoments:
         (lambda: make_wrapped_normal([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]), "positive definite"),
         (lambda: make_wrapped_normal([0.0, 0.0], [[1.0, 0.5], [0.4, 1.0]]), "symmetric"),
         (lambda: make_wrapped_normal([np.nan, 0.0], np.eye(2)), "finite"),
-        (lambda: make_wrapped_normal([0.0, 0.0, 0.0], np.eye(3)), "give"),
+        (lambda: make_wrapped_normal([0.0, 0.0, 0.0], np.eye(3)), "expected"),
         (lambda: wrapped_normal.five_samples(moments_of([1.0, 1.0], 0.1), 0.6), "central weight"),
         (lambda: wrapped_normal.five_samples(moments_of([1.0, 1.0], 1.1)), "circular correlation"),
         (lambda: wrapped_normal.fit_moments(moments_of([0.0, 1.0], 0.1)), "not in"),
