@@ -329,7 +329,7 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
         words = view if written else [str(log) if word == LOG else word for word in opens]
         for sentence in told[:1]:
             say(f"{log}: {sentence}")
-        say(f"  {shlex.join(['fuselog', *words])}")
+        say(shlex.join(["fuselog", *words]))
     rows = [
         [
             each["estimator"],
