@@ -9,9 +9,10 @@ import hashlib
 import math
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
@@ -58,10 +59,8 @@ NIS, COMPONENTS = "nis_per_component", "components"
 SIZES = {"nees": COMPONENTS, "position_nees": "position_components"}  # of which they are the aims
 FAULTS, GAIN = "faults", "gain"  # by which logs are sorted without errors
 # Columns that identify a row, and columns with texts; all others are metrics.
-KEYS, TEXTS = (
-    ("log", "group", "estimator", "case"),
-    ("problem", "doubt", "finding", "estimates", "sha256"),
-)
+KEYS = ("log", "group", "estimator", "case")
+TEXTS = ("problem", "doubt", "kind", "where", "setting", "finding", "estimates", "sha256")
 LOG = "LOG"  # stands for the log in the words of a command
 OTHERS = (*KEYS, *TEXTS, *SIZES.values())
 PRINTED = ("nees", NIS, FAULTS, GAIN)
@@ -102,8 +101,8 @@ class Replaying:
                 return [{"estimator": label, "problem": why} for label, why in refused.items()]
             done = self._replay(log, others, folder / name)
         rows = [*_rows_of(done), *({"estimator": of, "problem": why} for of, why in refused.items())]
-        written = None if self.place is None else name.as_posix()
-        return [row | {"sha256": hash_of(log), "estimates": written} for row in rows]
+        about = {"sha256": hash_of(log), "estimates": None if self.place is None else name.as_posix()}
+        return [row | about for row in rows]
 
     def _refusal(self, log: Path, label: str) -> str:
         """Return why an estimator cannot replay a log; empty if it can."""
@@ -140,7 +139,8 @@ def _rows_of(done: Pass) -> list[Row]:
     failures = [sentence for _, sentence in done.judge.failed_runs]
     for (label, case), row in rows.items():
         row["doubt"] = doubts.get((label, case))
-        own = [each for each in failures if each.startswith(" ".join(filter(None, (label, case))))]
+        name = " ".join(filter(None, (label, case)))
+        own = [each for each in failures if each.startswith((f"{name} ", f"{name}:"))]
         row["problem"] = "; ".join(own) or None
     return list(rows.values())
 
@@ -170,7 +170,8 @@ class Campaign(NamedTuple):
 
     def run(self, task: Task, kind: Kind, settings: Mapping[str, Any]) -> OverLogs:
         """Run a task over the logs, and write its rows and verdicts to the result folder."""
-        with result_folder(self.out) as part, self.table(task, part) as table:
+        with self.table(task) as (table, hand_over), result_folder(self.out) as part:
+            hand_over(part)
             outcome = Outcome(tables={"logs": table}, kind=kind)
             verdicts = pd.DataFrame(_measured(table, outcome))
             if len(verdicts):
@@ -183,17 +184,17 @@ class Campaign(NamedTuple):
         return OverLogs(table, verdicts, self.out)
 
     @contextmanager
-    def table(self, task: Task, folder: Path) -> Iterator[pd.DataFrame]:
-        """Yield the rows of a task, the worst log first, and keep them until the block has succeeded.
+    def table(self, task: Task) -> Iterator[tuple[pd.DataFrame, Callable[[Path], None]]]:
+        """Yield the rows of a task, the worst log first, and a function that moves its files.
 
-        The files that the task wrote are moved to a folder.
+        The function takes the folder. Rows and files are kept until the block has succeeded.
         """
         check_outputs(self.out, None, {"log": self.selection.logs})
         with checkpoints_of(self.out) as checkpoints:
             batches = batches_of(task, self.selection.logs)
             found = list(over_logs(batches, self.open_pool, checkpoints, self.progress))
-            checkpoints.hand_over([batch.key for batch in batches], folder)
-            yield worst_first(_table_of(self.selection, found))
+            hand_over = partial(checkpoints.hand_over, [batch.key for batch in batches])
+            yield worst_first(_table_of(self.selection, found)), hand_over
 
 
 def campaign_of(selection: Mapping[str, Any], out: Path) -> Campaign:
@@ -329,7 +330,7 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
         words = view if written else [str(log) if word == LOG else word for word in opens]
         for sentence in told[:1]:
             say(f"{log}: {sentence}")
-        say(f"  {shlex.join(['fuselog', *words])}")
+        say(shlex.join(["fuselog", *words]))
     rows = [
         [
             each["estimator"],

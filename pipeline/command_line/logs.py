@@ -45,8 +45,13 @@ if TYPE_CHECKING:
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     """Show what LOG contains: the run, its topics, schemas, message counts, and the models that fit it.
 
-    LOG may be a log, an estimates log, a ROS bag, a result folder or a timeline (.rrd).
+    LOG may be a log, an estimates log, a ROS bag, a result folder, a catalog or a timeline (.rrd).
     """
+    if selecting([log], {}):
+        from fuselog.pipeline.logs.cataloguing import show_catalog
+
+        show_catalog([log], as_json=as_json)
+        return
     from fuselog.pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
@@ -247,7 +252,8 @@ def view(paths: tuple[Path, ...], where: str | None, **options: Any) -> None:
         from fuselog.pipeline.logs.cataloguing import select
 
         paths = tuple(select(paths, where).logs)
-    view_path(paths, Options(**options))
+    kept = [path / "estimates" for path in paths if (path / "tables" / "logs.parquet").is_file()]
+    view_path(kept if len(kept) == len(paths) else paths, Options(**options))
     _say_next_of_view(paths[0], recover=options["recover"])
 
 

@@ -8,7 +8,6 @@ from fuselog.pipeline.api.over_logs import OTHERS, SIZES, Campaign, Replaying, a
 from fuselog.pipeline.comparing.candidates import Candidate
 from fuselog.pipeline.comparing.comparing import Differences, differences_of
 from fuselog.pipeline.selecting.selection import notes_of
-from fuselog.recorders.atomic import scratch_folder
 from fuselog.recorders.errors import BadInput
 
 
@@ -24,7 +23,7 @@ def compare_over_logs(
     labels = list(task.estimators)
     if len(labels) < 2:
         raise BadInput("name two estimators to compare over a selection of logs: -e ekf -e ukf")
-    with scratch_folder("fuselog-compare") as folder, campaign.table(task, folder) as table:
+    with campaign.table(task) as (table, _):
         rows = _in_common(table)
         if rows["estimator"].nunique() < len(labels):
             raise BadInput(f"no log was replayed by {' and '.join(labels)}; fuselog replay shows why")

@@ -254,12 +254,12 @@ def logs_meant(paths: Sequence[Path], where: str | None = None) -> Selection:
 def show_catalog(
     paths: Sequence[Path],
     *,
-    out: Path | None,
-    deep: bool,
-    where: str | None,
-    workers: int | None,
-    scheduler: str | None,
     as_json: bool,
+    out: Path | None = None,
+    deep: bool = False,
+    where: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> None:
     """Describe logs, write the catalog, and print the rows that meet a condition."""
     found = catalogued(

@@ -18,7 +18,7 @@ import fuselog as fl
 from fuselog.pipeline.api.over_logs import over_units
 from fuselog.pipeline.logs import cataloguing
 from fuselog.pipeline.runs.batches import Batch
-from fuselog.pipeline.selecting.catalog import rows_in, schema
+from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, schema
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
@@ -111,6 +111,10 @@ def test_a_catalog_as_json(drives: Path, fuselog: Callable[..., Said]) -> None:
     wanted = fl.catalog(drives, deep=True, where="folder == 'robot1'")
     assert said == {"logs": rows_in(wanted[schema().names])}
     assert [row["sha256"] is None for row in said["logs"]] == [False, False, True]
+    fuselog("catalog", drives, "-o", "logs.parquet")
+    assert fuselog("info", "logs.parquet", "--json").json["logs"] == rows_in(
+        read_catalog(Path("logs.parquet"))
+    )
 
 
 def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
@@ -236,6 +240,8 @@ def test_each_log_of_a_selection_has_a_row(drives: Path, fuselog: Callable[..., 
     shown = fuselog("replay", "logs.parquet", "-e", "ekf", "--group", "folder", "--out", "out/other").out
     assert "fuselog info drives/robot1/drive5.mcap" in shown
     assert "there are only 2" in shown
+    assert fuselog("view", "out/replay", "--save", "viewed").code == 0
+    assert len(list(Path("viewed").glob("*.rrd"))) == 4
 
 
 @pytest.mark.paper

@@ -67,6 +67,15 @@ sweep landmarks --runs 2 --set duration_s=5 --over range_bearing.sigma_range_m=0
 report compared diagnosed swept -o pages.html
 view run.mcap --save view.rrd
 view view.rrd --start 1
+catalog run.mcap other.mcap drive.csv -o logs.parquet
+catalog logs.parquet --where seed<1
+catalog logs.parquet --where sed<1
+replay logs.parquet -e ekf -o replayed
+compare logs.parquet -e ekf -e ukf --out both
+lint logs.parquet --where seed<1 --out linted
+diagnose logs.parquet --where seed<1 -e ekf --out diagnoses
+check logs.parquet --against ekf.golden.xz --out checked
+run logs.parquet -e ekf --out ran
 """.strip().splitlines()
 
 
