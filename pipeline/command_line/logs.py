@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     """Show what LOG contains: the run, its topics, schemas, message counts, and the models that fit it.
 
-    LOG may be a log, an estimates log, a ROS bag, a result folder or a timeline (.rrd).
+    LOG may be a log, an estimates log, a ROS bag, a result folder or a timeline (.rrd). If it is the URL
+    of a log, only its summary is fetched.
     """
     from fuselog.pipeline.logs.information import show_log
 

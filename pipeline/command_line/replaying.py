@@ -60,7 +60,8 @@ folds_option = click.option(
     "-o",
     "--out",
     type=LOG_OR_FOLDER,
-    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log].",
+    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log, "
+    "or the current folder if it is a URL].",
 )
 @model_option
 @click.option(
