@@ -129,7 +129,7 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
     """Open a log as a mapping of its topics to their streams, which are read on demand.
 
     Args:
-        path: an MCAP file.
+        path: an MCAP file, or its URL.
         recover: read the intact part of a truncated or damaged log; a warning states what is missing.
 
     Returns:

@@ -57,7 +57,8 @@ class _Sections(click.Group):
     cls=_Sections,
     context_settings={"help_option_names": ["-h", "--help"]},
     help=with_examples(
-        "Record, replay, evaluate and visualise estimators for sensor fusion.",
+        "Record, replay, evaluate and visualise estimators for sensor fusion.\n\n"
+        "A log can be a file, or a URL that fsspec can open, such as https:// or s3://.",
         "fuselog record landmarks --seed 7 -o run.mcap",
         "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
         "fuselog view est.mcap",

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     """Show what LOG contains: the run, its topics, schemas, message counts, and the models that fit it.
 
-    LOG may be a log, an estimates log, a ROS bag, a result folder, a catalog or a timeline (.rrd).
+    LOG may be a log, an estimates log, a ROS bag, a result folder, a catalog or a timeline (.rrd). If it
+    is the URL of a log, only its summary is fetched.
     """
     if selecting([log], {}):
         from fuselog.pipeline.logs.cataloguing import show_catalog

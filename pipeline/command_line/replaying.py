@@ -64,8 +64,8 @@ folds_option = click.option(
     "-o",
     "--out",
     type=LOG_OR_FOLDER,
-    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log]; "
-    "for a catalog, the result folder [default: out/replay].",
+    help="The folder for LOG.estimates.mcap, or an .mcap file for one log [default: next to the log, "
+    "or the current folder if it is a URL]; for a catalog, the result folder [default: out/replay].",
 )
 @selection_options
 @model_option

@@ -34,9 +34,12 @@ _VALUE = re.compile(r"(?<=[?&])([^=&#\s]+)=(?:(?!::)[^&#\s])+?(?=::|[&#]|[:;,.)'
 _WEB_PAGE = re.compile(rb"\s*(<\?xml[^>]*>\s*)?(<!doctype html|<html)", re.IGNORECASE)
 
 
+MASK = "***"
+
+
 def masked(text: str) -> str:
-    """Replace users, passwords and the values of queries in the URLs of a text by `***`."""
-    return _VALUE.sub(r"\1=***", _USER.sub("***", text)) if "://" in text else text
+    """Replace users, passwords and the values of queries in the URLs of a text by `MASK`."""
+    return _VALUE.sub(rf"\1={MASK}", _USER.sub(MASK, text)) if "://" in text else text
 
 
 class Identity(NamedTuple):
@@ -104,10 +107,14 @@ def matches_of(url: str) -> list[str]:
 
 
 class RangeFile:
-    """A remote file of which only the requested bytes are fetched."""
+    """A remote file of which only the requested bytes are fetched.
+
+    Attributes:
+        is_lost: whether a request failed after all repetitions.
+    """
 
     def __init__(self, url: str) -> None:
-        self._url = url
+        self._url, self.is_lost = url, False
         self._opened: _Opened | None = None
 
     def read(self, offset: int, length: int) -> bytes:
@@ -125,7 +132,11 @@ class RangeFile:
                 raise WrongLength(f"{len(found)} of {length} bytes arrived")
             return found
 
-        return _answer(self._url, answer)
+        try:
+            return _answer(self._url, answer)
+        except BadInput:
+            self.is_lost = True
+            raise
 
     def close(self) -> None:
         """Close the file."""

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 from urllib.parse import urlsplit
 
+from fuselog.recorders.errors import BadInput
 from fuselog.recorders.remote.backends import (
+    MASK,
     Identity,
     NoRanges,
     RangeFile,
@@ -69,6 +71,8 @@ class RemotePath(_LocalPath):
     @cached_property
     def identity(self) -> Identity:
         """Ask for the version of the file, once: other versions are refused later."""
+        if MASK in self.url:
+            raise BadInput(f"{self}: was stored without its password or key; give the complete URL")
         if self.is_dir():
             raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(self))
         return identity_of(self.url)
@@ -132,7 +136,7 @@ class RemotePath(_LocalPath):
     def is_dir(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002
         """Test whether the URL has `*` or a final `/`."""
         first = self.url.partition("::")[0]
-        return first.endswith("/") or "*" in first
+        return first.endswith("/") or "*" in first.replace(MASK, "")
 
     def is_file(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002
         """Test whether the URL names a single file."""
@@ -210,7 +214,7 @@ def reference_to(log: Path, beside: Path) -> str:
 def referred_to(text: str, beside: Path) -> Path:
     """Find the log to which the file `beside` refers with a text of `reference_to`."""
     if _URL.match(text):
-        return RemotePath(text)
+        return located(text)
     if not isinstance(beside, RemotePath):
         return (beside.parent / text).resolve()
     first, sign, archive = beside.url.partition("::")
@@ -276,4 +280,5 @@ class RangeStream(io.RawIOBase):
         if not self.closed:
             super().close()
             self._file.close()
-            check_unchanged(self._path.url, self._path.identity)
+            if not self._file.is_lost:
+                check_unchanged(self._path.url, self._path.identity)

@@ -61,6 +61,7 @@ ABOUT_OTHERS = (
     "known_answers",
     "outputs",
     "presenting",
+    "remote",
     "report",
     "shipped_experiments",
 )

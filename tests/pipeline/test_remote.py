@@ -17,7 +17,7 @@ from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Log, make_stream, open_log, read_streams, schemas, write_log
 from fuselog.recorders.recording import record_run
-from fuselog.recorders.remote import backends
+from fuselog.recorders.remote import backends, paths
 from fuselog.recorders.remote.paths import located, partly
 from fuselog.replay.engine.streams.sources import LogSource, in_memory
 from tests.pipeline.site import Site, served
@@ -41,10 +41,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def site(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    """The logs on a web server; an empty cache, an empty current folder, and no patience."""
+    """The logs on a web server; an empty cache, an empty current folder, and no pauses."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(backends, "PAUSES_S", (0.0, 0.0))
-    monkeypatch.setattr(backends, "PATIENCE_S", 0.4)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     shutil.copytree(logs, tmp_path / "site")
@@ -64,22 +63,29 @@ def hashes_of(log: Log) -> str:
     return hash_streams([in_memory(LogSource(log), log.topics)])
 
 
-def test_info_fetches_two_per_cent_of_a_log(fuselog, site, copies):
-    url = f"{site.url}/large.mcap"
-    by_ranges, whole = open_log(partly(located(url))), open_log(site.folder / "large.mcap")
-    assert (by_ranges.run, by_ranges.topics) == (whole.run, whole.topics)
-    site.sent = 0
-    said = fuselog("info", url, "--json").json
-    assert site.sent < 0.02 * (site.folder / "large.mcap").stat().st_size
-    local = fuselog("info", site.folder / "large.mcap", "--json").json
-    assert said == {**local, "path": url, "findings": None, "estimators": said["estimators"]}
-    assert copies() == []
+def test_the_summary_is_at_most_two_per_cent_of_a_log(site, copies):
+    local = site.folder / "large.mcap"
+    log, whole = open_log(partly(located(f"{site.url}/large.mcap"))), open_log(local)
+    assert (log.run, log.topics) == (whole.run, whole.topics)
+    assert site.sent < 0.02 * local.stat().st_size
     # a chunk that is needed is fetched, and the others are not
-    (first,) = read_streams(by_ranges, ["/range"], end_ns=10**9).values()
+    (first,) = read_streams(log, ["/range"], end_ns=10**9).values()
     assert len(first) == 100
-    assert site.sent < 0.5 * (site.folder / "large.mcap").stat().st_size
+    assert site.sent < 0.5 * local.stat().st_size
+    assert copies() == []
 
 
+@pytest.mark.paper
+def test_info_needs_only_the_summary(fuselog, site, copies):
+    url, local = f"{site.url}/large.mcap", site.folder / "large.mcap"
+    said = fuselog("info", url, "--json").json
+    assert site.sent < 0.02 * local.stat().st_size
+    assert copies() == []
+    told = fuselog("info", local, "--json").json
+    assert said == {**told, "path": url, "findings": None, "estimators": said["estimators"]}
+
+
+@pytest.mark.paper
 def test_commands_take_a_url(fuselog, site, copies):
     """The outputs are in the current folder, refer to the URL, and are those of the local log."""
     url, local = f"{site.url}/run.mcap", site.folder / "run.mcap"
@@ -107,6 +113,7 @@ def test_commands_take_a_url(fuselog, site, copies):
     assert copies() == []
 
 
+@pytest.mark.paper
 def test_folders_patterns_and_archives(fuselog, site):
     """A folder is listed by its page, and a zip is read through the server; each log is a run."""
     place = site.folder / "day"
@@ -166,15 +173,17 @@ def test_a_log_without_a_summary(fuselog, site, caplog):
         ("run.mcap", {"status": 401}, "access refused; check the credentials"),
         ("run.mcap", {"status": 403}, "access refused; check the credentials"),
         ("run.mcap", {"status": 503}, "the request failed 3 times \\(status 503\\)"),
-        ("run.mcap", {"silent_s": 0.6}, "no answer within 0.4 s, 3 times"),
+        ("run.mcap", {"silent_s": 0.2}, "no answer within 0.1 s, 3 times"),
         ("run.mcap", {"login": True}, "the server sent a web page instead of the log"),
         ("run.mcap", {"stated_bytes": 9}, "the request failed 3 times \\(WrongLength"),
         ("run.mcap", {"stated_bytes": -9}, "the request failed 3 times|cut off|its footer is missing"),
     ],
 )
 @pytest.mark.parametrize("command", [["info"], ["replay", "-e", "ekf"]])
-def test_faults_are_one_sentence(fuselog, site, copies, name, fault, reason, command):
+def test_faults_are_one_sentence(fuselog, site, monkeypatch, name, fault, reason, command):
     """It names the URL without its secrets, and nothing is left behind."""
+    if "silent_s" in fault:
+        monkeypatch.setattr(backends, "PATIENCE_S", 0.1)
     vars(site).update(fault)
     url = f"{site.url.replace('//', f'//me:{SECRET}@')}/{name}?sig={SECRET}"
     first, *options = command
@@ -185,6 +194,23 @@ def test_faults_are_one_sentence(fuselog, site, copies, name, fault, reason, com
     assert f"{site.url.replace('//', '//***@')}/{name}?sig=***: " in said.err
     assert re.search(reason, said.err)
     assert list(Path().iterdir()) == []
+
+
+@pytest.mark.paper
+def test_results_keep_no_password(fuselog, site, monkeypatch):
+    """Another process can therefore not open such a log again, and says why."""
+    url = f"{site.url.replace('//', f'//me:{SECRET}@')}/run.mcap?sig={SECRET}"
+    shown = f"{site.url.replace('//', '//***@')}/run.mcap?sig=***"
+    assert fuselog("run", url, "-e", "ekf", "--out", "result").code == 0
+    assert fuselog("replay", url, "-e", "ekf", "-o", "estimates.mcap").code == 0
+    assert fuselog("evaluate", "estimates.mcap").code == 0
+    assert shown in Path("result/result.json").read_text()
+    files = [each for each in Path().rglob("*") if each.is_file()]
+    assert not [each for each in files if SECRET.encode() in each.read_bytes()]
+    monkeypatch.setattr(paths, "_urls", {})
+    assert fuselog("evaluate", "estimates.mcap").err == (
+        f"fuselog: {shown}: was stored without its password or key; give the complete URL\n"
+    )
 
 
 def test_a_log_that_changes_is_not_mixed(site, monkeypatch):
