@@ -56,7 +56,12 @@ def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[
 
 
 def add_rows(values: Floats, totals: Floats) -> None:
-    """Compute the sums (d,) of the columns of values (n, d), row by row."""
+    """Sum the columns of values, row by row.
+
+    Args:
+        values: (n, d).
+        totals: (d,), filled.
+    """
     for column in range(len(totals)):
         totals[column] = 0.0
     for row in range(len(values)):

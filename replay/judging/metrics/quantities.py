@@ -87,7 +87,13 @@ def fill_columns(
 def fill_innovations(
     accepted: NDArray[np.bool_], degrees: Integers, squared: Floats, stated: Floats, columns: Floats
 ) -> None:
-    """Fill the rows (n, 5) to sum for innovations (n,); see `OfRuns`."""
+    """Fill the rows to sum for innovations; see `OfRuns`.
+
+    Args:
+        accepted, degrees, squared: (n,), as in `Innovations`.
+        stated: (n,), log-likelihoods; NaN if they are not stated.
+        columns: (n, 5), filled.
+    """
     for row in range(len(columns)):
         is_accepted = accepted[row]
         columns[row, 0], columns[row, 1] = float(is_accepted), float(degrees[row])
