@@ -18,6 +18,7 @@ from fuselog.recorders.common_streams import (
     stated_numbers,
     truth_stream,
 )
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.log import Schema, Stream, make_stream, schemas
 from fuselog.recorders.log.streams import divide
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
@@ -284,7 +285,7 @@ def _look(
         place[:] = each.poses_at(times_s)[:2] if isinstance(each, Drives) else each.T[:, :, None]
     pose = np.stack(robot.poses_at(times_s))[:, :, :, None]
     distance, bearing = range_bearing(pose, places)
-    bearing = wrap_angle(bearing)
+    _wrap(bearing.reshape(-1))
     half_view = np.radians(sensor.field_of_view_deg) / 2
     visible = (distance <= sensor.maximum_range_m) & (np.abs(bearing) <= half_view)
     outages_s = []
@@ -340,8 +341,18 @@ def _bearing(sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator
     noise, place, chance = _drawn(seen, rngs)
     measured = seen.bearing_rad + sensor.bias_bearing_rad + noise * sensor.sigma_bearing_rad
     is_outlier = chance < sensor.outlier_probability
-    wrapped: Floats = wrap_angle(np.where(is_outlier, -np.pi + 2 * np.pi * place, measured))
-    return wrapped
+    measured = np.where(is_outlier, -np.pi + 2 * np.pi * place, measured)
+    _wrap(measured)
+    return measured
+
+
+def wrap(angles: Floats) -> None:
+    """Wrap angles (n,) in place; see `wrap_angle`."""
+    for place in range(len(angles)):
+        angles[place] = wrap_angle(angles[place])
+
+
+_wrap = compiled(wrap)
 
 
 def _clocks(

@@ -23,7 +23,7 @@ from fuselog.recorders.log import (
 )
 from fuselog.recorders.log.impossible import Rejections, main_span, main_span_of, possible
 from fuselog.recorders.recording import Recording
-from fuselog.replay.engine.streams.blocks import gather, is_in_order
+from fuselog.replay.engine.streams.blocks import Ragged, is_in_order
 
 
 class Source(Protocol):
@@ -324,7 +324,7 @@ class MemorySource(_Readable):
     def in_order(self, topic: str, order: Clock) -> Stream:
         """Return `topic` in the order of the clock `order`; equal stamps keep the order of the file."""
         stream = self.stream_of(topic)
-        if is_in_order(gather([stream]), order):
+        if is_in_order(Ragged(stream, np.array([0, len(stream)])), order):
             return stream
         return stream.take(np.lexsort((stream.position, stream.times(order))))
 

@@ -172,13 +172,13 @@ def add_error(
     yz: float,
     zz: float,
 ) -> float:
-    """Add an error e = (x, y, z) and its weight W to the sums in a frame, and return e' W e.
+    """Add an error e and its weight W to the sums in one frame, and return e' W e.
 
     Args:
-        sums: (15,), the sums, which are changed.
-        time_s: time of the error.
-        x, y, z: the error.
-        xx, xy, xz, yy, yz, zz: the entries of the symmetric W.
+        sums: (15,), see `ConstantSums`.
+        time_s: the time.
+        x, y, z: e.
+        xx, xy, xz, yy, yz, zz: W.
     """
     u, v, w = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
     sums[0] += x

@@ -350,9 +350,9 @@ def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tu
     topic = estimates.stream.metadata.get("truth", "")
     if not all(topic in source.topics for source in sources):
         return ()
-    there = set(names).intersection(
-        *(stated_components(source.topics[topic].metadata, {}, topic) for source in sources)
-    )
+    stated = [source.topics[topic].metadata for source in sources]
+    alike = {(each.get("components"), each.get("kinds")): each for each in stated}
+    there = set(names).intersection(*(stated_components(each, {}, topic) for each in alike.values()))
     return tuple(
         name
         for _, columns in manifold_blocks(list(components.values()))
@@ -450,7 +450,8 @@ def _truth_around(
     if plane is not None:
         truth = into_plane_of(truth, plane)
     columns = match_components(truth.metadata, components, f"{truths.source.name}: topic {topic}")
-    return truth.publish_time_ns, truth["state"][:, columns]
+    state = truth["state"]
+    return truth.publish_time_ns, state if columns == list(range(state.shape[1])) else state[:, columns]
 
 
 def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:

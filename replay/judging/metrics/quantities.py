@@ -90,10 +90,8 @@ def fill_innovations(
     """Fill the rows to sum for innovations; see `OfRuns`.
 
     Args:
-        accepted: (n,), whether the gate accepted the innovation.
-        degrees: (n,), number of measured components.
-        squared: (n,) NIS.
-        stated: (n,) log-likelihood; NaN if it is not stated.
+        accepted, degrees, squared: (n,), as in `Innovations`.
+        stated: (n,), log-likelihoods; NaN if they are not stated.
         columns: (n, 5), filled.
     """
     for row in range(len(columns)):

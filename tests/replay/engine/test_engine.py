@@ -16,6 +16,7 @@ from fuselog.recorders.log import Clock, LogWriter, RunMetadata, Stream, make_st
 from fuselog.recorders.recording import Recording, record_run
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import Report, collect, replay
+from fuselog.replay.engine.replaying.usage import Usage
 from fuselog.replay.engine.streams import ensembles
 from fuselog.replay.engine.streams.blocks import (
     Block,
@@ -408,3 +409,41 @@ def test_filters_of_the_same_topics_share_their_events(few: int, monkeypatch: py
     for each in bounds:
         alone = {topic: rows.stream for topic, rows in collect(replay(sources, [each])).items()}
         assert_equal(alone, {topic: together[topic].stream for topic in alone})
+
+
+def test_a_map_that_states_two_positions_of_a_landmark_is_doubtful() -> None:
+    """Only within a run; if several runs do, the last one is named."""
+    of_runs = [
+        ([5, 6], [[0, 0], [1, 0]]),
+        ([7, 5, 7], [[0, 0], [9, 0], [0, 2]]),
+        ([5, 6, 6, 5], [[0, 0], [1, 0], [1, 1], [3, 4]]),
+        ([5, 5, 6], [[8, 0], [8, 0], [7, 7]]),
+    ]
+    maps = [
+        make_stream("/map", schemas.LANDMARK, [0] * len(ids), landmark_id=ids, position_m=places)
+        for ids, places in of_runs
+    ]
+    usage = Usage("ekf")
+    usage.note_start({"/map": gather(maps)})
+    assert usage.doubtful == {"/map": "landmark 5 is stated at two positions, 5 m apart"}
+    assert usage.given["/map"] == 12
+    sound = Usage("ekf")
+    sound.note_start({"/map": gather([maps[0], maps[3]])})
+    assert not sound.doubtful
+
+
+def test_impossible_messages_of_one_run_of_an_ensemble_are_left_out_and_counted() -> None:
+    topic = "/robot1/range_bearing"
+    sound, bad = (memory_source(*record_run("landmarks", {"duration_s": 2.0}, 3, k)) for k in (0, 1))
+    stream = bad.streams[topic]
+    values = stream["range_m"].copy()
+    values[[3, 5]] = np.inf
+    wrong = replace(stream, columns={**stream.columns, "range_m": values})
+    bad = replace(bad, streams={**bad.streams, topic: wrong})
+    runs = Ensemble([sound, bad])
+    (block,) = runs.blocks([topic], "publish_time", 100)
+    counts = len(sound.streams[topic]), len(stream) - 2
+    assert np.diff(block[topic].offsets).tolist() == list(counts)
+    assert np.isfinite(block[topic]["range_m"]).all()
+    assert not sound.rejections
+    assert bad.rejections[topic].total() == 2
