@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -117,7 +118,7 @@ def kept_numbers(request: pytest.FixtureRequest) -> Iterator[None]:
         assert opposite(name, settings, outcome.claims) == []
         result = write_outcome(folder, name, settings, outcome)
         if in_full and is_new(name, settings, outcome):
-            told(result, folder)
+            assert_whole(result, told(result, folder))
         viewed(name, folder)
         return result
 
@@ -142,18 +143,28 @@ _TOLD: set[tuple[str, ...]] = set()
 
 
 def is_new(name: str, settings: Mapping[str, Any], outcome: Outcome) -> bool:
-    """Whether nothing was told of a study with these tables and figures."""
-    key = settings.get("study", name), *outcome.tables, *outcome.figures
+    """Whether nothing was told of an experiment or study with these tables and figures."""
+    key = name, settings.get("study", name), *outcome.tables, *outcome.figures
     is_known = key in _TOLD
     _TOLD.add(key)
     return not is_known
 
 
-def told(result: Result, folder: Path) -> None:
-    """Have `run`'s sentences and the report of what a study found."""
+def told(result: Result, folder: Path) -> str:
+    """Have `run`'s sentences and the report of what a study found; return the page."""
     run_sentences(result, folder)
     with TemporaryDirectory() as place:
-        write_report([folder], Path(place, "report.html"))
+        page = Path(place, "report.html")
+        write_report([folder], page)
+        return page.read_text(encoding="utf-8")
+
+
+def assert_whole(result: Result, page: str) -> None:
+    """A result has metrics, none of them of more runs than it has, and its page a value in each cell."""
+    assert result.metrics
+    stated = re.findall(r"first-(\d+)-runs", " ".join(result.metrics))
+    assert max(map(int, stated), default=0) <= result.settings["runs"]
+    assert not re.search(r">\s*-?((?i:nan|inf)|None)\s*<", page)
 
 
 _VIEWED: set[tuple[str, bool]] = set()

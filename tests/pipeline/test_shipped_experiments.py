@@ -12,6 +12,7 @@ from fuselog.pipeline.output.results import read_result
 from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
 from tests.claims.few_runs import opposite
+from tests.pipeline.conftest import assert_whole
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
@@ -19,10 +20,7 @@ Fuselog = Callable[..., Any]
 
 # the smallest form of each: its options of `run`, then what --set sets
 SMALLEST: dict[str, tuple[str, ...]] = {
-    "acoustic": ("--runs 2", "shots=2", "options.multipliers=[1.0]", "options.maps.step_m=50.0"),
     "acoustic-sequence": ("--runs 2", "shots=3", "mixture.kind=particles:20"),
-    "bingham-2d": ("--runs 2",),
-    "bingham-4d": ("--runs 2",),
     "biometrics-sequential-simulated": (
         "--runs 1",
         "users=40",
@@ -35,7 +33,6 @@ SMALLEST: dict[str, tuple[str, ...]] = {
         "options.watched=4",
         "options.watched_probes=200",
     ),
-    "biometrics-simulated": ("--runs 1", "users=20", "low_galleries=2", "options.replicates=5"),
     "calibration": ("--runs 1", "options.seeds=[3000]", "options.motions=[]"),
     "crossing": (
         "--runs 1",
@@ -45,16 +42,11 @@ SMALLEST: dict[str, tuple[str, ...]] = {
     ),
     "diagnosis": ("--runs 1", 'options.faults=["landmarks-bias"]', "options.battery_runs=0"),
     "ellipsoid": ("--runs 1", "options.seeds=[5000]"),
-    "extended-target": ("--runs 1", "points=10"),
     "false-causes": ("--runs 1", "options.to_fix=[1.0]", "options.to_compass=[0.0]"),
     "faults-together": ("--runs 1", "options.pairs=1", "options.triples=1"),
     "imu-grades": ("--runs 1", "duration_s=22", "gnss.outages_s=[[10, 21]]"),
-    "ispace": ("--runs 1", "steps=12"),
-    "ispace-stress": ("--runs 1",),
     "landmarks": ("--runs 1", "duration_s=2"),
-    "lcd-sampling": ("--runs 1", "options.sizes=[[2, 5]]", "options.starts=1"),
     "los-moving": ("--runs 1", "duration_s=2"),
-    "los-three-sensors": ("--runs 2", "passes=1"),
     "los-two-sensors": ("--runs 2", "passes=1"),
     "lrkf-dimension": (
         "--runs 1",
@@ -69,18 +61,30 @@ SMALLEST: dict[str, tuple[str, ...]] = {
     "navigation-heading": ("--runs 1", "duration_s=12"),
     "navigation-simulated": ("--runs 1", "duration_s=12"),
     "navigation-unknown-heading": ("--runs 1", "duration_s=12"),
-    "reactor": ("--runs 1",),
-    "relative-bearings": ("--runs 1",),
     "sensor-noise": ("--runs 1", "options.seeds=[1000]"),
-    "set-filter": ("--runs 1", "duration_s=3"),
     "torus-filter": ("--runs 2", "options.grid_cells=16"),
-    "torus-propagation": ("--runs 2", "options.correlations=[0.0]", "options.couplings_rad=[0.5]"),
     "tuning": ("--runs 1", "options.durations_s=[5.0]"),
-    "vehicles-ctm2": ("--runs 1", "duration_s=3"),
     "vehicles-ctm4": ("--runs 1", "duration_s=3", "options.few_runs=0"),
     "vehicles-cv": ("--runs 1", "duration_s=2"),
-    "vehicles-scaling": ("--runs 1", "duration_s=2", "options.vehicles=[2]"),
     "warehouse-uwb": ("--runs 1", "duration_s=5"),
+}
+# what tests of studies run; their results are reported and viewed by `kept_numbers`
+STUDIED = {
+    "acoustic": "test_angle_studies",
+    "bingham-2d": "families/directional/test_bingham_study",
+    "bingham-4d": "families/directional/test_bingham_study",
+    "biometrics-simulated": "families/biometrics/test_biometrics_study",
+    "extended-target": "families/sampling/test_linearization_studies",
+    "ispace": "families/networks/test_network_studies",
+    "ispace-stress": "families/networks/test_stress_studies",
+    "lcd-sampling": "families/sampling/test_linearization_studies",
+    "los-three-sensors": "test_angle_studies",
+    "reactor": "families/sampling/test_linearization_studies",
+    "relative-bearings": "families/networks/test_network_studies",
+    "set-filter": "families/sets/test_set_filter_study",
+    "torus-propagation": "families/directional/test_torus_studies",
+    "vehicles-ctm2": "families/vehicles/test_vehicles_studies",
+    "vehicles-scaling": "families/vehicles/test_vehicles_studies",
 }
 # studies of numbers, without a log to draw
 WITHOUT_TIMELINE = {
@@ -91,17 +95,19 @@ WITHOUT_TIMELINE = {
     "faults-together",
     "lrkf-dimension",
     "sensor-noise",
-    "torus-propagation",
     "tuning",
-    "vehicles-scaling",
 }
 
 
-def test_each_that_ships_its_data_has_a_smallest_form() -> None:
+def test_each_that_ships_its_data_has_a_smallest_form_or_a_study() -> None:
     """Others import data, and `test_report` makes pages of their kept results."""
-    assert {*SMALLEST} == {
+    assert {*SMALLEST, *STUDIED} == {
         name for name in shipped("experiments") if not load_experiment(name, {}, {})[1].import_
     }
+    for name, file in STUDIED.items():
+        text = (Path(__file__).parent / f"{file}.py").read_text(encoding="utf-8")
+        assert "run_experiment" in text
+        assert re.search(rf'(load_experiment|run)\("{name}"', text), name
 
 
 @pytest.mark.parametrize("name", SMALLEST)
@@ -124,9 +130,5 @@ def test_its_smallest_form_is_run_reported_and_viewed(
         assert viewed.code or Path("saved.rrd").stat().st_size > 1000
         result = read_result(Path("result"))
         page = Path("page.html").read_text()
-    assert not re.search(r">\s*-?((?i:nan|inf)|None)\s*<", page)
-    assert result.metrics
-    few = int(runs.split()[1])
-    more = {n for n in re.findall(r"first-(\d+)-runs", " ".join(result.metrics)) if int(n) > few}
-    assert not more
+    assert_whole(result, page)
     assert opposite(name, result.settings, result.claims) == []
