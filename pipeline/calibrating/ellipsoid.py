@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.api.planning import Log, sources_of
@@ -21,10 +20,10 @@ from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2, unit_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.intervals import Interval
 
-Floats = NDArray[np.float64]
 FEWEST, MOST = 30, 20_000  # largest number of readings; larger sets are thinned
 _STILL_S = 0.5  # an accelerometer reading is a mean over this time, in which the sensor is still
 _STILL = 3.0  # limit on the spread of a still sensor, as a multiple of that of the quietest tenth

@@ -8,12 +8,11 @@ Vasconcelos et al., IEEE T-AES 2011, describe sets of readings that do not deter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from fuselog.pipeline.tuning.information import Undetermined, undetermined
+from fuselog.replay.engine.arrays import Floats
 
-Floats = NDArray[np.float64]
 AXES = "xyz"
 PAIRS = (0, 1), (0, 2), (1, 2)
 NAMES = (

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
 from fuselog.pipeline.calibrating.ellipsoid import Ellipsoid, ellipsoid
@@ -23,9 +22,9 @@ from fuselog.recorders.log import RunMetadata, make_stream, schemas
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
-Floats = NDArray[np.float64]
 FIELD, FORCE = "/imu.magnetic_field_ut", "/imu.specific_force_mps2"
 FIELD_UT = 48.0
 # offsets in the field's unit, scales, cross terms

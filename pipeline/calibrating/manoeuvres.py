@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.information import information
@@ -23,10 +22,10 @@ from fuselog.recorders.log import RunMetadata, Schema, Stream, schemas, topics_o
 from fuselog.recorders.recording import Recording
 from fuselog.recorders.simulators.car import MOTIONS, Car, CarParameters, philox, streams_of
 from fuselog.recorders.simulators.car import drive as simulated
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.ensembles import Ensemble
 from fuselog.replay.engine.streams.sources import MemorySource, Source, memory_source
 
-Floats = NDArray[np.float64]
 DURATION_S = 20.0
 PRIOR = 10.0  # standard deviation of a parameter before anything is recorded, in useful units
 SIMULATED = {

@@ -19,9 +19,8 @@ from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.divergence import find_divergence
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
-from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, split_topic
 
-Floats = NDArray[np.float64]
 # kinds of findings that precede causes, because they need no filter
 FIRST = ("lost messages", "gap", "stamps")
 TAIL = 3.0  # standard deviations

@@ -16,13 +16,13 @@ from fuselog.replay.judging.consistency.whiteness import Whiteness, whitened, wh
 from fuselog.replay.judging.errors.evaluation import (
     POSITION,
     Errors,
+    Floats,
     chi_square_interval,
     nis_by_bin,
     split_topic,
 )
 from fuselog.replay.timeline.drawing import canvas
 
-Floats = NDArray[np.float64]
 BIN_S = 1.0  # time in s over which NIS is averaged for its curve
 LINES = 400  # largest number of points in a curve; more would delay it behind the slider
 

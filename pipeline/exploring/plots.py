@@ -18,7 +18,6 @@ from bokeh.plotting import figure
 
 from fuselog.pipeline.exploring.curves import (
     Case,
-    Floats,
     Path,
     extremes,
     fewer,
@@ -29,6 +28,7 @@ from fuselog.pipeline.exploring.session import Played
 from fuselog.pipeline.exploring.sliders import Slider, ticks_between
 from fuselog.pipeline.output.words import label_of, quantity
 from fuselog.recorders.units import unit_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.judging.consistency.consistency import ellipses
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import Clock, Stream, make_stream, open_log, schemas, topics_of
@@ -27,9 +26,8 @@ from fuselog.replay.engine.vectors.components import (
     stated_components,
 )
 from fuselog.replay.engine.vectors.tangent import named_now, tangent_components, truth_at
-from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, split_topic
 
-Floats = NDArray[np.float64]
 # Function that computes a run's prior at a time in ns from an estimator's label and the log's prior.
 Origin = Callable[[str, Stream, int], Stream]
 Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)

@@ -7,13 +7,11 @@ second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.pipeline.sensing.terms import Terms
 from fuselog.replay.engine import chi2
+from fuselog.replay.engine.arrays import Floats, Integers
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 PER_DECADE = 8
 _BLOCK = 1 << 16
 _FULL = 1 << 17  # number of samples above which only some of the differences are used

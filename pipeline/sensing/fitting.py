@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from fuselog.pipeline.optimise import DROP_95, Cost, curvature, minimum, profile_ends
 from fuselog.pipeline.sensing.likelihood import Likelihood, Samples, likelihood
 from fuselog.pipeline.sensing.terms import Terms
+from fuselog.replay.engine.arrays import Floats
 
-Floats = NDArray[np.float64]
 _GAIN = 1e-7  # smallest gain of a step in log-likelihood
 # accuracy of interval ends, and doublings of the distance: up to 16 standard deviations
 _WITHIN, _DOUBLINGS = 1e-4, 4

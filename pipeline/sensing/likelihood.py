@@ -10,13 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.pipeline.sensing.terms import Terms
 from fuselog.recorders.compiling.compile import compiled
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fuselog.replay.engine.arrays import Floats, Integers
 
 
 class Samples(NamedTuple):

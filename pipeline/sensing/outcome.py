@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from fuselog.pipeline.api.api import ResultFolder
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve
@@ -17,9 +16,9 @@ from fuselog.pipeline.sensing.allan import Curve, interval
 from fuselog.pipeline.sensing.exports import FILES, Densities, Density
 from fuselog.pipeline.sensing.fitting import Fit
 from fuselog.recorders.units import unit_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.judging.intervals import Interval
 
-Floats = NDArray[np.float64]
 MISFIT = "misfit: "  # prefix of a sentence that users of the numbers should read first
 _TERMS = {  # names of the values in a table; {} is replaced by the unit of the column
     "white": "white noise N ({}/sqrt(Hz))",

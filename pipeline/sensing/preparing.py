@@ -4,16 +4,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from fuselog.pipeline.sensing.fitting import fit
 from fuselog.pipeline.sensing.likelihood import Samples, likelihood, residuals
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.units import unit_of
+from fuselog.replay.engine.arrays import Floats, Integers
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 FEWEST, SHORTEST_S = 500, 20.0
 MOST = 1 << 16  # largest number of samples in a likelihood; longer recordings are averaged in blocks
 _GAP = 1.75  # a step that is longer than this multiple of the median is a gap

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 from scipy.signal import lfilter
 
@@ -22,9 +21,9 @@ from fuselog.pipeline.sensing.terms import Terms
 from fuselog.recorders.log import RunMetadata, make_stream, schemas
 from fuselog.recorders.parameters import Parameters
 from fuselog.recorders.recording import Recording
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
-Floats = NDArray[np.float64]
 TURN = "/wheels.turn_radps"
 TERMS, STEP_S, SIZE = Terms(1e-3, 1e-4), 0.02, 65536
 TAUS_S = (1.0, 10.0, 100.0)

@@ -8,13 +8,12 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.pipeline.optimise import QUANTILE, Cost
 from fuselog.pipeline.tuning.search import UNIT, Coordinates
 from fuselog.recorders.parameters import Parameter
+from fuselog.replay.engine.arrays import Floats
 
-Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known only within a factor of about 2.7
 INVOLVED = 0.3  # component of a unit direction above which a parameter is involved
 PROFILE_POINTS = 9

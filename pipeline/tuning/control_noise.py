@@ -20,15 +20,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.altering.entries import entries_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive
 from fuselog.replay.engine.streams.sources import MemorySource
 
-Floats = NDArray[np.float64]
 PAIRS = 8  # number of pairs of copies with opposite noise; a power of two
 SEED = 62
 FEWEST = 20  # fewest messages from which noise can be estimated

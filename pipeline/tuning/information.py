@@ -12,16 +12,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.pipeline.optimise import QUANTILE
 from fuselog.pipeline.tuning.objective import Objective, Run, innovations_in
 from fuselog.pipeline.tuning.search import MOVES
 from fuselog.recorders.log import Stream
 from fuselog.recorders.parameters import Parameter
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.judging.consistency.whiteness import whitened
 
-Floats = NDArray[np.float64]
 STEP = 0.01  # step of the finite differences, in useful units
 LEAST = 1.0  # eigenvalue at which the standard error equals the useful error
 INVOLVED = 0.3  # component of an undetermined direction above which a parameter is involved

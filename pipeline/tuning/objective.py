@@ -14,7 +14,6 @@ from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.pipeline.runs.executors import WorkerPool, threads
 from fuselog.pipeline.runs.trials import Trial
@@ -30,6 +29,7 @@ from fuselog.pipeline.tuning.broad_starts import (
 from fuselog.pipeline.tuning.control_noise import PAIRS, disturbed
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream, schemas, topics_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Ragged, gather
@@ -40,7 +40,6 @@ from fuselog.replay.judging.consistency.whiteness import whitened
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.measuring import Sums, plus
 
-Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]
 NOISE = "noise"  # key of the cost of a log's control noise, next to the topics of estimates
 INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name

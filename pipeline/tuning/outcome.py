@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import tomli_w
-from numpy.typing import NDArray
 
 from fuselog.pipeline.altering.sources import setting_of
 from fuselog.pipeline.api.api import ResultFolder
@@ -26,10 +25,9 @@ from fuselog.pipeline.tuning.confidence import Profile, SearchOutcome, doubts, p
 from fuselog.pipeline.tuning.objective import Objective, innovations_in
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
 from fuselog.replay.judging.consistency.whiteness import whitened, whiteness
-from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, split_topic
 from fuselog.replay.judging.tables import joined
 
-Floats = NDArray[np.float64]
 Source = LogSource | MemorySource
 START, TUNED = "start", "tuned"  # labels of the estimator with its start values and its tuned values
 SETTINGS = "settings.toml"

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from fuselog.pipeline.altering.changes import is_of_topic
 from fuselog.pipeline.altering.sources import split_settings
@@ -52,11 +51,11 @@ from fuselog.pipeline.tuning.search import (
 )
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.parameters import Parameter, field_of, merge, number_of
+from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
 from fuselog.replay.engine.streams.channels import stated
 from fuselog.replay.foreign.naming import allowed
 
-Floats = NDArray[np.float64]
 # bounds of a positive parameter without bounds: its start value divided and multiplied by this
 REACH = 1e4
 OPEN = {"gate_probability": 1.0}

@@ -38,7 +38,7 @@ from fuselog.recorders.parameters import Parameters
 from fuselog.replay.engine.replaying.estimator import Bound, Reading
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.engine.vectors.components import components_of, stated_components
-from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, split_topic
 
 FEWEST = 20  # fewest messages from which a topic's errors can be found
 
@@ -47,7 +47,6 @@ SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # limit in standard deviations of a prior
 STEP_M = 1.0
 Metres = tuple[float, float]
 
-Floats = NDArray[np.float64]
 DELAYS_S = (-0.02, 0.02, -0.1, 0.1, -0.4, 0.4, -2.0, 2.0, -8.0, 8.0)
 SPECIAL_S = {18.0: "the leap seconds between GPS and UTC", -18.0: "the leap seconds from UTC to GPS"}
 RATES = (-1e-4, 1e-4, -1e-3, 1e-3, -0.01, 0.01, -0.03, 0.03, -0.1, 0.1)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from fuselog.recorders.atomic import scratch_folder
@@ -14,10 +13,9 @@ from fuselog.recorders.log import open_log, schemas, topics_of
 from fuselog.replay.engine.replaying.replaying import BLOCK_MESSAGES
 from fuselog.replay.engine.streams.ensembles import ensemble_of
 from fuselog.replay.engine.streams.sources import LogSource, Source
-from fuselog.replay.judging.errors.evaluation import Innovations, split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, Innovations, split_topic
 from fuselog.replay.judging.judge import Judge
 
-Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
 PICTURE_PX = (1280, 800)
 # Innovations of at most this many runs are read; more would hardly change their mean over time.

@@ -22,9 +22,8 @@ from fuselog.replay.engine import chi2
 from fuselog.replay.engine.streams.detections import ORIGIN, detected_places
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.consistency.consistency import ellipses
-from fuselog.replay.judging.errors.evaluation import split_topic
+from fuselog.replay.judging.errors.evaluation import Floats, split_topic
 
-Floats = NDArray[np.float64]
 # Number of times at which particles are drawn, and number of equally weighted particles at each.
 CLOUDS, CLOUD_POINTS = 6, 150
 ELLIPSES, CORNERS = 6, 48
