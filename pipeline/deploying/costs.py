@@ -1,7 +1,7 @@
 """Operation counts of the steps of a filter in C, from their graphs and their loops."""
 
 import operator
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -31,7 +31,18 @@ from fuselog.replay.inference.model.corrections import sloping
 from fuselog.replay.inference.sampled_steps import SETTLING, SampledFunction
 from fuselog.replay.inference.step_graphs import Step
 from fuselog.replay.tracing.functions import Argument, Shape, trace
-from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed, steady
+from fuselog.replay.tracing.graph import (
+    CONSTANT,
+    INPUT,
+    POWER,
+    SELECT,
+    Graph,
+    Level,
+    Node,
+    choices,
+    needed,
+    steady,
+)
 
 _FLOPS = (operator.add, operator.sub, operator.mul, operator.truediv)
 _FREE = (
@@ -43,7 +54,7 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """An upper bound of a step's cost: both branches of every condition, and the most iterations.
+    """An upper bound of a step's cost: the more expensive side of every branch, and the most iterations.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
@@ -86,28 +97,41 @@ def costs_of(made: CFilter) -> tuple[dict[str, Cost], list[Products]]:
 
 
 def _cost_of_step(step: Step) -> Cost:
-    return _cost(needed(step.outputs.values()))
+    return cost_of(list(step.outputs.values()))
 
 
-def _cost(nodes: Collection[Node]) -> Cost:
-    flops = roots = calls = 0
-    for node in nodes:
-        if node.operation in _FLOPS:
-            flops += 1
-        elif node.operation is POWER:
-            flops += abs(node.value).bit_length() + abs(node.value).bit_count() - 2 + (node.value < 0)
-        elif node.operation is np.sqrt:
-            roots += 1
-        elif node.operation is np.sinc:  # sin(pi x) / (pi x)
-            flops, calls = flops + 2, calls + 1
-        elif node.operation not in _FREE:
-            calls += 1
-    return Cost(flops, roots, calls)
+def cost_of(outputs: Sequence[Node], known: Collection[Node] = ()) -> Cost:
+    """Count the operations of a graph; of two sides of a branch, the more expensive one counts."""
+    choice_of, levels = choices(outputs, known)
+    on_level: dict[Level, list[Node]] = {}
+    for node in needed(outputs, known):
+        if node not in known:
+            on_level.setdefault(levels.get(node), []).append(node)
+
+    def cost(level: Level) -> Cost:
+        own = on_level.get(level, [])
+        branches = {id(choice_of[node]): choice_of[node] for node in own if node in choice_of}
+        sides = [[cost((each, index)) for index in (0, 1)] for each in branches.values()]
+        return added(*map(_operation, own), *(Cost(*map(max, *both)) for both in sides))
+
+    return cost(None)
+
+
+def _operation(node: Node) -> Cost:
+    if node.operation in _FLOPS:
+        return Cost(1)
+    if node.operation is POWER:
+        return Cost(abs(node.value).bit_length() + abs(node.value).bit_count() - 2 + (node.value < 0))
+    if node.operation is np.sqrt:
+        return Cost(0, roots=1)
+    if node.operation is np.sinc:  # sin(pi x) / (pi x)
+        return Cost(2, calls=1)
+    return NOTHING if node.operation in _FREE else Cost(0, calls=1)
 
 
 def _traced(function: Any, *arguments: Argument) -> Cost:
     result = trace(Graph(), function, arguments)
-    return _cost(needed([*result.returned, *(node for _, _, node in result.written)]))
+    return cost_of([*result.returned, *(node for _, _, node in result.written)])
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
@@ -144,7 +168,7 @@ def _sampling(sampled: SampledFunction) -> Cost:
     mean = Cost(2 * count * sampled.size)
     if sampled.recentre is None:
         return added(own, mean, Cost(sampled.size))
-    curved = _cost(needed([sampled.move.outputs["centre", (i,)] for i in sampled.curved]))
+    curved = cost_of([sampled.move.outputs["centre", (i,)] for i in sampled.curved])
     again = added(mean, curved, _in_loop(sampled.recentre, SETTLING, count))
     return added(own, mean, _cost_of_step(sampled.move), *[again] * MEANS)
 
@@ -168,8 +192,7 @@ def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
     """Count the cost of a step at every sample; operations that all samples share count once."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
-    inside = [node for node in needed(outputs, same) if node not in same]
-    return added(_cost(needed(same)), *[_cost(inside)] * count)
+    return added(cost_of(same), *[cost_of(outputs, same)] * count)
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:

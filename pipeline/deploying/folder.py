@@ -68,7 +68,7 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
 |---|---|---|---|
 {table}
 
-These are upper bounds: both branches of every condition are counted{iterated}.{saved}
+These are upper bounds: the more expensive side of every branch is counted{iterated}.{saved}
 
 {bytes_in_words}"""
 

@@ -15,7 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fuselog.replay.tracing.formulas import Text
-from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from fuselog.replay.tracing.graph import (
+    CONSTANT,
+    INPUT,
+    POWER,
+    SELECT,
+    Choice,
+    Level,
+    Node,
+    choices,
+    needed,
+)
 
 SHORTEST, LONGEST = (
     16,
@@ -165,9 +175,15 @@ def c_lines(
     taken = {*inputs.values(), *named, *known.values()}
     free = (name for name in map(f"{of}{{}}".format, range(1, len(everything) + 1)) if name not in taken)
     found = {node: Text(name, _WHOLE) for node, name in known.items()}
-    for name, output in named.items():
-        for node in needed([output], known):
-            if node in found:
+    choice_of, levels = choices(list(named.values()), known)
+
+    def lines_of(nodes: Collection[Node], level: Level) -> Iterator[str]:
+        """Yield the lines that define the nodes on a level."""
+        for node in nodes:
+            if node in found or levels.get(node) != level:
+                continue
+            if node in choice_of:
+                yield from branches(choice_of[node], level)
                 continue
             text = _text_of(node, [found[each] for each in node.arguments], inputs, precision)
             is_call = text.binds == _WHOLE and text.text.endswith(")")
@@ -180,6 +196,26 @@ def c_lines(
                 yield f"const {kind} {own} = {text.text};"
                 text = Text(own, _WHOLE)
             found[node] = text
+
+    def branches(choice: Choice, level: Level) -> Iterator[str]:
+        """Yield the lines of a choice, whose sides are computed only if they are selected."""
+        yield from lines_of(
+            [each for each in needed(choice.members, known) if each not in choice.members], level
+        )
+        own = [next(free) for _ in choice.members]
+        yield f"{precision.real} {', '.join(own)};"
+        for index, head in enumerate((f"if ({found[choice.condition].text}) {{", "} else {")):
+            yield head
+            sides = [each.arguments[1 + index] for each in choice.members]
+            for line in lines_of(needed(sides, known), (choice, index)):
+                yield f"    {line}"
+            for target, side in zip(own, sides, strict=True):
+                yield f"    {target} = {_real(side, found[side], precision).text};"
+        yield "}"
+        found.update(zip(choice.members, (Text(each, _WHOLE) for each in own), strict=True))
+
+    for name, output in named.items():
+        yield from lines_of(needed([output], known), None)
         if name.isidentifier():
             yield f"const {precision.real} {name} = {_real(output, found[output], precision).text};"
             found[output] = Text(name, _WHOLE) if not output.is_truth else found[output]

@@ -9,13 +9,14 @@ import math
 import operator
 from collections.abc import Callable, Collection, Iterable, Iterator
 from hashlib import blake2b
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.errors import BadInput
 
 MOST_NODES = 50_000
+WORTH_A_BRANCH = 8  # nodes that are computed only if a condition is true
 INPUT, CONSTANT, POWER, SELECT = "input", "constant", "power", "select"
 _COMPARISONS = (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
 _TRUTHS = (
@@ -194,6 +195,56 @@ def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
             found.add(node)
             waiting += () if node in known else node.arguments
     return sorted(found, key=lambda node: node.number)
+
+
+class Choice(NamedTuple):
+    """Selections by one condition, and, for its yes and its no, the nodes that only this side needs."""
+
+    condition: Node
+    members: tuple[Node, ...]
+    sides: tuple[frozenset[Node], frozenset[Node]]
+
+
+# A side of a choice, on which a node is computed; None for nodes that are always computed.
+Level = tuple[Choice, int] | None
+
+
+def choices(
+    outputs: Collection[Node], known: Collection[Node] = ()
+) -> tuple[dict[Node, Choice], dict[Node, Level]]:
+    """Find selections whose sides are worth a branch, by member, and the level of nodes inside them."""
+    nodes, kept = needed(outputs, known), {*outputs, *known}
+    users: dict[Node, list[tuple[Node, int]]] = {}
+    grouped: dict[Node, list[Node]] = {}
+    for node in nodes:
+        if node in known:
+            continue
+        for place, argument in enumerate(node.arguments):
+            users.setdefault(argument, []).append((node, place))
+        if node.operation is SELECT and not node.is_truth:
+            members = grouped.setdefault(node.arguments[0], [])
+            if members and not set(members).isdisjoint(needed([node])):
+                continue
+            members.append(node)
+    inner = [each for each in reversed(nodes) if each not in kept and each.arguments]
+    found: list[Choice] = []
+    for condition, members in grouped.items():
+        sides: list[set[Node]] = [set(), set()]
+        for place, side in enumerate(sides, 1):
+            for node in inner:
+                if all(user in side or (user in members and at == place) for user, at in users[node]):
+                    side.add(node)
+        if max(map(len, sides)) >= WORTH_A_BRANCH:
+            found.append(Choice(condition, tuple(members), (frozenset(sides[0]), frozenset(sides[1]))))
+    while True:
+        levels: dict[Node, Level] = {}
+        for choice in sorted(found, key=lambda each: -max(map(len, each.sides))):
+            for index in (0, 1):
+                levels |= dict.fromkeys(choice.sides[index], (choice, index))
+        whole = [each for each in found if len({levels.get(one) for one in each.members}) == 1]
+        if len(whole) == len(found):
+            return {member: choice for choice in found for member in choice.members}, levels
+        found = whole
 
 
 def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:

@@ -13,8 +13,12 @@ import pytest
 
 import fuselog as fl
 from fuselog.pipeline.deploying.certificate import deepest_stack
+from fuselog.pipeline.deploying.costs import Cost, cost_of
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.families.sampling.reactor import REACTOR
+from fuselog.replay.tracing.c_text import DOUBLE, c_lines
+from fuselog.replay.tracing.functions import trace
+from fuselog.replay.tracing.graph import Graph
 from tests.claims.pages import DEPLOYED
 from tests.deployed.building import (
     COMPILERS,
@@ -167,6 +171,26 @@ def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
     assert found["worst"]["flops"] == sum(each["flops"] for each in found["steps"].values())
     # F P F' of 3 states, lower half of the second product, and P H', H P H' of 2 components
     assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
+
+
+def folded(x: Any, _: Any) -> Any:
+    """Of either side some operations, which both need, and one function."""
+    shared = x * x + 1.0
+    if x > 0.0:
+        return shared * np.sin(shared), 2.0 * shared + 3.0 * x, shared
+    side = np.cos(x) / (1.0 + shared * shared * shared)
+    return side * side + shared, side - shared, side
+
+
+def test_a_side_of_a_branch_is_computed_only_if_it_is_chosen() -> None:
+    """The bound counts the more expensive side, which C computes in a branch."""
+    outputs = trace(Graph(), folded, (None, None)).returned
+    assert cost_of(outputs) == Cost(flops=2 + 7, calls=1)
+    named = {f"y{i}": node for i, node in enumerate(outputs)}
+    lines = [*c_lines(named, {(0, None): "x"}, DOUBLE)]
+    place = lines.index("} else {")
+    assert [line for line in lines[: place + 1] if "cos" in line] == []
+    assert [line for line in lines[place:] if "sin" in line] == []
 
 
 class CartParameters(fl.ModelParameters):

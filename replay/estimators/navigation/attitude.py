@@ -19,7 +19,7 @@ from fuselog.recorders.models.inertial import into_body, into_plane, product, ro
 from fuselog.recorders.models.planar import Components
 from fuselog.recorders.models.states import ORIENTATION
 from fuselog.recorders.units import STANDARD_GRAVITY_MPS2
-from fuselog.replay.engine.arrays import Booleans, Floats
+from fuselog.replay.engine.arrays import Booleans, Floats, Integers, over_columns
 from fuselog.replay.engine.vectors.components import components_of
 from fuselog.replay.engine.vectors.tangent import Kind
 from fuselog.replay.estimators.navigation.navigation import UNIT as CARRIED
@@ -137,7 +137,7 @@ def first_of_periods(stream: Stream) -> Booleans:
 
 def read_velocity(stream: Stream) -> Floats:
     """Return zero velocities (n, 3) once a period, otherwise NaN."""
-    return np.where(first_of_periods(stream)[:, None], np.zeros(3), np.nan)
+    return _at(np.zeros((len(stream), 3)), first_of_periods(stream))
 
 
 def read_field(stream: Stream) -> Floats:
@@ -145,20 +145,26 @@ def read_field(stream: Stream) -> Floats:
     field = stream["magnetic_field_ut"]
     if field.shape[1:] != (3,):  # the magnetometer has a separate topic
         return np.full((len(stream), 3), np.nan)
-    known = np.flatnonzero(np.isfinite(field).all(axis=1))
+    known = np.flatnonzero(over_columns(np.logical_and, np.isfinite(field)))
     if len(known) in (0, len(field)):
-        return np.where(first_of_periods(stream)[:, None], field, np.nan)
+        return _at(field, first_of_periods(stream))
     own = stream.take(known)
     metadata = {key: value for key, value in own.metadata.items() if key != "rate_hz"}
-    found = np.full(field.shape, np.nan)
-    first = known[first_of_periods(replace(own, metadata=metadata))] if len(known) > 1 else known
-    found[first] = field[first]
-    return found
+    return _at(
+        field, known[first_of_periods(replace(own, metadata=metadata))] if len(known) > 1 else known
+    )
 
 
 def read_own_field(stream: Stream) -> Floats:
     """Return the field (n, 3) of a magnetometer with a separate topic, once a period."""
-    return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
+    return _at(stream["magnetic_field_ut"], first_of_periods(stream))
+
+
+def _at(values: Floats, rows: Booleans | Integers) -> Floats:
+    """Return some rows of an array, and NaN in all others."""
+    found = np.full(values.shape, np.nan)
+    found[rows] = values[rows]
+    return found
 
 
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:

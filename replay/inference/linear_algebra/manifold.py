@@ -199,14 +199,15 @@ def recentring(kinds: tuple[str, ...]) -> Recentre:
                     values[index, t] = change
             else:
                 x, y, z = shift[t], shift[t + 1], shift[t + 2]
-                most = max(abs(x), abs(y), abs(z))
-                if most > SETTLED:  # otherwise they do not change
+                # `&` and `|` make one condition, and so one branch in C
+                is_slight = (abs(x) < SLIGHT) & (abs(y) < SLIGHT) & (abs(z) < SLIGHT)
+                if (abs(x) > SETTLED) | (abs(y) > SETTLED) | (abs(z) > SETTLED):  # they change
                     again = True
                     turned_back = conjugate(from_vector(x, y, z))
                     for index in range(len(values)):
                         a, b, c = values[index, t], values[index, t + 1], values[index, t + 2]
                         squared = a * a + b * b + c * c
-                        if most < SLIGHT and squared < 1.0:
+                        if is_slight & (squared < 1.0):
                             turn = slightly_turned_back((a, b, c), squared, (x, y, z))
                         else:
                             turn = to_vector(*product(turned_back, from_vector(a, b, c)))

@@ -158,12 +158,13 @@ def filter_events(
             if each.schema is schemas.INERTIAL_SAMPLE:
                 sampled += [columns[component] for component in each.components]
     for number, (_, topic) in enumerate(found.sensors):
-        ragged = block.streams[topic.name]
-        uses.append((topic.name, sensor_table(bound_model, number, ragged, context, settings)))
+        given = bound_model, number, block.streams[topic.name], context, settings
+        is_further = topic.name in dict(uses)
+        uses.append((topic.name, sensor_table(*given, only_measured=is_further)))
     tables = dict(reversed(uses))  # the first use of every topic
     data, source, target, without_covariance = (
         column[0] if len(column) == 1 else np.concatenate(column).take(merged.source, axis=0)
-        for column in zip(*(tables[name] for name in block.streams), strict=True)
+        for column in zip(*(tables[name][:4] for name in block.streams), strict=True)
     )
     arrival = np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival
     events = FilterEvents(merged.offsets, merged.time_ns, source, data, merged.is_last, target, arrival)
@@ -183,12 +184,16 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """Messages of one topic: data (n, width), source, target, and whether each is skipped."""
+    """Messages of one topic: data (n, width), source, target, and whether each is skipped.
+
+    `rows` (n,) are their numbers in the topic; None for all messages.
+    """
 
     data: Floats
     source: Integers
     target_id: Integers
     lacks_covariance: Booleans
+    rows: Integers | None = None
 
 
 def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
@@ -201,8 +206,11 @@ def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple
     of_topic = block.events.topic == before
     row = np.where(of_topic, block.events.source - begin, 0)
     measures = ~over_columns(np.logical_and, np.isnan(table.data)) & ~table.lacks_covariance
-    chosen = of_topic & measures[row]
-    data, source, target, _ = (column.take(row[chosen], axis=0) for column in table)
+    known = np.flatnonzero(measures)
+    place = np.full(len(block.streams[name]), -1)
+    place[known if table.rows is None else table.rows[known]] = known
+    chosen = of_topic & (place[row] >= 0)
+    data, source, target = (column.take(place[row[chosen]], axis=0) for column in table[:3])
     again = select_events(events, chosen)._replace(data=data, source=source, target_id=target)
     return np.flatnonzero(chosen), again
 
@@ -238,7 +246,13 @@ def control_numbers(control: Control, ragged: Ragged) -> Floats:
 
 
 def sensor_table(
-    bound_model: BoundModel, number: int, ragged: Ragged, context: Context, settings: Floats
+    bound_model: BoundModel,
+    number: int,
+    ragged: Ragged,
+    context: Context,
+    settings: Floats,
+    *,
+    only_measured: bool = False,
 ) -> Table:
     """Read the messages of a sensor: measurement, reference and covariance; see `update.message_layout`.
 
@@ -250,6 +264,7 @@ def sensor_table(
         ragged: messages of the sensor in all runs.
         context: maps and origins.
         settings: (1 + sensors, fields); see `settings_of`.
+        only_measured: whether messages without a measured component may be left out.
 
     Raises BadInput if a field has another width than the model declares.
     """
@@ -259,7 +274,6 @@ def sensor_table(
         assert context.origins is not None
         ragged = in_plane(ragged, context.origins)
     stream = ragged.stream
-    source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
     without_covariance = np.zeros(len(stream), bool)
     if sensor.covariance:
         value, spread, without_covariance = with_covariance(sensor, ragged)
@@ -273,6 +287,12 @@ def sensor_table(
         parts = [value, spread[:, *np.tril_indices(m)]]
     else:
         parts = [without_covariance_of(sensor, ragged)]
+    rows = None
+    if only_measured and not sensor.reference_size:
+        rows = np.flatnonzero(~over_columns(np.logical_and, np.isnan(parts[0])))
+        without_covariance, *parts = (each.take(rows, axis=0) for each in (without_covariance, *parts))
+    count = len(without_covariance)
+    source, target = np.full(count, number), np.zeros(count, np.int64)
     reference: list[Floats] = []
     numbers = [stream[each.of].astype(np.int64) for each in sensor.maps]
     if sensor.maps:
@@ -280,9 +300,9 @@ def sensor_table(
         run = run_of_rows(ragged.offsets)
     for each, number_of in zip(sensor.maps, numbers, strict=True):
         places = context.points[each.topic]
-        rows = places.rows(run, number_of)
-        source[rows < 0] = NOTHING
-        reference.append(places.at(rows))
+        found = places.rows(run, number_of)
+        source[found < 0] = NOTHING
+        reference.append(places.at(found))
     if sensor.control is not None:  # see `fill_control`
         reference.append(np.full((len(stream), len(sensor.control.components)), np.nan))
     reference += [_field(stream, name, size) for name, size in sensor.fields.items()]
@@ -290,12 +310,12 @@ def sensor_table(
         reference.append(np.stack(numbers, axis=1).astype(float))
     parts[1:1] = reference
     source[without_covariance] = NOTHING
-    data, filled = np.empty((len(stream), width)), 0
+    data, filled = np.empty((count, width)), 0
     for part in parts:
         data[:, filled : filled + part.shape[1]] = part
         filled += part.shape[1]
     data[:, filled:] = np.nan
-    return Table(data, source, target, without_covariance)
+    return Table(data, source, target, without_covariance, rows)
 
 
 def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:

@@ -106,9 +106,9 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
-    columns: Columns = (
-        np.concatenate(both).take(order, axis=0) for both in zip(first[1:], second[1:], strict=True)
-    )
+    columns: Columns = (np.concatenate(both) for both in zip(first[1:], second[1:], strict=True))
+    if (order[1:] < order[:-1]).any():
+        columns = (column.take(order, axis=0) for column in columns)
     return FilterEvents(first.offsets + second.offsets, *columns)
 
 
