@@ -42,6 +42,7 @@ from fuselog.pipeline.runs.executors import PoolFactory, pool_for
 from fuselog.pipeline.selecting.selection import Selection
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
+from fuselog.recorders.remote.paths import RemotePath
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import (
@@ -119,7 +120,8 @@ class Replaying:
         if self.place is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             there = (self.place / "estimates").resolve()
-            places = [(path, path.parent / os.path.relpath(log.resolve(), there))]
+            is_remote = isinstance(log, RemotePath)
+            places = [(path, log if is_remote else path.parent / os.path.relpath(log.resolve(), there))]
         return plan.replay(places)
 
 

@@ -288,7 +288,9 @@ def test_a_catalog_of_urls(fuselog, site, copies):
     rows = {row["log"].rpartition("/")[2]: row for row in again["logs"]}
     assert rows["large.mcap"]["messages"] == 100_000
     replayed = fuselog("replay", "logs.parquet", "-e", "ekf", "--where", "fits_robot", "--json").json
-    assert [row["log"] for row in replayed["logs"]] == [f"{place}run.mcap"]
+    [row] = replayed["logs"]
+    estimates = open_log(Path("out/replay") / row["estimates"])
+    assert (row["log"], estimates.run.notes["log"]) == (f"{place}run.mcap", f"{place}run.mcap")
     shutil.copy(site.folder / "large.mcap", site.folder / "run.mcap")
     assert "run.mcap: changed after it was catalogued" in fuselog("lint", "logs.parquet").err
     site.login = True
