@@ -158,11 +158,11 @@ def blocks_of(url: str, identity: Identity) -> Iterator[tuple[int, bytes]]:
     After a failure, the file is continued at the same position, or from the beginning if the server can
     only send the whole file; in this case, the position returns to 0.
     """
-    done, has_ranges = 0, identity.has_ranges
+    done, restarts, has_ranges = 0, 0, identity.has_ranges
     opened: _Opened | None = None
 
     def answer() -> bytes:
-        nonlocal done, has_ranges, opened
+        nonlocal done, restarts, has_ranges, opened
         try:
             if opened is None:
                 opened = _open(url, is_whole=not has_ranges)
@@ -180,8 +180,11 @@ def blocks_of(url: str, identity: Identity) -> Iterator[tuple[int, bytes]]:
                 opened.close()
             opened = None
             if has_ranges and isinstance(error, ValueError):
-                has_ranges = False
-                return answer()
+                has_ranges = False  # the server does not have range requests
+            else:
+                restarts += not has_ranges
+            if restarts > len(PAUSES_S):  # each of them may have read a part of the file
+                raise BadInput(f"{masked(url)}: {_lasting(error) or _temporary(error, url)}") from None
             raise
 
     try:
@@ -292,9 +295,9 @@ def _lasting(error: BaseException) -> str | None:
             "access refused; check the credentials, which fsspec reads from the environment or its "
             "configuration"
         )
-    # a web server's error may be the cause of a FileNotFoundError, whatever it is
-    is_missing = isinstance(error, FileNotFoundError) and statuses == {None}
-    if statuses & {404, 410} or (is_missing and not any(map(_is_connection, chain))):
+    # fsspec raises FileNotFoundError for every error of a web server
+    is_missing = isinstance(error, FileNotFoundError) and not any(map(_is_of_web, chain))
+    if statuses & {404, 410} or is_missing:
         return "not found; check the URL"
     return None
 
@@ -319,7 +322,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__
 
 
-def _is_connection(error: BaseException) -> bool:
-    """Test whether an error is about the connection, not about the file."""
+def _is_of_web(error: BaseException) -> bool:
+    """Test whether an error is one of a web server or of the connection to it."""
     of_client = type(error).__module__.startswith("aiohttp")
     return isinstance(error, TimeoutError | ConnectionError) or of_client

@@ -19,7 +19,8 @@ class Site:
         folder: the files.
         ranges: whether parts can be requested.
         versions: whether the ETag is stated.
-        cuts: how many of the next answers end in the middle.
+        spared: how many of the next answers are whole, although `cuts` is set.
+        cuts: how many answers end in the middle.
         stated_bytes: what HEAD adds to the size.
         silent_s: how long every answer takes.
         status: the status of every answer; None for the right one.
@@ -31,7 +32,7 @@ class Site:
     def __init__(self, folder: Path, url: str) -> None:
         self.folder, self.url = folder, url
         self.ranges = self.versions = True
-        self.cuts = self.stated_bytes = self.sent = 0
+        self.spared = self.cuts = self.stated_bytes = self.sent = 0
         self.silent_s, self.login = 0.0, False
         self.status: int | None = None
         self.asked: list[str] = []
@@ -78,7 +79,9 @@ class _Answer(BaseHTTPRequestHandler):
         self.end_headers()
         if is_head:
             return
-        if site.cuts and len(part) > 1000:
+        if site.spared:
+            site.spared -= 1
+        elif site.cuts:
             site.cuts -= 1
             part = part[: len(part) // 2]
             self.close_connection = True
