@@ -192,6 +192,11 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
     fl.catalog(drives, out="logs.parquet")
     pd.read_parquet("logs.parquet").to_parquet("table.parquet")
     Path("text.parquet").write_text("log")
+    damaged = pq.read_table("logs.parquet")
+    for name in ("log", "notes"):
+        values = pa.array([None if name == "log" else "{"] * len(damaged), pa.string())
+        place = damaged.column_names.index(name)
+        pq.write_table(damaged.set_column(place, name, values), f"{name}.parquet")
     Path("empty").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fuselog.pipeline.selecting.catalog.FORMAT", 2)
@@ -204,6 +209,8 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
         "catalog text.parquet": "is not a Parquet file",
         "catalog no.parquet": "no.parquet: cannot be read",
         "catalog empty": "has no logs",
+        "catalog log.parquet": "its column log was changed",
+        "catalog notes.parquet --where seed<1": "notes in the catalog are damaged",
         "replay logs.parquet -e ekf": "drive0.mcap: changed after it was catalogued",
         "replay drives/robot0 -e ekf --group foldr": "did you mean 'folder'?",
         "replay drives/robot0 -e ekf --where seed>70": "--where seed>70",
