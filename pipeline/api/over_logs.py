@@ -19,7 +19,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from fuselog.pipeline.api.planning import plan_replay
 from fuselog.pipeline.logs.cataloguing import select
@@ -47,7 +46,6 @@ from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import (
     FEWEST_RUNS,
-    Floats,
     Interval,
     mean_interval,
     rms_interval,
@@ -58,6 +56,7 @@ from fuselog.replay.judging.verdicts import Squares
 
 NIS, COMPONENTS = "nis_per_component", "components"
 SIZES = {"nees": COMPONENTS, "position_nees": "position_components"}  # of which they are the aims
+FAILED = "failed_runs"
 FAULTS, GAIN = "faults", "gain"  # by which logs are sorted without errors
 # Columns that identify a row, and columns with texts; all others are metrics.
 KEYS = ("log", "group", "estimator", "case")
@@ -175,12 +174,14 @@ class Campaign(NamedTuple):
         with self.table(task) as (table, hand_over), result_folder(self.out) as part:
             hand_over(part)
             outcome = Outcome(tables={"logs": table}, kind=kind)
-            verdicts = pd.DataFrame(_measured(table, outcome))
+            verdicts = pd.DataFrame(measured(table, outcome))
             if len(verdicts):
                 outcome.tables["verdicts"] = verdicts
             if "sha256" in table:
                 digests = table["sha256"].fillna("").groupby(table["log"]).first()
                 outcome.input_sha256 = hashlib.sha256("".join(digests).encode()).hexdigest()
+            if "runs" in outcome.tables:
+                settings = {**settings, "runs": outcome.tables["runs"]["unit"].nunique()}
             title = f"{kind} of {count(table['log'].nunique(), 'log')}"
             write_outcome(part, kind, {"title": title, **self.stated, **settings}, outcome)
         return OverLogs(table, verdicts, self.out)
@@ -246,28 +247,36 @@ def worst_first(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[np.argsort(logs.map(place).to_numpy(), kind="stable")].reset_index(drop=True)
 
 
-def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
-    """Add each metric over the logs to the outcome, and yield its row.
+def measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
+    """Add each metric over the logs to the outcome, with those of its units, and yield its row.
 
     The unit of an interval is the log, or the group of logs; see docs/judge.md.
     """
     if "estimator" not in table or "case" not in table:  # nothing was judged
         return
     metrics = [str(name) for name in table if name not in OTHERS]
+    table = table.assign(unit=table["group"] if "group" in table else table["log"])
+    numbers = {unit: number for number, unit in enumerate(sorted(table["unit"].dropna().unique()))}
+    runs: list[pd.DataFrame] = []
     for what, rows in table.fillna({"case": ""}).groupby(["estimator", "case"], sort=False):
         label, case = map(str, what)
+        failed = table[(table["estimator"] == label) & table["problem"].notna()]
         aims = {NIS: 1.0, **aims_of(rows)}
+        of_units: dict[str, pd.Series] = {}
         for name in metrics:
-            known = rows[rows[name].notna()]
-            units = known["group"] if "group" in known else known["log"]
-            number = over_units(known[name].to_numpy(float), units.to_numpy(), is_rms="rmse" in name)
+            known, is_rms = rows[rows[name].notna()], "rmse" in name
             if not len(known):
                 continue
-            outcome.measure(".".join(filter(None, (label, name, case))), number)
-            count_of, aim = units.nunique(), aims.get(name, math.nan)
-            has_band = name in SIZES and name in aims
-            usual = chi_square_interval(int(aim), count_of) if has_band else (-math.inf, math.inf)
-            is_judged = has_band or (name in aims and number.is_bounded)
+            own = of_units[name] = by_unit(known[name], known["unit"], is_rms=is_rms)
+            number = (rms_interval if is_rms else mean_interval)(own.to_numpy())
+            if name == FAILED:
+                number = Interval(float(failed["unit"].nunique()))
+            key, aim = ".".join(filter(None, (label, name, case))), aims.get(name, math.nan)
+            outcome.measure(key, number)
+            usual = (-math.inf, math.inf)
+            if name in SIZES and name in aims:
+                usual = outcome.bounds[key] = chi_square_interval(int(aim), len(own))
+            is_judged = name in aims and (number.is_bounded or key in outcome.bounds)
             yield {
                 "estimator": label,
                 "case": case,
@@ -278,8 +287,12 @@ def _measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
                 "aim": aim,
                 "verdict": str(Squares(name, number, aim, usual).verdict) if is_judged else None,
                 "logs": known["log"].nunique(),
-                "units": count_of,
+                "units": len(own),
             }
+        about = {"estimator": label, "case": case}
+        runs.append(pd.DataFrame(of_units).rename_axis("unit").reset_index().assign(**about))
+    of_all = pd.concat(runs, ignore_index=True)
+    outcome.tables["runs"] = of_all.assign(run=of_all["unit"].map(numbers))
 
 
 def aims_of(rows: pd.DataFrame) -> dict[str, float]:
@@ -288,19 +301,16 @@ def aims_of(rows: pd.DataFrame) -> dict[str, float]:
     return {name: float(own.pop()) for name, own in sizes.items() if len(own) == 1 and any(own)}
 
 
-def over_units(values: Floats, units: NDArray[Any], *, is_rms: bool) -> Interval:
-    """Compute the mean or root mean square of the units' values, with its 95 % interval over units.
-
-    The value of a unit, such as a robot, is the mean or root mean square of its logs.
+def by_unit(values: pd.Series, units: pd.Series, *, is_rms: bool) -> pd.Series:
+    """Compute the value of each unit, such as a robot: the mean or root mean square of its logs.
 
     Args:
         values: (n,) one value per log.
         units: (n,) the unit of each log.
         is_rms: whether the values are root mean squares.
     """
-    of_unit = root_mean_square if is_rms else np.mean
-    own = [of_unit(values[units == unit]) for unit in np.unique(units)]
-    return rms_interval(own) if is_rms else mean_interval(own)
+    found: pd.Series = values.groupby(units).agg(root_mean_square if is_rms else "mean")
+    return found
 
 
 def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("info", LOG)) -> bool:

@@ -25,6 +25,7 @@ SUFFIX = ".parquet"
 FORMAT = 1
 _KEY = b"fuselog_catalog"
 GONE = (0, 0, "")  # the state of a log that cannot be reached
+REQUIRED = ("log", "size_bytes", "modified_ns", "version")  # columns in which no value is missing
 
 
 def schema() -> "pa.Schema":
@@ -119,8 +120,11 @@ def read_catalog(path: Path) -> "pd.DataFrame":
         raise BadInput(f"{path}: is not a catalog; write one with fuselog catalog FOLDER -o {path.name}")
     check_format(path, int(version), FORMAT)
     for field in schema():
-        if field.name not in stored.schema.names or stored.schema.field(field.name).type != field.type:
-            raise BadInput(f"{path}: its column {field.name} was changed; write the catalog again")
+        is_there = (
+            field.name in stored.schema.names and stored.schema.field(field.name).type == field.type
+        )
+        if not is_there or (field.name in REQUIRED and stored[field.name].null_count):
+            raise BadInput(f"{path}: its column {field.name} was changed; write it again")
     stored = stored.select([*dict.fromkeys([*schema().names, *stored.schema.names])])
     names = stored["log"].to_pylist()
     return _pandas(stored.set_column(0, "log", pa.array([_seen(log, path) for log in names])))
@@ -254,9 +258,20 @@ def _columns_of(row: Mapping[Any, Any]) -> Iterator[tuple[tuple[str, str], Any]]
     for model in row["models"] or ():
         yield (_name(f"fits_{model}"), model), True
     for prefix, stated in (("run", row["parameters"]), ("note", row["notes"])):
-        for name, value in flat(json.loads(stated or "{}")):
+        for name, value in flat(_parsed(stated, row["log"])):
             if isinstance(value, bool | int | float | str):
                 yield (_name(f"{prefix}_{name}"), name), value
+
+
+def _parsed(stated: str | None, log: str) -> dict[str, Any]:
+    """Parse parameters or notes of a row; raise BadInput if another program has changed them."""
+    try:
+        found = json.loads(stated or "{}")
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise BadInput(f"{log}: its parameters or notes in the catalog are damaged; write it again")
+    return found
 
 
 def _name(text: str) -> str:

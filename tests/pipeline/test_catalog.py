@@ -15,12 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 
 import fuselog as fl
-from fuselog.pipeline.api.over_logs import over_units
+from fuselog.pipeline.api.over_logs import measured
 from fuselog.pipeline.logs import cataloguing
+from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.batches import Batch
 from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, schema
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput
+from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from tests.pipeline.conftest import Said
 from tests.pipeline.test_campaigns import contents
 
@@ -192,6 +194,11 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
     fl.catalog(drives, out="logs.parquet")
     pd.read_parquet("logs.parquet").to_parquet("table.parquet")
     Path("text.parquet").write_text("log")
+    damaged = pq.read_table("logs.parquet")
+    for name in ("log", "notes"):
+        values = pa.array([None if name == "log" else "{"] * len(damaged), pa.string())
+        place = damaged.column_names.index(name)
+        pq.write_table(damaged.set_column(place, name, values), f"{name}.parquet")
     Path("empty").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fuselog.pipeline.selecting.catalog.FORMAT", 2)
@@ -204,6 +211,8 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
         "catalog text.parquet": "is not a Parquet file",
         "catalog no.parquet": "no.parquet: cannot be read",
         "catalog empty": "has no logs",
+        "catalog log.parquet": "its column log was changed",
+        "catalog notes.parquet --where seed<1": "notes in the catalog are damaged",
         "replay logs.parquet -e ekf": "drive0.mcap: changed after it was catalogued",
         "replay drives/robot0 -e ekf --group foldr": "did you mean 'folder'?",
         "replay drives/robot0 -e ekf --where seed>70": "--where seed>70",
@@ -346,15 +355,27 @@ def test_a_diagnosis_has_a_row_for_each_log(drives: Path, fuselog: Callable[...,
     assert alone["found"][0].endswith(rows[1]["finding"])
 
 
-def test_the_unit_of_an_interval_is_the_group() -> None:
-    units = np.repeat(["a", "b", "c", "d", "e"], 4)
-    values = np.repeat([1.0, 2.0, 3.0, 4.0, 5.0], 4) + np.tile([-0.1, 0.1], 10)
-    found = over_units(values, units, is_rms=False)
-    assert found[:3] == pytest.approx((3.0, 3.0 - 1.963243, 3.0 + 1.963243), abs=1e-6)  # t of 4
-    alone = over_units(values, np.arange(20), is_rms=False)
-    assert alone.high - alone.low < 0.7 * (found.high - found.low)
-    assert over_units(values, units, is_rms=True).value == pytest.approx(np.sqrt(np.mean(values**2)))
-    assert np.isnan(over_units(values[:16], units[:16], is_rms=False).low)
+def test_the_unit_of_a_verdict_is_the_group() -> None:
+    """Six robots with four logs each, whose NEES is that of the robot: there are six values, not 24."""
+    units = np.repeat([*"abcdef"], 4)
+    rmse = np.repeat([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], 4) + np.tile([-0.1, 0.1], 12)
+    rows = {"log": map(str, range(24)), "group": units, "estimator": "ekf", "case": "robot1"}
+    numbers = {"position_rmse_m": rmse, "nees": 2.0 * rmse, "components": 3, "failed_runs": 0.0}
+    table = pd.DataFrame({**rows, **numbers, "problem": None})
+    table.loc[[2, 3, 23], "problem"] = "failed"
+    outcome = Outcome()
+    found = pd.DataFrame(measured(table, outcome)).set_index("quantity")
+    nees = found.loc["nees"]
+    half = 2.570582 * np.std([2, 4, 6, 8, 10, 12], ddof=1) / np.sqrt(6)  # t of 5 degrees
+    assert nees[["value", "low", "high"]].tolist() == pytest.approx([7, 7 - half, 7 + half], rel=1e-6)
+    assert outcome.bounds["ekf.nees.robot1"] == chi_square_interval(3, 6)
+    assert nees[["aim", "verdict", "logs", "units"]].tolist() == [3, "overconfident", 24, 6]
+    assert found.loc["position_rmse_m", "value"] == pytest.approx(np.sqrt(np.mean(rmse**2)))
+    assert found.loc["failed_runs", "value"] == 2  # of the robots a and f
+    alone = pd.DataFrame(measured(table.drop(columns="group"), Outcome())).set_index("quantity")
+    assert alone.loc["nees", "high"] - alone.loc["nees", "low"] < 0.6 * 2 * half
+    few = pd.DataFrame(measured(table[table["group"] < "e"], Outcome())).set_index("quantity")
+    assert np.isnan(few.loc["nees", "low"])
 
 
 def test_an_interrupted_selection_is_resumed(
