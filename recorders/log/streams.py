@@ -85,11 +85,6 @@ class Stream:
             position=self.position[rows],
         )
 
-    def placed(self, position: NDArray[np.int64]) -> "Stream":
-        """Return the same messages at other positions (n,) in the file."""
-        stamps_ns = self.publish_time_ns, self.log_time_ns
-        return Stream(self.topic, self.schema, *stamps_ns, self.columns, position, self.metadata)
-
     def pandas(self) -> "pd.DataFrame":
         """Convert to a data frame with a row for every message: both stamps in ns, then the fields.
 

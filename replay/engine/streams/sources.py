@@ -334,7 +334,7 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
     cuts = accumulate(map(len, streams), initial=0)
     placed = {
-        stream.topic: stream.placed(ranks[first:end])
+        stream.topic: replace(stream, position=ranks[first:end])
         for stream, (first, end) in zip(streams, pairwise(cuts), strict=True)
     }
     return MemorySource(placed, run, f"run {run.run} of {run.scenario}")
