@@ -318,30 +318,44 @@ def _dead(
     return outages_s, is_dead
 
 
-def _drawn(seen: Sightings, rngs: Sequence[np.random.Generator]) -> tuple[Floats, Floats, Floats]:
-    """Draw for every sighting (n,) a standard normal number, and two that are uniform in [0, 1)."""
-    noise, place, chance = np.empty((3, len(seen.view)))
-    for rng, (first, end) in zip(rngs, pairwise(seen.cuts), strict=True):
+def _noisy(
+    sensor: Sensor,
+    exact: Floats,
+    sigma: float,
+    ends: tuple[float, float],
+    cuts: Sequence[int],
+    rngs: Sequence[np.random.Generator],
+) -> Floats:
+    """Add noise to values (n,), and replace outliers by values anywhere between two ends.
+
+    The same numbers are drawn without outliers; those that have no effect are skipped.
+    """
+    noise, place, chance = np.empty((3, len(exact)))
+    for rng, (first, end) in zip(rngs, pairwise(cuts), strict=True):
         rng.standard_normal(out=noise[first:end])
-        rng.random(out=place[first:end])
-        rng.random(out=chance[first:end])
-    return noise, place, chance
+        bits = rng.bit_generator
+        if sensor.outlier_probability == 0.0 and isinstance(bits, np.random.PCG64):
+            bits.advance(2 * (end - first))
+        else:
+            rng.random(out=place[first:end])
+            rng.random(out=chance[first:end])
+    measured: Floats = exact + noise * sigma
+    if sensor.outlier_probability > 0.0:
+        wild = ends[0] + (ends[1] - ends[0]) * place
+        measured = np.where(chance < sensor.outlier_probability, wild, measured)
+    return measured
 
 
 def _range(sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator]) -> Floats:
     """Measure ranges with bias, noise, and outliers anywhere in the sensor's range."""
-    noise, place, chance = _drawn(seen, rngs)
-    measured = seen.range_m + sensor.bias_range_m + noise * sensor.sigma_range_m
-    is_outlier = chance < sensor.outlier_probability
-    return np.abs(np.where(is_outlier, sensor.maximum_range_m * place, measured))
+    exact, ends = seen.range_m + sensor.bias_range_m, (0.0, sensor.maximum_range_m)
+    return np.abs(_noisy(sensor, exact, sensor.sigma_range_m, ends, seen.cuts, rngs))
 
 
 def _bearing(sensor: Sensor, seen: Sightings, rngs: Sequence[np.random.Generator]) -> Floats:
     """Measure bearings with bias, noise, and outliers in any direction."""
-    noise, place, chance = _drawn(seen, rngs)
-    measured = seen.bearing_rad + sensor.bias_bearing_rad + noise * sensor.sigma_bearing_rad
-    is_outlier = chance < sensor.outlier_probability
-    measured = np.where(is_outlier, -np.pi + 2 * np.pi * place, measured)
+    exact, ends = seen.bearing_rad + sensor.bias_bearing_rad, (-np.pi, np.pi)
+    measured = _noisy(sensor, exact, sensor.sigma_bearing_rad, ends, seen.cuts, rngs)
     _wrap(measured)
     return measured
 

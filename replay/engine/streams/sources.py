@@ -360,13 +360,11 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     times = [stream.log_time_ns for stream in streams]
     ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
     cuts = accumulate(map(len, streams), initial=0)
-    placed = [
-        replace(stream, position=ranks[first:end])
+    placed = {
+        stream.topic: replace(stream, position=ranks[first:end])
         for stream, (first, end) in zip(streams, pairwise(cuts), strict=True)
-    ]
-    return MemorySource(
-        {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
-    )
+    }
+    return MemorySource(placed, run, f"run {run.run} of {run.scenario}")
 
 
 def in_memory(source: LogSource | MemorySource, topics: Iterable[str] | None = None) -> MemorySource:
