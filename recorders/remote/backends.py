@@ -71,9 +71,9 @@ def identity_of(url: str) -> Identity:
 
 def _identity(url: str) -> Identity:
     """Ask for the version of a file and, if it is in an archive, of the archive."""
-    from fsspec.archive import AbstractArchiveFileSystem
-
     file_system, path = _backend(url)
+    from fsspec.archive import AbstractArchiveFileSystem  # `_backend` reports a missing fsspec
+
     file_system.invalidate_cache()
     facts = file_system.info(path)
     version = [f"{key} {facts[key]}" for key in sorted(facts) if _VERSION.fullmatch(key) and facts[key]]

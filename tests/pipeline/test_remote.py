@@ -275,6 +275,8 @@ def test_missing_file_systems_name_what_to_install(fuselog, monkeypatch):
     said = fuselog("info", "rare://bucket/run.mcap").err
     assert said.endswith("/run.mcap: needs rarefs, which is not installed; run: pip install rarefs\n")
     assert "fsspec has no file system of this name" in fuselog("info", "nosuch://x/run.mcap").err
+    for name in [each for each in sys.modules if each.partition(".")[0] == "fsspec"]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "fsspec", None)
     assert "pip install 'fuselog[remote]'" in fuselog("info", "https://x/run.mcap").err
 
