@@ -1,7 +1,7 @@
 """Public interface for programs, notebooks and plug-ins; see docs/python.md.
 
-A name is imported on first use, from the module that the stub file in this folder lists for it. This
-makes `import fuselog` fast, and editors and type checkers still see every name.
+A name is imported on first use, from the module that the stub file in this folder lists for it. Imports
+on first use make `import fuselog` fast, and editors and type checkers still see every name.
 """
 
 import ast
@@ -22,7 +22,7 @@ _RENAMED = {"Told": "Diagnostics"}  # names of the previous release
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """Read the stub; map each public name to its module and to its name in that module."""
+    """Read the stub file, and map each public name to its module and to its name in that module."""
     stub = ast.parse((_HERE / "__init__.pyi").read_text(encoding="utf-8"))
     return {
         alias.asname or alias.name: (node.module or "", alias.name)

@@ -32,7 +32,7 @@ def assert_golden(
 
     Args:
         logs: a log, a folder of logs, or runs by name, such as `{"seed 7": fuselog.record(...)}`.
-        golden: the golden file. Its name ends in .golden.xz; keep it next to the tests.
+        golden: the golden file. The file's name ends in .golden.xz; keep the file next to the tests.
         estimators: as for `fuselog.replay`; by default, the estimators that the golden file names.
 
     Raises AssertionError with the first difference: topic, run, stamp, component, both values, and the
@@ -51,7 +51,7 @@ def assert_golden(
 
 
 def assert_same(replayed: Replayed, golden: str | Path) -> None:
-    """Compare estimates from any source with a golden file; raise as `assert_golden` does."""
+    """Compare estimates from any source with a golden file; raise the same errors as `assert_golden`."""
     _require(compared(read(Path(golden)), replayed), Path(golden))
 
 

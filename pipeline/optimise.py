@@ -1,8 +1,8 @@
 """Minimisation of a cost, its curvature at the minimum, and 95 % likelihood intervals.
 
-A cost is evaluated at many points per call, so its evaluations can be distributed; minus a
-log-likelihood is such a cost. Begin with `minimum`. `Beside` contains the costs around a point, and
-`profile_ends` finds intervals.
+A cost, such as the negative log-likelihood, is evaluated at many points per call, so its evaluations can
+be distributed. Begin with `minimum`. `Beside` contains the costs around a point, and `profile_ends`
+finds intervals.
 """
 
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -99,7 +99,7 @@ def minimum(
 
 
 class Beside(NamedTuple):
-    """Costs at a point (k,) and at steps on both sides of it along m of its coordinates.
+    """Costs at a point (k,), and one step away on both sides of it, along m of its coordinates.
 
     Attributes:
         here: the cost at the point.
@@ -119,19 +119,19 @@ class Beside(NamedTuple):
 
     @property
     def bends(self) -> Floats:
-        """Return the second derivatives (m,); not finite if a cost is not finite."""
+        """Return the second derivatives (m,); a derivative is not finite if a cost is not finite."""
         with np.errstate(invalid="ignore"):
             return (self.ahead - 2.0 * self.here + self.behind) / self.steps**2
 
 
 def beside(cost: Cost, point: Floats, places: Iterable[int], steps: float | Floats) -> Beside:
-    """Evaluate a cost at a point and at steps on both sides of it.
+    """Evaluate a cost at a point, and one step away on both sides of it along m coordinates.
 
     Args:
         cost: function that computes the costs (n,) of points (n, k).
         point: (k,).
         places: indices of m of the k coordinates.
-        steps: one step for all these coordinates, or (m,) a step for each.
+        steps: one step for all m coordinates, or (m,) a step for each.
     """
     return _differences(cost, point, list(places), steps, [])[0]
 
@@ -145,7 +145,7 @@ def curvature(
         cost: function that computes the costs (n,) of points (n, k).
         point: (k,).
         places: indices of m of the k coordinates.
-        steps: one step of the finite differences for all these coordinates, or (m,) a step for each.
+        steps: one step of the finite differences for all m coordinates, or (m,) a step for each.
 
     Returns:
         The costs around the point, and the derivatives (m, m); a derivative is not finite if a cost from
@@ -169,7 +169,7 @@ def _differences(
     steps: float | Floats,
     pairs: Sequence[tuple[int, int]],
 ) -> tuple[Beside, Floats]:
-    """Compute the costs along coordinates and at the four corners of pairs of them, in one call."""
+    """Compute costs along coordinates, and at the four corners of each pair of them, in one call."""
     m, h = len(places), np.broadcast_to(steps, len(places))
     along = h[:, None] * np.eye(len(point))[places]
     corners = [
@@ -191,16 +191,16 @@ def profile_ends(
     within: float = END,
     doublings: int = DOUBLINGS,
 ) -> tuple[Floats, Floats]:
-    """Find the ends of the 95 % interval of each coordinate; the curvature gives the others there.
+    """Find the ends of each coordinate's 95 % interval, where the curvature gives the other coordinates.
 
     Args:
         cost: function that computes minus the log-likelihoods of points (n, k).
         point: (k,) the minimum.
         curvature: (k, k) the second derivatives at the minimum.
-        corrections: the number of Newton steps that optimise the other coordinates again at each value,
-            for costs that the curvature alone does not describe.
+        corrections: the number of Newton steps by which the other coordinates are optimised again at
+            each value; use it for costs that the curvature alone does not describe.
         within: the relative accuracy of an end.
-        doublings: the most doublings of the step while an end is bracketed.
+        doublings: the largest number of doublings of the step while an end is bracketed.
 
     Returns:
         The lower ends (k,) and the upper ends (k,); infinite if no end is found.
@@ -228,11 +228,12 @@ def profile_ends(
 def end(
     at: float, gain: float, scale: float, within: float = END, doublings: int = DOUBLINGS
 ) -> Search[float, float]:
-    """Search for an end of the 95 % interval of a number, at which its gain has dropped by DROP_95.
+    """Search for an end of a number's 95 % interval, where the gain has dropped by DROP_95.
 
-    `scale` is an estimate of the signed distance from `at` to the end. An end that is not found is
-    infinite. The gain is nearly a parabola, so the root of its drop is nearly linear. If the gain is
-    a spike, the bracket stops narrowing after `NARROWINGS` values and its outer end is returned.
+    `scale` is an estimate of the signed distance from `at` to the end. If no end is found, the result is
+    infinite. The gain is nearly a parabola, so the square root of its drop is nearly linear. If the gain
+    is a narrow spike, the bracket stops narrowing after `NARROWINGS` values, and the bracket's outer end
+    is returned.
     """
 
     def root_of_fall(gains: Sequence[float]) -> float:
@@ -268,10 +269,10 @@ def side_by_side(
     searches: Sequence[Search[Asked, Found]],
     gains_of: Callable[[Sequence[tuple[int, Asked]]], Sequence[float]],
 ) -> list[Found]:
-    """Run searches in parallel, with one evaluation of all values that they request at a time.
+    """Run searches in parallel, and evaluate the values that all of them request together.
 
-    `gains_of` is a function of pairs of a search's index and a value. A gain of NaN counts as minus
-    infinity.
+    `gains_of` computes the gains of pairs: the index of a search, and a value. A gain of NaN counts as
+    minus infinity.
     """
     asked = {place: list(next(search)) for place, search in enumerate(searches)}
     results: dict[int, Found] = {}

@@ -1,4 +1,4 @@
-"""The log, sensor and motion models, the simulators and the importers of real data.
+"""The log format, models of sensors and motion, the simulators, and the importers of real data.
 
 Begin with `recording`, which defines what a recorder is, and `log`.
 """

@@ -197,7 +197,7 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
 def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
     """Create the parent folders of a path; after an exception, remove those that are still empty.
 
-    Raises BadInput if they cannot be created.
+    Raises BadInput if the folders cannot be created.
     """
     missing = [folder for folder in place.parents if not folder.exists()] if make else []
     with _telling(place):
@@ -214,7 +214,7 @@ def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _telling(place: Path, work: Path | None = None) -> Iterator[None]:
-    """Convert the system's errors to BadInput; if `work` is given, only errors on files in that folder.
+    """Convert the system's errors to BadInput; with `work`, only errors on files in that folder.
 
     Errors without an `errno`, which Python code raised itself, and errors on other files are passed on.
     """

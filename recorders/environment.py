@@ -35,8 +35,8 @@ def processor() -> tuple[str | None, str | None]:
 def cache_folder() -> Path:
     """Find the folder for this user's cached results.
 
-    The folder is FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. As in the XDG
-    specification, a relative XDG_CACHE_HOME is ignored.
+    The folder is FUSELOG_CACHE if it is set, otherwise $XDG_CACHE_HOME/fuselog, or ~/.cache/fuselog if
+    neither is set. As in the XDG specification, a relative XDG_CACHE_HOME is ignored.
     """
     stated = os.environ.get("FUSELOG_CACHE")
     if stated:

@@ -17,13 +17,13 @@ class BadInput(Exception):
 
 
 class UnknownName(BadInput, KeyError):
-    """A name that is not in a mapping; also a KeyError, so that `in` and `get` work as usual."""
+    """An error for an unknown name; also a KeyError, so that `in` and `get` of mappings still work."""
 
     __str__ = Exception.__str__  # KeyError would quote the message
 
 
 def choices(name: str, known: Collection[str]) -> str:
-    """Write the end of a message on an unknown name: the most similar name, or the available ones."""
+    """Write the end of a message about an unknown name: the most similar name, or the available ones."""
     from difflib import get_close_matches  # imported only after a mistake, not at every start
 
     few = len(known) <= _COMPARED and all(len(each) <= _COMPARED for each in (name, *known))
@@ -52,16 +52,16 @@ def check_format(path: object, stated: object, read: int) -> None:
 
 
 def ignore_warnings_of_numbers() -> None:
-    """Suppress NumPy's warnings on single operations, unless the user enables warnings.
+    """Suppress NumPy's warnings about single operations, unless the user enables warnings.
 
-    Overflows and NaN are reported where they matter: as findings, warnings or empty cells.
+    Where overflows and NaN matter, they are reported as findings, warnings or empty cells.
     """
     warnings.simplefilter("ignore", RuntimeWarning, append=True)
 
 
 @contextmanager
 def without_warnings_of_numbers() -> Iterator[None]:
-    """Ignore NumPy's warnings in a `with` block, or in the function that this decorates."""
+    """Ignore NumPy's warnings in a `with` block or in a decorated function."""
     with warnings.catch_warnings():
         ignore_warnings_of_numbers()
         yield

@@ -33,7 +33,7 @@ class Parameters(BaseModel):
     Like given values, defaults are converted to the declared type: `sigma_m: float = 1` is 1.0.
 
     The meaning of a parameter is in one place: under `Attributes:` in the docstring of its type. Its
-    unit is the ending of its name, or is written there too. `describe` returns both.
+    unit is the ending of its name, or is stated in the same place. `describe` returns both.
     """
 
     model_config = ConfigDict(
@@ -138,7 +138,7 @@ MOST_WORDS = 8  # in a name
 
 @cache
 def meanings(kind: type[BaseModel]) -> dict[str, str]:
-    """Return the meanings of a type's parameters by name: its `Attributes:` and those of its bases.
+    """Return the meanings of a type's parameters, from its `Attributes:` and those of its bases.
 
     An entry is `name: meaning`, or `name, name: meaning` if several share a meaning. Raises BadInput if
     an entry names no parameter.
@@ -159,7 +159,7 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
 
 
 def in_few_words(meaning: str) -> str:
-    """Return the first words of a parameter's meaning if they can serve as its name, else nothing.
+    """Return the first words of a parameter's meaning, or an empty text if they cannot be its name.
 
     >>> in_few_words("standard deviation of a range, as the sensor states it.")
     'standard deviation of a range'
@@ -191,7 +191,7 @@ class Parameter(NamedTuple):
         accepts: the accepted values, in words.
         role: role of a number in its estimator; empty for anything else.
         low, high: bounds of a number, or of the range in which it is varied.
-        is_log: whether the logarithm is varied.
+        is_log: whether the logarithm of the value is varied.
         is_assumed: whether the value comes neither from a setting nor from the log.
         useful: standard error that is sufficient for a calibration; zero if there is none.
         group: heading under which it is shown, such as a topic.

@@ -23,8 +23,8 @@ DEEPEST = 50
 def parse_json(text: str, *, constants: bool = False) -> Any:
     """Parse a JSON text; raise ValueError if it is malformed or nested too deeply.
 
-    NaN, infinity and numbers beyond the range of a double are rejected, unless `constants` allows them
-    as Python writes them.
+    NaN, infinity and numbers beyond the range of a double are rejected, unless `constants` is True; NaN
+    and infinity are then written as Python's json module writes them.
     """
     number = float if constants else _finite
     return _shallow(

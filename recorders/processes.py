@@ -26,12 +26,12 @@ _OF_NUMBA, _OF_MATPLOTLIB = ".numba_config.yaml", "matplotlibrc"
 def start_module(
     module: str, *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
 ) -> "subprocess.Popen[bytes]":
-    """Start one of our modules in another process.
+    """Start one of fuselog's modules in another process.
 
     Args:
         module: full name of the module.
         arguments: arguments on its command line.
-        environment: variables of the process; by default those of this process.
+        environment: environment variables of the new process; by default those of the current process.
         options: options of subprocess.Popen. By default standard input is a pipe, and standard error is
             discarded.
     """
@@ -65,7 +65,7 @@ def users_environment() -> dict[str, str]:
 def keep_off_settings_here() -> None:
     """Prevent libraries from reading settings in the current folder.
 
-    matplotlib reads its file once, on import, so it is imported from another folder.
+    matplotlib reads its settings file once, on import, so it is imported from another folder.
 
     Raises BadInput if the folder contains settings that numba would use.
     """

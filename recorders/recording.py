@@ -1,4 +1,4 @@
-"""Recorders: they turn parameters, or a folder of real data, into streams."""
+"""Recorders, which turn parameters or a folder of real data into streams."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,10 +48,10 @@ def named_generator(
     """Return a generator for this name; new names do not change the random numbers of existing ones.
 
     Args:
-        rng: generator of the run, or of a part of it; nothing is drawn from it.
+        rng: generator of the run or of a part of the run; no numbers are drawn from it.
         name: name of a sensor, for example, with at least two letters; the same name gives the same
             numbers.
-        numbers: indices of names that used `rng.spawn(...)` before generators had names.
+        numbers: spawn indices by name, for names that used `rng.spawn(...)` before generators had names.
     """
     seed = rng.bit_generator.seed_seq
     assert isinstance(seed, np.random.SeedSequence)
@@ -135,7 +135,7 @@ class Simulator(Recorder[ParametersType]):
 
 @dataclass(frozen=True)
 class Importer(Recorder[ParametersType]):
-    """A reader of real data in the layout of its publishers, as a whole or block by block.
+    """A reader of real data in the layout that its publishers use, as a whole or block by block.
 
     Attributes:
         read: function of (path, parameters) that returns the recording.
@@ -207,7 +207,7 @@ def import_log(
         path: file or folder with the data.
         values: parameters of the importer.
         target: path of the log.
-        stated: parameters that the log states instead of those values.
+        stated: parameters that the log states instead of those in `values`.
 
     Returns the metadata of the run, and the number of messages in the log.
     """

@@ -28,8 +28,8 @@ def available(kind: str) -> dict[str, EntryPoint]:
 def load(kind: str, name: str, expected: type = object) -> Any:
     """Load the object registered under `name`.
 
-    Raises BadInput with the available names if the name is unknown, and if the object cannot be imported
-    or is not of the `expected` type.
+    Raises BadInput if the name is unknown (with the available names), or if the object cannot be
+    imported or is not of the `expected` type.
     """
     known = available(kind)
     one = SINGULAR.get(kind, kind.removesuffix("s"))

@@ -1,10 +1,10 @@
 """Readers and writers of trajectories in the formats of benchmarks: TUM, KITTI and (read only) EuRoC.
 
 A line of a TUM file has the time (s), the position and the quaternion x, y, z, w. A line of a KITTI file
-has the upper three rows of a pose's matrix, without a stamp. A line of a EuRoC file, with commas, has
-the time (ns), the position, the quaternion w, x, y, z, and further columns that are not part of the
-pose. Stamps distinguish TUM, with spaces or commas, from EuRoC; if both are possible, the file is
-rejected.
+has the upper three rows of a pose's matrix, without a stamp. A line of a EuRoC file has, separated by
+commas, the time (ns), the position, the quaternion w, x, y, z, and further columns that are not part of
+the pose. TUM files may also have commas; the stamps then distinguish them from EuRoC files. If both
+formats remain possible, the file is rejected.
 """
 
 import re
@@ -43,9 +43,9 @@ class Trajectory:
     Attributes:
         name: name in messages.
         position_m: (n, 3).
-        rotation: (n, 3, 3) from the body's frame to that of the positions, with as many digits as the
-            source has; None if there are no orientations.
-        time_ns: (n,); None if there are no stamps.
+        rotation: (n, 3, 3) rotations from the body's frame to the frame of the positions, with all
+            digits of the source; None if there are no orientations.
+        time_ns: (n,), or None if there are no stamps.
         notes: sentences on the format that was found, and on corrected or doubtful data.
     """
 
@@ -85,7 +85,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """The layout of a line: a description, its least and largest number of cells, and its columns."""
+    """The layout of a line: a description, the smallest and largest number of cells, and its columns."""
 
     columns: str
     least: int
@@ -100,7 +100,7 @@ def _seconds_ns(text: str) -> int:
 
 
 def _exact(text: str) -> Decimal:
-    """Read a number exactly if it is finite as a double; exponents beyond Decimal's range give zero."""
+    """Read a finite number exactly; return zero if its exponent is beyond the range of Decimal."""
     try:
         return Decimal(text)
     except InvalidOperation:
@@ -121,7 +121,7 @@ LAYOUTS: dict[Format, _Layout] = {
 
 
 def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory:  # noqa: A002
-    """Read a trajectory file; poses that are not in the order of time are sorted, and a note reports it.
+    """Read a trajectory file; unsorted poses are sorted by time, and a note reports it.
 
     Args:
         path: the file; empty lines and lines that begin with # are skipped.
@@ -214,9 +214,9 @@ def _fields(line: str) -> list[str]:
 def _recognised(
     path: object, numbers: Sequence[int], lines: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> Format:
-    """Recognise the format by the columns of the first pose and the stamps of all.
+    """Recognise the format from the columns of the first pose and the stamps of all poses.
 
-    Raises BadInput if the poses have no known format, or could have two.
+    Raises BadInput if the format is unknown, or if the poses could have two formats.
     """
     count, has_commas = len(rows[0]), "," in lines[0]
     if count == LAYOUTS["kitti"].least and not (has_commas and _unit(rows) == "ns"):
@@ -251,7 +251,7 @@ def _recognised(
 
 
 def _unit(rows: Sequence[Sequence[str]]) -> str:
-    """Determine the unit of stamps, s, ms, us or ns, by their size and steps; empty if it is ambiguous.
+    """Infer the unit of stamps (s, ms, us or ns) from their size and steps; empty if it is ambiguous.
 
     Poses are assumed to be at most three hours apart, and to have a rate of at most 1 kHz. Dates in ms
     and us are from 2001 to 2033.

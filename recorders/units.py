@@ -113,7 +113,7 @@ def written(unit: str) -> str:
 
 
 def mistaken(unit_: str) -> dict[str, float]:
-    """Return the units often given by mistake, with the factor by which their numbers are too large."""
+    """Return units often used by mistake instead of `unit_`, and how much too large numbers get."""
     return {name: unit(unit_).size / unit(name).size for name in MISTAKEN.get(unit_, ())}
 
 
@@ -122,7 +122,7 @@ def conversion(given: str, name: str, *, is_root: bool = False) -> float:
 
     With `is_root` the numbers are square roots, such as the standard deviations for a covariance.
 
-    Raises BadInput if the text is not a unit, or measures another quantity.
+    Raises BadInput if the text is not a unit, or if the unit measures another quantity.
 
     >>> conversion("g", "specific_force_mps2"), conversion("cm", "covariance_m2", is_root=True)
     (9.80665, 0.01)

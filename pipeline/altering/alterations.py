@@ -115,7 +115,7 @@ def delayed(stream: Stream, by_s: float) -> Stream:
 
 
 def drifted(first_ns: int) -> Alteration:
-    """Make an alteration by which the clock of the stamps gains `rate` s per s from `first_ns` on."""
+    """Make an alteration that speeds up the clock of the stamps by `rate` s per s from `first_ns` on."""
     return partial(_drifted, first_ns)
 
 
@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Make an alteration that reorders a vector's entries and covariance, whatever the number."""
+    """Make an alteration that reorders a vector's entries and covariance and ignores its number."""
     return partial(_permuted, field, tuple(order))
 
 

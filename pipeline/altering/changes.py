@@ -57,7 +57,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """A setting of a topic, with its full key, the key's last part, the value and an empty stream."""
+    """A setting of a topic: the full key, its last part, the value, and an empty stream of the topic."""
 
     key: str
     what: str
@@ -69,7 +69,7 @@ class _Setting(NamedTuple):
         return BadInput(f"--set {self.key}={self.value}: expected {expected}")
 
     def number(self, name: str, example: str) -> float:
-        """Parse the value; its unit is that of `name`, unless the text has one, such as `300 ms`."""
+        """Parse the value; its unit is that of `name` unless the text states one, such as `300 ms`."""
         found = _NUMBER.fullmatch(str(self.value))
         if isinstance(self.value, bool) or found is None:
             raise self.refused(example)
@@ -83,7 +83,7 @@ class _Setting(NamedTuple):
         return number
 
     def several(self, counts: Sequence[int], example: str) -> list[str]:
-        """Parse the value as a list; it may also be text with commas."""
+        """Parse the value as a list; the value may also be text with commas."""
         is_list = isinstance(self.value, list | tuple)
         parts = list(self.value) if is_list else str(self.value).strip("[] ").split(",")
         if len(parts) not in counts:
@@ -97,11 +97,12 @@ class Change:
 
     Attributes:
         topic: its name.
-        stored: the topic of the log from which the topic is read; it differs if topics are swapped.
+        stored: name of the topic in the log; it differs from `topic` only if two topics are swapped.
         first_ns: the start of the run, at which the drift of a clock begins.
-        columns: alterations of its columns, in the order in which they are applied.
-        metadata: metadata to add to those in the log.
-        gain, delay_ns: the gain of the clock since `first_ns` and the delay to remove from the stamps.
+        columns: alterations of the topic's columns, in the order in which they are applied.
+        metadata: metadata to add to the topic's metadata in the log.
+        gain, delay_ns: the clock's gain since `first_ns`, and the delay, which are removed from the
+            stamps.
     """
 
     topic: str
@@ -128,7 +129,7 @@ class Change:
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
-        """Return a stored topic with the name and metadata of the altered one."""
+        """Return a stored topic with the name and metadata of the altered topic."""
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
@@ -154,7 +155,7 @@ def is_of_topic(key: str) -> bool:
 def is_parameter(key: str) -> bool:
     """Test whether a setting of a topic is a parameter of its sensor, not an alteration of the log.
 
-    The names of parameters never consist of a field's name and the suffix of an alteration.
+    A parameter's name is never a field's name followed by the suffix of an alteration.
     """
     _, dot, what = key.rpartition(".")
     if not (is_of_topic(key) and dot) or what in (*WHATS, "delay"):
@@ -163,7 +164,7 @@ def is_parameter(key: str) -> bool:
 
 
 def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Move each parameter `/TOPIC.NAME` to a table: to the entry NAME of the table `/TOPIC`."""
+    """Move each parameter `/TOPIC.NAME` to the entry NAME of the table `/TOPIC`."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         found = merge(found, nested(key, value) if is_parameter(key) else {key: value})
@@ -172,7 +173,7 @@ def by_topic(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _read_by_sensors() -> frozenset[str]:
-    """Collect the parameters that sensors of the registered models read."""
+    """Collect the names of the parameters that the sensors of registered models read."""
     return frozenset(
         name
         for model in registered_models().values()
@@ -207,8 +208,8 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
     """Parse settings of topics into changes of a run, by topic, in the order of the settings.
 
     `WHATS` lists the possible settings. Fields are given by their full name without the unit, or by an
-    unambiguous prefix of it, entries of vectors with their axis, such as `position_x_bias`, and entries
-    of states by their component. A number may have a unit, such as `300 ms` or `4.5 deg`.
+    unambiguous prefix of it. Entries of vectors are given with their axis, such as `position_x_bias`,
+    and entries of states by their component. A number may have a unit, such as `300 ms` or `4.5 deg`.
 
     Raises BadInput if the topic or field does not exist, or if a value is invalid.
     """
@@ -237,7 +238,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
 def _of_one_topic(
     source: LogSource | MemorySource, settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield settings, with `/*.plane` replaced by a setting of each topic that states no plane."""
+    """Yield settings; replace `/*.plane` with a setting for each topic that states no plane."""
     of_all = f"{ALL_TOPICS}.plane"
     for key, value in settings.items():
         if key != of_all:

@@ -20,7 +20,8 @@ class Entry(NamedTuple):
         field, place: the field, and the index in it; a heading belongs to the field `quaternion`.
         name: the name in a setting, with the unit.
         is_angle: whether the number is a measured angle.
-        number: the index of the measured component that depends on it; None if several do.
+        number: the index of the measured component that depends on the number; None if several
+            components do.
         varies: the number's standard deviation over the log.
     """
 
@@ -33,7 +34,7 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Test whether this is the heading of orientations."""
+        """Test whether this number is the heading of orientations."""
         return self.field == "quaternion"
 
 

@@ -99,18 +99,18 @@ def alterations_of(source: Source) -> dict[str, Any]:
 
 
 def note_of(source: Source) -> dict[str, str]:
-    """Return a run's alterations as metadata of an estimates log; {} if the run is not altered."""
+    """Return a run's alterations as metadata of an estimates log, or {} if the run is not altered."""
     return {name: json.dumps(applied) for name, applied in setting_of(source).items()}
 
 
 def setting_of(source: Source) -> dict[str, dict[str, Any]]:
-    """Return a run's alterations as a setting of a result; {} if the run is not altered."""
+    """Return a run's alterations as a setting of a result, or {} if the run is not altered."""
     applied = alterations_of(source)
     return {NOTE: applied} if applied else {}
 
 
 def stated_alterations(estimates: Source) -> dict[str, Any]:
-    """Read from an estimates log how its run was altered; raise BadInput if this is unreadable."""
+    """Read from an estimates log how its run was altered; raise BadInput if the entry is unreadable."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get(NOTE, "{}"))
@@ -124,7 +124,7 @@ def stated_alterations(estimates: Source) -> dict[str, Any]:
 
 
 def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split settings into alterations of topics and parameters, some of which belong to a topic.
+    """Split settings into alterations of topics, and parameters of estimators and of topics.
 
     >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1, "/fix.lever_x_m": 0.4})
     ({'/fix.delay_s': 0.3}, {'gate_probability': 1, '/fix': {'lever_x_m': 0.4}})
@@ -140,7 +140,7 @@ def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @dataclass(frozen=True, repr=False)
 class AlteredRecording(MemorySource):
-    """A recording in memory whose streams are altered; `before` is the unaltered one."""
+    """A recording in memory whose streams are altered; `before` is the unaltered recording."""
 
     before: MemorySource = field(kw_only=True)
     alterations: Settings = field(kw_only=True)
@@ -303,8 +303,8 @@ def in_one_plane(
 ) -> dict[str, Change]:
     """Extend the changes of topics so that all positions are in one local tangent plane.
 
-    This is the plane of the truth, in which errors are computed. Without truth, it is the plane of the
-    first topic.
+    The single plane is the plane of the truth, in which errors are computed. Without truth, all
+    positions are converted to the plane of the first topic.
 
     Args:
         name: the run's name.

@@ -1,4 +1,4 @@
-"""Python functions for logs, recordings, experiments and lists, which do the same as the commands.
+"""Python functions that do for logs, recordings, experiments and lists what the commands do.
 
 All functions raise BadInput with the same messages as the commands. docs/python.md shows how to use
 them. The replay is in `fuselog.pipeline.api.replays`.
@@ -44,7 +44,7 @@ from fuselog.replay.foreign.naming import allowed
 
 @without_warnings_of_numbers()
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
-    """Record a run of a scenario in memory; the recording can be replayed like a log, or written to one.
+    """Record a run of a scenario in memory; the recording can be replayed, or written to a log.
 
     Args:
         scenario: a name from `scenarios`, or a TOML file.
@@ -69,7 +69,7 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
     """Import real data, in the format in which they were published, into memory.
 
     Args:
-        importer: a registered name, such as "mrclam"; `fuselog scenarios` lists them.
+        importer: a registered name, such as "mrclam"; `fuselog scenarios` lists the names.
         path: the file or folder to read.
         parameters: parameters of the importer.
 
@@ -174,8 +174,8 @@ def run(
             cores if that saves time.
         scheduler: a Dask scheduler whose workers share the runs, or `local:N`.
         executor: any other executor whose workers can read this machine's files.
-        set: entries of the experiment, parameters of its scenario, or of its estimators by label:
-            `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
+        set: entries of the experiment, parameters of its scenario, or parameters of its estimators by
+            label: `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
         progress: function that wraps iterables to report progress.
 
     Returns:
@@ -277,7 +277,7 @@ def _pool(
     executor: Executor | None,
     experiments: Sequence[Experiment],
 ) -> PoolFactory:
-    """Choose the workers for experiments; with a scheduler, ignore the default of one process."""
+    """Choose the workers for experiments; if there is a scheduler, ignore the default of one process."""
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)

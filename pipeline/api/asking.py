@@ -40,7 +40,7 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
     """Print the meaning of the parameters in `NAME=?` texts; raise BadInput for an unknown name.
 
     Args:
-        texts: the settings; those that are not questions are skipped.
+        texts: the settings; settings without a question mark are skipped.
         takes: a key of `TAKERS`.
         options: the options of the command.
     """
@@ -55,7 +55,7 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
 
 
 def settings_that_begin(begin: str, takes: str, options: Mapping[str, Any]) -> dict[str, str]:
-    """Find the parameters whose names begin with a text, with the meaning of each, for completion.
+    """Find the parameters whose names begin with a text, and their meanings, for completion.
 
     Args:
         begin: the first letters of a name.
@@ -98,7 +98,7 @@ def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
 
 
 def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
-    """Name the owners of a parameter, without their models if the parameter is the same for all."""
+    """Name the owners of a parameter, with their models only if the parameter differs between them."""
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
@@ -140,7 +140,7 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
 def _by_label(
     estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
 ) -> Iterator[Entries]:
-    """Yield the parameters of each estimator with its label as prefix, then of all without prefix."""
+    """Yield each estimator's parameters with its label as prefix, then all parameters without prefix."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
         yield [replace(entry, prefix=f"{label}.") for entry in entries]

@@ -93,7 +93,7 @@ LISTS: dict[str, Callable[[], Entries]] = {
 
 
 def show(kind: str, name: str | None, *, as_json: bool) -> None:
-    """Print the details of one entry, or all entries as JSON, with errors of those that fail to load.
+    """Print one entry, or all entries as JSON; an entry that cannot be loaded shows its error.
 
     Raises BadInput if the entry is unknown or cannot be loaded.
     """
@@ -113,12 +113,12 @@ def show(kind: str, name: str | None, *, as_json: bool) -> None:
 
 
 def methods() -> dict[str, dict[str, str]]:
-    """Find the methods that can estimate each model, and what the model lacks for the others."""
+    """For each model, find the methods that can estimate it, and what it lacks for the others."""
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
 def show_formulas(name: str | None, *, as_json: bool) -> None:
-    """Print the formulas of a model; raise BadInput if no model is named, or if it is unknown."""
+    """Print the formulas of a model; raise BadInput if `name` is None or not a known model."""
     if name is None:
         raise BadInput("--formulas needs a model, for example: fuselog models robot --formulas")
     if as_json:
@@ -149,7 +149,7 @@ def _files(kind: str, described: Callable[[str, Path], Entry]) -> Entries:
 
 
 def entry_or_why(name: str, make: Callable[[], Entry]) -> Entry:
-    """Make an entry; if its module cannot be loaded, make one with the error message."""
+    """Make an entry, or one that contains the error message if its module cannot be loaded."""
     try:
         return make()
     except BadInput as error:
@@ -204,7 +204,7 @@ def stated_of(model: Model) -> set[str]:
 
 
 def _listed(components: Mapping[str, str]) -> str:
-    """Format components, each followed by its kind unless it is linear."""
+    """Format components, each followed by its kind unless the kind is linear."""
     return ", ".join(
         name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
     )
@@ -267,5 +267,5 @@ def rows_of(entry: Entry) -> list[list[object]]:
 
 
 def _default(value: object, *, is_stated: bool) -> object:
-    """Return a parameter's default, or a phrase if a log's channels state it."""
+    """Return a parameter's default, or a phrase if a log's channels state the parameter."""
     return "from the log" if value is None and is_stated else value

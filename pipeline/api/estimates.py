@@ -130,7 +130,7 @@ def judge_estimates(
 
 
 def _opened(path: Path, *, recover: bool) -> LogSource:
-    """Open an estimates log; raise BadInput if the file is not one."""
+    """Open an estimates log; raise BadInput if the file is not an estimates log."""
     try:
         log = open_log(path, recover=recover)
     except NotMcap as error:

@@ -46,7 +46,7 @@ FAMILIES = {
 
 
 def show_list(kind: str) -> None:
-    """Print the names of a kind, such as "scenarios", with a one-line description, by family."""
+    """Print the names of a kind (such as "scenarios") by family, each with a one-line description."""
     in_families = kind in ("scenarios", "models", "estimators")
     rows = by_family(kind) if in_families else listed(kind).items()
     print_table([kind.removesuffix("s"), "what"], [*rows])
@@ -77,7 +77,7 @@ def by_family(kind: str) -> Iterator[tuple[str, str]]:
 
 
 def listed(kind: str) -> dict[str, Any]:
-    """Return the description of each name; for methods, whether they can estimate each model."""
+    """Return each name's description; for "methods", whether each method can estimate each model."""
     kept, places = json.loads(KEPT.read_text(encoding="utf-8"))[kind], places_of(kind)
     if kept.keys() >= {*places.values()}:
         return {name: kept[place] for name, place in places.items()}

@@ -37,7 +37,8 @@ def observability(
 
     Args:
         logs: one or several logs with the same topics: paths, opened logs, or recordings.
-        model: a registered name, or a model of your own; by default the registered one that fits.
+        model: a registered name, or a model of your own; by default the registered model that fits the
+            logs.
         window_s: length of the windows in seconds; by default each run is one window.
         scales: unit of each component, instead of the prior's standard deviation.
         end_s: end of the evaluated span, in seconds since each run's epoch.

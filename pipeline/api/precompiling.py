@@ -36,7 +36,7 @@ class Precompiled(NamedTuple):
         model, method: registered names.
         scenario: the scenario that was recorded and replayed.
         took_s: duration of the replay in s, including everything that it compiled.
-        why_not: the reason why the model was not replayed by this method; empty if it was.
+        why_not: the reason why this method did not replay the model; empty if it did.
     """
 
     model: str
@@ -53,7 +53,7 @@ def precompile(
     *,
     workers: int | None = None,
 ) -> list[Precompiled]:
-    """Compile and store the kernels that the first replay of models by methods needs.
+    """Compile and store the kernels needed for the first replay of each model with each method.
 
     A kernel is specific to the sensors of a log, so short recordings of the registered scenarios that
     fit a model are replayed. A log with other sensors compiles its own kernels on its first replay, and

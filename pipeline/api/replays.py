@@ -1,7 +1,7 @@
 """Replay as a function, which returns an object with all estimates, tables and figures.
 
-Estimates are stored in a temporary folder as long as the replay or one of its estimates is referenced.
-Memory holds only the sums of the metrics and the tables that were requested.
+Estimates are stored in a temporary folder for as long as the replay or one of its estimates is
+referenced. Memory holds only the sums of the metrics and the tables that were requested.
 """
 
 import hashlib
@@ -70,8 +70,8 @@ def replay(
         end_s: end of the span.
         start_from: initial state of filters at `start_s`: "truth", or for each log the estimates log of
             an earlier replay.
-        start_sigma: standard deviations for a start from the truth, by component; by default the
-            prior's.
+        start_sigma: by component, standard deviations for a start from the truth; by default those of
+            the prior.
         gap_limit_s: the longest gap over which the truth is interpolated.
         arrival_order: process messages in order of log time, as they arrived.
         late: handling of messages that arrive out of sequence: "drop", "wait:0.5" (in seconds) or
@@ -230,7 +230,7 @@ class Replay(Showing):
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
-        """Draw RMSE and NEES over time for a `case` such as `robot1`, by default for the first.
+        """Draw RMSE and NEES over time for a `case` such as `robot1`, by default for the first case.
 
         Raises BadInput if there is no such case, or nothing was judged.
         """

@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """Return notes on both trajectories, on doubtful results, and on a time offset not found."""
+        """Return notes on both trajectories, on doubtful results, and on a failed time-offset search."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         notes = [in_vain] if sought and not self.compared.time_offset_s else []
@@ -175,7 +175,7 @@ def evaluate(
             vertical axis, and translation), "se2" (the same, with the height unchanged), "se3", "sim3".
         delta: the distance over which relative errors are computed.
         delta_unit: unit of `delta`: "m" along the estimate's path, "frames" or "s".
-        association: "nearest" pairs poses that are close in time, "interpolated" interpolates the truth.
+        association: "nearest" pairs poses that are close in time; "interpolated" interpolates the truth.
         max_difference_s: the largest time difference of matched poses, for "nearest".
         gap_limit_s: the longest gap over which the truth is interpolated.
         time_offset_s: offset in seconds to add to the estimate's stamps; "estimate" finds the offset
@@ -207,8 +207,8 @@ class ComparedLogs:
     """Estimates of logs as trajectories, compared with the truth.
 
     Attributes:
-        estimates: of every run, aligned with the truth.
-        compared: by estimator and case, for the runs that have both estimates and truth.
+        estimates: the estimates of every run, aligned with the truth.
+        compared: the comparisons by estimator and case, for the runs that have both estimates and truth.
     """
 
     estimates: Sequence[Source]
@@ -247,7 +247,7 @@ def compare_logs(
 
     Memory holds the poses of all runs.
 
-    Raises BadInput as `compare` does, if an alignment would tilt a planar state out of its plane, or if
+    Raises BadInput if `compare` does, if an alignment would tilt a planar state out of its plane, or if
     unaligned estimates and truth are in local tangent planes that cannot be compared.
     """
     compared: dict[tuple[str, str], list[Compared]] = {}
@@ -281,7 +281,7 @@ def compare_logs(
 def trajectory_figures(
     compared: Mapping[str, Compared], suffix: str = ""
 ) -> dict[str, "Chart | Figure"]:
-    """Draw paths, errors, and paths coloured by error, in the style of evo, by label."""
+    """Draw the paths and errors of all labels, and each label's path coloured by error, as in evo."""
     figures: dict[str, Chart | Figure] = {
         f"trajectory{suffix}": _path_chart(compared),
         f"pose-errors{suffix}": _error_chart(compared),
@@ -292,7 +292,7 @@ def trajectory_figures(
 
 
 def _plane(truth: Trajectory) -> list[int]:
-    """Find the two axes with the largest extent of the truth: the ground plane, even for a camera."""
+    """Find the two axes with the truth's largest extents: the ground plane, also in a camera's axes."""
     return sorted(np.argsort(-np.ptp(truth.position_m, axis=0), kind="stable")[:2].tolist())
 
 

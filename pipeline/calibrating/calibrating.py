@@ -33,15 +33,15 @@ def calibrate(
 ) -> Tuning:
     """Estimate the parameters of mountings, scales, biases and delays of sensors.
 
-    All parameters that the model marks as its calibration, and on which the logs depend, are estimated
-    together by maximum likelihood. Parameters that the motion does not determine are named, keep their
-    start values, and have no interval.
+    All calibration parameters of the model that affect the likelihood of the logs are estimated together
+    by maximum likelihood. Parameters that the motion does not determine are named, keep their start
+    values, and have no interval.
 
     Args:
         logs: one or several logs with the same topics: paths, opened logs, or recordings.
         estimator: a registered name, or a label of your own mapped to an estimator; see `replay`.
         set: values of other parameters, and start values; see `tune`.
-        fixed: calibration parameters that are known and keep the values that are set.
+        fixed: calibration parameters that are known and keep the values set for them.
         next_motion: also recommend the next manoeuvre to record, for a robot with wheels and fixes.
         options: as for `tune`, except `free` and `by`.
 

@@ -33,7 +33,7 @@ def show_ellipsoid(
     recover: bool,
     as_json: bool,
 ) -> None:
-    """Fit an ellipsoid, and print its parameters with intervals, followed by sentences."""
+    """Fit an ellipsoid, and print its parameters with intervals, followed by notes."""
     paths = logs_meant(logs).logs
     check_outputs(out, None, {"log": paths})
     sources = [LogSource(open_log(path, recover=recover)) for path in paths]

@@ -1,7 +1,7 @@
 """Calibration of a rotated magnetometer or accelerometer: offsets, scales, cross terms.
 
-The magnetic field and gravity have a constant length in all orientations of a unit. Therefore corrected
-readings are on a sphere, and raw readings on an ellipsoid; see `ellipsoid_fit`.
+The magnetic field and gravity have a constant length in all orientations of a unit. Therefore, corrected
+readings are on a sphere, and raw readings are on an ellipsoid; see `ellipsoid_fit`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -39,7 +39,7 @@ class Ellipsoid:
         logs: the names of the logs.
         length: the length of corrected readings.
         is_assumed: whether the length was computed from the readings, because none was given.
-        unit: the length that equals one in the fit.
+        unit: the length that the fit uses as its unit.
         readings: (n, 3) the fitted readings.
         fitted: the ellipsoid.
     """
@@ -68,13 +68,13 @@ class Ellipsoid:
 
     @property
     def left_open(self) -> list[str]:
-        """List undetermined parameters; all, if there are too few orientations to fit an ellipsoid."""
+        """List undetermined parameters, or all of them if the orientations are too few for a fit."""
         places = self.fitted.lacking.places
         return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
-        """Return a table with each parameter's value and 95 % interval; NaN if not determined."""
+        """Return a table with each parameter's value and 95 % interval, or NaN if not determined."""
         factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
         values = self.fitted.numbers * factors
         reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
@@ -85,7 +85,7 @@ class Ellipsoid:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Return settings that correct a log's readings; {} if a parameter is not determined."""
+        """Return settings that correct a log's readings, or {} if a parameter is not determined."""
         if self.left_open:
             return {}
         stem, _, unit = self.field.rpartition("_")
@@ -178,14 +178,16 @@ class Ellipsoid:
 def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
     """Estimate offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
 
-    Only readings of a still accelerometer are used, because it then measures only gravity. The matrix is
-    symmetric, because readings do not determine the rotation between the sensor's and the body's axes.
+    For an accelerometer, only readings at rest are used, because it then measures only gravity. The
+    matrix is symmetric, because readings do not determine the rotation between the sensor's and the
+    body's axes.
 
     Args:
-        logs: paths, opened logs, or recordings of one unit that is rotated to all sides.
+        logs: paths, opened logs, or recordings of one sensor unit that was rotated through many
+            orientations.
         field: the field, such as `/imu.magnetic_field_ut`.
         length: the vector's length in the field's unit. The default is gravity for a specific force,
-            otherwise the length with which the mean of the scales is one.
+            otherwise the length for which the mean of the scales is one.
 
     Returns:
         Offset (3,) and matrix (3, 3) with 95 % intervals, and the quality of the fit.
@@ -219,7 +221,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
 
 
 def _readings(source: LogSource | MemorySource, field: str) -> Floats:
-    """Return the readings (n, 3) of a field; for an accelerometer, means while it is still."""
+    """Return the readings (n, 3) of a field; average an accelerometer's over periods at rest."""
     topic, _, name = field.rpartition(".")
     if not topic:
         raise BadInput(f"--field {field}: expected TOPIC.FIELD, such as /imu.magnetic_field_ut")
@@ -235,7 +237,7 @@ def _readings(source: LogSource | MemorySource, field: str) -> Floats:
 
 
 def _still(readings: Floats, times_s: Floats) -> Floats:
-    """Average readings (n, 3) over half seconds in which they are still: (m, 3)."""
+    """Average readings (n, 3) over each half second in which they are still, and return (m, 3)."""
     if len(readings) < FEWEST:
         return readings[:0]
     size = max(2, round(_STILL_S / float(np.median(np.diff(times_s)))))

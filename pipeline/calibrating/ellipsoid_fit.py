@@ -37,8 +37,8 @@ class Fit(NamedTuple):
         numbers: (9,) the parameters, in the order of `NAMES`.
         covariance: (9, 9) covariance of the determined parameters; meaningless for the others.
         lacking: the parameters that the readings do not determine.
-        turned_about: the coordinate axis closest to the only axis of rotation; empty if there were
-            several.
+        turned_about: the coordinate axis closest to the axis of rotation if there was only one such
+            axis; otherwise empty.
         sigma: the standard deviation of the noise.
         correlation: correlation of the noise between successive readings.
     """

@@ -102,7 +102,7 @@ def recorded(unit: str, seed: int) -> MemorySource:
 
 
 def turned(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Simulate the field (n, 3) in the axes of a unit that is rotated for a minute, and its noise."""
+    """Simulate the field (n, 3) in the axes of a unit rotated for a minute; return it and the noise."""
     time_s = STEP_S * np.arange(3000)
     across, up = 1.1 * time_s, 1.5 * np.sin(0.13 * time_s)
     across, up = across + 6.0 * rng.random(), up + 0.05 * rng.random()
@@ -111,7 +111,7 @@ def turned(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def put_down(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Simulate the specific force (n, 3) of a unit that is moved between positions, and its noise."""
+    """Simulate the specific force (n, 3) of a unit moved between positions; return it and the noise."""
     directions = rng.standard_normal((POSITIONS, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     held, moved = round(HELD_S / STEP_S), round(MOVED_S / STEP_S)

@@ -1,9 +1,10 @@
 """Advice on the next manoeuvre to record, from the information that it would add to a calibration.
 
-Manoeuvres of a wheeled robot are simulated without noise, with the sensors, steps and noise of the log
-and the estimated values, to compute their information. The best manoeuvre depends on the criterion: the
-determinant considers all parameters together, the widest interval only the least accurate one. A
-parameter's useful unit is the standard error that a calibration should reach.
+Manoeuvres of a wheeled robot are simulated without noise to compute their information. The simulation
+uses the sensors, time steps and noise levels of the log, and the estimated values. The best manoeuvre
+depends on the criterion: the determinant takes all parameters into account, whereas the widest interval
+depends only on the least accurate one. A parameter's useful unit is the standard error that a
+calibration should reach.
 """
 
 from collections.abc import Mapping
@@ -90,8 +91,9 @@ def gain(known: Floats, added: Floats) -> Gain:
 def manoeuvres(found: Tuning) -> pd.DataFrame:
     """Tabulate manoeuvres of 20 s, in ascending order of the widest interval that would remain.
 
-    The columns are the manoeuvre, the nats that it adds, and the standard deviation of each parameter
-    with it, in the parameter's unit. The row "none" describes the logs without another manoeuvre.
+    The columns are the manoeuvre, the information that it adds in nats, the largest standard deviation
+    with it in useful units, and the standard deviation of each parameter with it in the parameter's
+    unit. The row "none" describes the logs without another manoeuvre.
 
     Raises BadInput if the logs are not those of a robot with wheels.
     """
@@ -115,7 +117,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
 
 
 def advice(found: Tuning) -> list[str]:
-    """Recommend the best manoeuvres, by the widest interval and by the determinant."""
+    """Recommend the best manoeuvre for the widest interval, and the best for the determinant."""
     table = manoeuvres(found)
     names = list(table.columns[3:])
     before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
@@ -165,7 +167,7 @@ def _simulated(found: Tuning, log: Source, motion: str) -> Run:
 
 
 def _first_of(log: Source, schema: Schema) -> Stream | None:
-    """Read the first topic of a schema, except estimates; None if there is none."""
+    """Read a schema's first topic outside /estimates/, or return None if there is no such topic."""
     for name in topics_of(log.topics, schema):
         if not name.startswith("/estimates/"):
             return log.read([name])[name]
@@ -197,7 +199,7 @@ def _errors(values: Mapping[str, Any]) -> Floats:
 
 
 def _alike(stream: Stream, like: Stream) -> Stream:
-    """Give a simulated stream the name, metadata and covariance of a recorded one."""
+    """Give a simulated stream the name, metadata and covariance of a recorded stream."""
     columns = {
         name: np.repeat(like[name][:1], len(stream), axis=0) if "covariance" in name else column
         for name, column in stream.columns.items()

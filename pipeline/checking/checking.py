@@ -72,7 +72,7 @@ def compared(golden: Golden, replayed: Replayed) -> Checked:
 def runs_of(path: Path, where: str | None = None) -> Runs:
     """Return the runs of a log, of a folder or catalog of logs, or of the logs in a result folder.
 
-    Raises BadInput if there are no logs, or two of them have the same name.
+    Raises BadInput if there are no logs, or if two logs have the same name.
     """
     applied: dict[str, Any] = {}
     if (path / RESULT_FILE).is_file():

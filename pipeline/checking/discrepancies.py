@@ -37,7 +37,7 @@ class Discrepancy(NamedTuple):
         allowed: largest allowed difference, relative to the size of the column.
         row: first row in the golden whose difference exceeds `allowed`; None if there is no such row.
         component: component of the column.
-        before, after: values of the golden and of the replay in this row.
+        before, after: values of the golden and of the replay in the row `row`.
         stamp_ns: stamp of the row, if the replayed stream is available.
     """
 
@@ -111,7 +111,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
 def _distances(
     golden: Golden, found: Golden, missing: Callable[[str, str, str], Discrepancy]
 ) -> Iterator[Discrepancy]:
-    """Yield the relative difference of every part from the golden; infinite for a missing part."""
+    """Yield every part's relative difference from the golden, which is infinite for a missing part."""
     for key, stored, new in _pairs(golden["metrics"], found["metrics"]):
         before, after = _floats(stored), _floats(new)
         if before.shape != after.shape:
@@ -221,7 +221,7 @@ def _relative(difference: Floats, size: ArrayLike) -> Floats:
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """Describe the earliest discrepancy, the stamp from which its bits differ, and the innovation."""
+    """Describe the earliest discrepancy, the stamp of the first differing bits, and the innovation."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     sentences = [first.sentence]
@@ -238,7 +238,7 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
 
 
 def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> int | None:
-    """Find the stamp of the first row whose bits differ; None if there is none or it is unknown."""
+    """Find the stamp of the first row whose bits differ; return None if no such row can be found."""
     stored, new = (
         each["runs"][first.run]["streams"].get(first.topic) for each in (golden, replayed.golden)
     )
@@ -255,7 +255,7 @@ def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> in
 
 
 def _innovation_at(outputs: Outputs, what: tuple[str, str], stamp_ns: int) -> Iterator[str]:
-    """Yield the innovation at a stamp, or the last before it, of each stream of an estimator."""
+    """Yield, for each stream of an estimator, the innovation at a stamp or the last one before it."""
     for topic, stream in outputs.items():
         if split_topic(topic) != what or stream.schema.full_name != schemas.INNOVATION.full_name:
             continue

@@ -1,9 +1,9 @@
 """Creation of goldens, which are small stored replays with which later replays are compared.
 
 A golden is compressed JSON with the settings, a hash of every input and the tolerances. For every output
-stream, it contains the number of rows, the metadata, hashes of both clocks and a checksum of each row.
-For every column, it contains some evenly spaced rows in full precision and sums over all rows. It
-contains no timings.
+stream, a golden contains the number of rows, the metadata, hashes of both clocks and a checksum of each
+row. For every column, a golden contains some evenly spaced rows in full precision and sums over all
+rows. A golden contains no timings.
 """
 
 import base64
@@ -109,7 +109,7 @@ def golden_of(
     metrics: Mapping[str, Any] | None = None,
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """Assemble a golden from its parts, in the same form as one that is read from a file."""
+    """Assemble a golden from its parts, in the same form as a golden that is read from a file."""
     found = {
         "format": FORMAT,
         "arithmetic": arithmetic(),
@@ -128,7 +128,7 @@ def input_hash(source: LogSource | MemorySource) -> str:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Test whether an output belongs in a golden, unlike coverage and empty streams of failures."""
+    """Test whether an output belongs in a golden; coverage and empty streams of failures do not."""
     schema = stream.schema.full_name
     return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 

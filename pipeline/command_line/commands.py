@@ -164,7 +164,7 @@ def mirrors_if(foxglove: bool) -> Mirrors | None:
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """Choose the path of each log's estimates log: next to the log, the given file, or in a folder.
 
-    Raises BadInput if two of them would have the same path.
+    Raises BadInput if two estimates logs would have the same path.
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
@@ -234,7 +234,7 @@ def evaluate_trajectory(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge a trajectory file against a true one, and print the errors."""
+    """Judge a trajectory file against a file with the true trajectory, and print the errors."""
     from fuselog.pipeline.api.trajectories import evaluate
 
     if len(estimates) > 1:

@@ -61,7 +61,7 @@ def run_named(
 ) -> None:
     """Run an experiment, or replay logs as an experiment, and print its metrics and claims.
 
-    With `tells_parameters`, print only the parameters of its estimators.
+    If `tells_parameters` is set, print only the parameters of the experiment's estimators.
     """
     stated, values = _stated_experiment(named, labels, over, settings_file, settings, where)
     if data is not None and stated.source.endswith(".mcap"):
@@ -182,7 +182,7 @@ def sweep_named(
     where: str | None,
     **options: Any,
 ) -> None:
-    """Run an experiment, or replay logs as one, at many points, and print its metrics at each.
+    """Run an experiment (or replay logs as one) at many points, and print the metrics at each point.
 
     The other options are those of `sweep`.
     """

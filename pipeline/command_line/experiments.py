@@ -79,9 +79,9 @@ def run(
     To run your own logs as an experiment, give LOG.mcap ..., folders or a catalog, and -e for each
     estimator.
 
-    --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 a parameter of one
-    estimator, --set gate_probability=1 of all estimators that have it, and --set gap_limit_s=1 an entry
-    of the experiment.
+    --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 sets a parameter
+    of one estimator, --set gate_probability=1 sets it for all estimators that have it, and --set
+    gap_limit_s=1 sets an entry of the experiment.
     """
     from fuselog.pipeline.command_line.experiment_commands import run_named
 

@@ -114,7 +114,7 @@ def with_examples(text: str, *examples: str) -> str:
 
 
 def example_of(command: str, option: click.Option) -> str | None:
-    """Return an example of an option as typed; None for flags and options that list choices."""
+    """Return an example of an option as typed, or None for flags and options that list choices."""
     if option.is_flag or isinstance(option.type, click.Choice):
         return None
     name = option.opts[-1]
@@ -124,7 +124,7 @@ def example_of(command: str, option: click.Option) -> str | None:
 def command(
     short_help: str, *examples: str, name: str | None = None
 ) -> Callable[[Callable[..., None]], click.Command]:
-    """Make a command. Its help is its docstring, or else the short help, followed by examples."""
+    """Make a command. The help is the docstring or the short help, then examples."""
 
     def added(function: Callable[..., None]) -> click.Command:
         text = with_examples(function.__doc__ or short_help, *examples)

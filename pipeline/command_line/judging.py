@@ -110,8 +110,8 @@ def evaluate(
     """Judge ESTIMATES logs against the truth in the logs they were replayed from.
 
     With --truth, judge one trajectory file (TUM, KITTI or EuRoC) against another: absolute and relative
-    pose errors (APE and RPE), computed as in evo. With --align or --delta, also compute them for the
-    estimated positions of logs; all other metrics then refer to the aligned estimates.
+    pose errors (APE and RPE), computed as in evo. With --align or --delta, also compute pose errors for
+    the estimated positions of logs; all other metrics then refer to the aligned estimates.
     """
     from fuselog.pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
 
@@ -201,8 +201,8 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     """Explain what is likely wrong with LOG or with an estimator's settings, and what to try.
 
     LOG is a log, or an estimates log next to its source log. The output has at most five sentences, the
-    likeliest cause first: the one whose correction increases the log-likelihood most. For a folder or a
-    catalog, a result folder has a row for each log.
+    likeliest cause first: the cause whose correction increases the log-likelihood most. For a folder or
+    a catalog, a result folder has a row for each log.
     """
     from fuselog.pipeline.diagnosing.command import diagnose_log, diagnose_selection
 
@@ -270,7 +270,7 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
 @json_option
 @set_option("observability")
 def observability(logs: tuple[Path, ...], **options: Any) -> None:
-    """Show how well the measurements of LOGS determine the state, and in which direction least.
+    """Show how well the measurements of LOGS determine the state, and the least determined direction.
 
     For every run and window, print the rank and the eigenvalues of the local Gramian along the smoothed
     trajectory, in units of the prior's information.

@@ -72,9 +72,10 @@ def models(name: str | None, formulas: bool, as_json: bool) -> None:
 def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> None:
     """Show the size of the cache of compiled kernels and samples, which can be deleted safely.
 
-    --warm compiles the kernels of the named models and methods: ekf, ukf and smoother:ekf for a model
-    without a method, and all models if nothing is named. It replays short recordings of scenarios that
-    fit a model. A log with other sensors compiles its own kernels on its first replay, in 0.3 to 2 s.
+    --warm compiles the kernels of the named models and methods. If a model is named without a method, it
+    is compiled for ekf, ukf and smoother:ekf. If nothing is named, all models are compiled. --warm
+    replays short recordings of scenarios that fit a model. A log with other sensors compiles its own
+    kernels on its first replay, in 0.3 to 2 s.
     """
     if pairs and not warm:
         raise BadInput(f"fuselog cache {pairs[0]}: add --warm to compile it in advance")

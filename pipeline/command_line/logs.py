@@ -123,9 +123,9 @@ def catalog(folders: tuple[Path, ...], **options: Any) -> None:
 def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options: Any) -> None:
     """Estimate sensor noise from LOG, a recording at rest: white noise, random walk and more.
 
-    Estimates are by maximum likelihood, with intervals. The Allan deviation is computed as well, and
-    fuselog reports where it departs from the model. LOG may also be the output of imu_utils or
-    allan_variance_ros; the meaning of its numbers is then explained.
+    Parameters are estimated by maximum likelihood, with intervals. The Allan deviation is computed as
+    well, and fuselog reports where it departs from the model. If LOG is the output of imu_utils or
+    allan_variance_ros, fuselog explains what its numbers mean.
     """
     from fuselog.pipeline.sensing.command import show_noise
 
@@ -151,7 +151,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 @recover_option
 @json_option
 def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
-    """Estimate offsets, scales and cross terms of a sensor that is rotated to all sides in LOGS.
+    """Estimate offsets, scales and cross terms of a sensor that LOGS show in many orientations.
 
     The Earth's magnetic field and gravity have constant magnitudes, so raw readings lie on an ellipsoid.
     Hold an accelerometer still in each position. Terms that the rotations do not determine are named and
@@ -302,10 +302,11 @@ def _say_next_of_view(path: Path, *, recover: bool) -> None:
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    tum and kitti are for trajectories: poses, and estimates and truths with a position. ros2
-    writes a bag with these and geodetic fixes, as messages and TF, stored as MCAP; ros2-sqlite3 writes a
-    .db3. mot is for tracks and truths, frame by frame, as TrackEval reads them. csv and parquet are for
-    any stream, as a table. foxglove writes one log with messages that Foxglove and Rerun show.
+    tum and kitti write trajectories: poses, and estimates and truths with a position. ros2 writes
+    trajectories and geodetic fixes as messages and TF to an MCAP bag, and ros2-sqlite3 writes them to a
+    .db3 bag. mot writes tracks and truths frame by frame, in the form that TrackEval reads. csv and
+    parquet write any stream as a table. foxglove writes one log with messages that Foxglove and Rerun
+    show.
     """
     from fuselog.pipeline.logs.exporting import export as export_log
 
@@ -388,8 +389,8 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     """Write PATH with zero-velocity and, with --set rolling_hz=10, non-holonomic pseudo-measurements.
 
-    The model inertial uses them like sensors: a vehicle at rest has no velocity, and one that rolls on
-    wheels moves neither sideways nor up.
+    The model inertial uses these pseudo-measurements like sensors: a vehicle at rest has no velocity,
+    and a vehicle that rolls on wheels moves neither sideways nor up.
     """
     from fuselog.pipeline.logs.edit import constrain as constrain_log
     from fuselog.recorders.parameters import parse_settings

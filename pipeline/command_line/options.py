@@ -40,7 +40,7 @@ class OutputFile(Output):
         super().__init__(suffix, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path, unless something other than a regular file exists there."""
+        """Return the path; reject it if it exists and is not a regular file."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.exists() and not path.is_file():
             self.fail(f"{path} is not a regular file", param, ctx)
@@ -249,7 +249,7 @@ foxglove_option = click.option(
 def estimator_option(
     name: str, text: str, *, many: bool = False, required: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add `-e`, which names an estimator, as the argument `name`; with `many` it is repeatable."""
+    """Add `-e`, which names an estimator, as the argument `name`; `many` makes it repeatable."""
     return click.option(
         "-e", "--estimator", name, type=ESTIMATOR, multiple=many, required=required, help=text
     )

@@ -33,8 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     FUSELOG_TRACEBACK=1 shows the traceback of an error, for authors of estimators.
 
     Args:
-        arguments: arguments of the command; by default those of this process. In this case, the function
-            collects garbage less often, and ends the process.
+        arguments: arguments of the command; by default those of this process. With the default, the
+            function collects garbage less often, and ends the process.
     """
     if arguments is None:
         gc.set_threshold(50_000, 20, 100)  # there is no garbage to collect while libraries are imported
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _end(code: int) -> NoReturn:
-    """End the process as Python does, but do not free objects, which takes 20 % of a short command.
+    """End the process as Python does, but without freeing objects, which takes 20 % of short runs.
 
     Threads are left running: Python up to 3.13 terminates them, which aborts the process if a thread
     is in NumPy's C++ code or holds the lock of standard error.

@@ -165,7 +165,7 @@ def _import(
     *,
     stated: Mapping[str, object] | None = None,
 ) -> None:
-    """Import data and write a log; its metadata contains `stated` instead of the used parameters."""
+    """Import data and write a log whose metadata contains `stated` instead of the used parameters."""
     from fuselog.pipeline.output.outputs import check_files, imported
     from fuselog.recorders.log import open_log
     from fuselog.recorders.parameters import parse_settings
@@ -193,7 +193,8 @@ def _import(
 def _guessed(paths: tuple[Path, ...], mapping: Path) -> Iterator[Path]:
     """Write a first mapping of tables, and print what it assumes.
 
-    Yields the temporary path of the mapping; it is moved to its final place only if all goes well.
+    Yields the temporary path of the mapping; the mapping is moved to its final place only if no error
+    occurs.
     """
     from fuselog.pipeline.output.outputs import MAPPING, check_files
     from fuselog.recorders.atomic import whole_file

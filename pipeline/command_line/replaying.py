@@ -108,10 +108,10 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 
     LOGS are logs or folders of logs. The exit code is 1 if an estimator failed in every run. With a
     catalog, or with --where, --group, --workers or --scheduler, each log is replayed by itself, and a
-    result folder has a row for each log and estimator.
-    --set gate_probability=1 sets a parameter of all estimators that have it, and
-    --set ekf.gate_probability=1 a parameter of one. --set /fix.delay_s=0.3 changes the topic /fix as it
-    is read, also in run, tune, diagnose and compare; --set /fix=? lists what can be set.
+    result folder has a row for each log and estimator. --set gate_probability=1 sets a parameter of all
+    estimators that have it, and --set ekf.gate_probability=1 sets a parameter of one estimator. --set
+    /fix.delay_s=0.3 changes the topic /fix as it is read, also in run, tune, diagnose and compare; --set
+    /fix=? lists what can be set.
     """
     if selection := selecting(logs, options):
         from fuselog.pipeline.command_line.selections import replay_selection
@@ -187,7 +187,7 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @scheduler_option
 @replay_options
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
-    """Estimate the parameters of an estimator that explain LOGS best, with 95 % intervals.
+    """Find the estimator parameters that explain LOGS best, with 95 % intervals.
 
     LOGS are logs, folders or catalogs; --validate takes one of these and can be repeated. The search
     starts from --set NAME=VALUE, or from the values in the log's channels. Truth is needed only for
@@ -234,9 +234,9 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     """Estimate the scales, biases, mounting angles, lever arms and delays that explain LOGS best.
 
-    The model defines these parameters; --set NAME=VALUE sets a start value. A parameter that the motion
-    in the logs does not determine is named, keeps its start value, and has no interval. Use
-    settings.toml from the result folder with --settings of fuselog replay and run.
+    The model defines which parameters are calibrated; --set NAME=VALUE sets a start value. A parameter
+    that the motion in the logs does not determine is named, keeps its start value, and has no interval.
+    Use settings.toml from the result folder with --settings of fuselog replay and run.
     """
     from fuselog.pipeline.calibrating.command import calibrate_logs
 
@@ -286,7 +286,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 
     The exit code is 1 if anything differs; the first difference is printed with its stamp. For an
     intended change, update the golden in the same commit. To check a filter written by fuselog deploy,
-    use -e lib:PATH; it must have been deployed from the golden's filter. With a catalog, or with
+    use -e lib:PATH; the filter must have been deployed from the golden's filter. With a catalog, or with
     --where, --group, --workers or --scheduler, a result folder has a row for each log, also for those
     that are missing or new.
     """
@@ -318,10 +318,10 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 @settings_option
 @set_option("estimators")
 def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:
-    """Write a filter as C99, with the sensors and parameters of LOG, and a test from its messages.
+    """Write a filter in C99 for the sensors and parameters of LOG, with a test made from LOG.
 
-    The C code performs the same operations in the same order, so its estimates are identical to the last
-    bit; README.md in the folder explains how to build, test and replay it.
+    The C code performs the same operations as fuselog in the same order, so the estimates are identical
+    to the last bit; README.md in the folder explains how to build, test and replay it.
     """
     from fuselog.pipeline.deploying.command import deploy_filter
 

@@ -1,4 +1,4 @@
-"""Candidates of a comparison, with estimates of every run that are compared with the truth.
+"""Candidates of a comparison, whose estimates of every run are compared with the truth.
 
 The estimates of a candidate come from logs written by `fuselog replay`, from a replay with the settings
 of a result, or from a trajectory file, which is converted to a stream of estimates.
@@ -82,7 +82,7 @@ class Candidate:
     coverage: Sequence[Row] = ()
 
     def estimates(self, run: str) -> Renamed:
-        """Return the estimates of one of the runs of `pairs`, under this candidate's name."""
+        """Return the estimates of a run of `pairs`, under this candidate's name."""
         return Renamed(self.pairs[run][1], self.label, self.name)
 
 
@@ -108,7 +108,7 @@ def measured(
 ) -> Candidate:
     """Judge the estimates of a label run by run; each of the `pairs` is a log with its estimates.
 
-    Estimates in the order of measurement have an age too: it is zero.
+    Estimates in the order of measurement also get an age, which is zero.
     """
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []
@@ -136,7 +136,7 @@ def measured(
 
 
 def _hash_of_truth(source: Source, estimates: Source) -> str:
-    """Hash the truths of estimates; the hash does not depend on how they are divided into blocks."""
+    """Hash the truths of estimates; the hash does not depend on their division into blocks."""
     named = {topic.metadata.get("truth", "") for topic in estimates.topics.values()}
     digests: list[str] = []
     for topic in sorted(named & source.topics.keys()):
@@ -247,8 +247,8 @@ def of_result(folder: Path, progress: Progress) -> Given:
     """Return the estimators of a result folder, replayed with its settings.
 
     A result contains the RMSE and NEES of every run, but not every metric. If a replay with this version
-    reproduces its rows, the other metrics of the replay are used too. Otherwise, only the rows of the
-    result are used.
+    reproduces the rows of the result, the other metrics of the replay are used too. Otherwise, only the
+    rows of the result are used.
     """
     result = read_result(folder)
     tables = {name: folder / "tables" / f"{name}.parquet" for name in ("runs", "times")}
@@ -356,7 +356,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
 
 
 def _row_that_differs(kept: Candidate, again: Candidate) -> str:
-    """Describe the first row in which a replay differs from a result; empty if they agree."""
+    """Describe the first row in which a replay differs from a result, or return "" if they agree."""
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
     if len(both) < len(kept.rows):

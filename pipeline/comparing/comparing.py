@@ -125,7 +125,7 @@ def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) ->
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Differences:
-    """Differences between the first candidate of each group and every other one.
+    """Differences between the first candidate of each group and every other candidate of the group.
 
     Attributes:
         groups: groups of candidates.
@@ -216,9 +216,9 @@ class Differences:
         }
 
     def draw(self, save: Path) -> None:
-        """Draw the first run that all candidates of the first group share to the .rrd file `save`.
+        """Draw, to the .rrd file `save`, the first run that all candidates of the first group share.
 
-        Raises BadInput if they share no run.
+        Raises BadInput if the candidates share no run.
         """
         from fuselog.replay.timeline.show import Drawing  # slow to import
 
@@ -338,14 +338,14 @@ def compare(
     Args:
         candidates: result folders, estimates logs or folders of them, and trajectory files; with
             `estimators`, logs to replay or folders of them.
-        estimators: estimators to compare, in the form that `replay` accepts, or labels of estimates
-            recorded in the logs, which come first. The default is the estimators that all candidates
-            have in common, or the only estimator of each.
+        estimators: estimators to compare, in the form that `replay` accepts, or labels of estimates that
+            the logs contain. Recorded estimates come first. By default, these are the estimators that
+            all candidates have in common, or the only estimator of each candidate.
         truth: file of the true trajectory, if all candidates are trajectory files.
         case: case to which trajectory files belong, such as `robot2`, if a log has several truths.
         margin: relative difference of a metric that is considered irrelevant.
         gap_limit_s: longest gap over which the truth is interpolated.
-        set: alterations of topics and parameters of estimators for the replay of logs, in the form
+        set: for the replay of logs, alterations of topics, and parameters of estimators, in the form
             that `replay` accepts.
         recover: whether the readable part of truncated or damaged logs is used.
         stress: whether to withhold a verdict if changes that should not matter (see `stress`) move the
@@ -418,7 +418,7 @@ def _with_ages(group: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _by_importance(quantities: Iterable[str]) -> list[str]:
-    """Move the age of estimates to the errors, since waiting makes errors smaller."""
+    """List quantities with the age of estimates after the errors, since waiting reduces errors."""
     found = list(dict.fromkeys(quantities))
     others = [name for name in found if name != AGE]
     errors = [number for number, name in enumerate(others, 1) if "rmse" in name]
@@ -500,7 +500,7 @@ def _span_s(tables: Iterable[pd.DataFrame]) -> float:
 
 
 def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
-    """Compute in each span the NEES and the RMSE of position and orientation, or of what comes first."""
+    """Compute the NEES and the RMSEs of position and orientation (or the first RMSE) in each span."""
     columns = [column for column in times if "rmse" in str(column)]
     main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
     parts = []
@@ -517,7 +517,7 @@ def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
 def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
-    """Find the consecutive spans that contribute most to a difference; None if it is not significant."""
+    """Find the consecutive spans that contribute most to a significant difference; otherwise None."""
     if over_time.empty or found.verdict not in DIFFER:
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]

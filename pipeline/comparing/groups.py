@@ -108,7 +108,7 @@ def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:
 def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
     """Return the kind of input at a path: "result", "estimates", "log" or "trajectory".
 
-    A recording that contains estimates is a "log" if one of the `labels` is not among them.
+    A recording that contains estimates is a "log" if it has no estimates for one of the `labels`.
     """
     if path.is_dir():
         return "result" if (path / RESULT_FILE).is_file() else "estimates"
@@ -189,7 +189,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 
 def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
-    """Yield sentences about unequal runs, truths and settings; raise BadInput if no run is common."""
+    """Yield sentences about unequal runs, truths and settings; raise BadInput if no run is shared."""
     runs = [list(dict.fromkeys(candidate.rows["run"])) for candidate in (first, second)]
     common = [run for run in runs[0] if run in set(runs[1])]
     if not common:

@@ -1,4 +1,4 @@
-"""The interface with which fuselog replays a filter in C, an implementation of `fuselog_filter.h`."""
+"""The interface through which fuselog replays a filter in C; it implements `fuselog_filter.h`."""
 
 import json
 from typing import Any
@@ -12,7 +12,7 @@ from fuselog.replay.inference.model.model import Map, Sensor
 
 
 def why_no_replay(made: CFilter) -> str:
-    """Explain why fuselog cannot replay the C code; "" if it can."""
+    """Explain why fuselog cannot replay the C code, or return "" if it can."""
     bound_model, found = made.filtering.bound_model, made.filtering.found
     if made.is_interpolated:
         return "its control is interpolated, so that messages have to wait for the next control"

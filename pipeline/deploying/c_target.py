@@ -56,7 +56,7 @@ def target_lines(name: str, *, argument: str) -> list[str]:
 
     Args:
         name: the filter's name.
-        argument: the test's argument, the allowed difference from fuselog's own filter.
+        argument: the test's argument, which is the allowed difference from fuselog's own filter.
     """
     return [
         f"arm-none-eabi-gcc {TARGET_OPTIONS} cortex_m4f.c test_{name}.c {name}.c -lm -o test_{name}.elf",

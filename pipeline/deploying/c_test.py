@@ -120,7 +120,7 @@ def _rows(events: FilterEvents, rows: Integers) -> FilterEvents:
 
 
 def _from_start(events: FilterEvents, start_ns: int, sensors: int) -> FilterEvents:
-    """Select the first events after the start, and more until they include all sensors."""
+    """Select the first events after the start, and further ones until every sensor is included."""
     rows = np.flatnonzero(events.time_ns >= start_ns)
     found = [np.flatnonzero(events.source[rows] == sensor) for sensor in range(sensors)]
     until = max([MOST_EVENTS, *(int(each[0]) + 1 for each in found if len(each))])

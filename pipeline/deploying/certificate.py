@@ -24,7 +24,7 @@ class Memory(NamedTuple):
     Attributes:
         compiler: its name, version and target.
         text: bytes of code and constants.
-        stack: bytes of stack in the deepest chain of calls, without those of libm.
+        stack: bytes of stack in the deepest chain of calls, not counting functions of libm.
     """
 
     compiler: str
@@ -36,7 +36,7 @@ class Single(NamedTuple):
     """The effect of single precision on the results for the log with which the filter is tested.
 
     Attributes:
-        estimates: number of estimates compared with those in double precision.
+        estimates: number of estimates compared with the estimates in double precision.
         furthest: largest difference of an entry of means and covariances, relative to the entry or to
             one, whichever is larger.
         lost_event, lost_s: the event, and its time after the start, at which the covariance stops being
@@ -56,9 +56,11 @@ class Certificate(NamedTuple):
         steps: the cost of the C functions, by name.
         worst: the cost of a prediction plus that of the costliest update.
         dense, sparse: flops of the products F P F', P H' and H P H' of all steps (of F L and H L for a
-            factor L), with all entries of F and H, and without those known to be zero or one.
-        memory: None if the compiler does not report it.
-        single: None in double precision, and if there is no compiler.
+            factor L), counted once with all entries of F and H, and once without the entries known to be
+            zero or one.
+        memory: memory of the compiled filter; None if the compiler does not report it.
+        single: effect of single precision; None if the filter has double precision, or if there is no
+            compiler.
     """
 
     steps: Mapping[str, Cost]
@@ -102,7 +104,7 @@ def certificate_text(made: CFilter, certificate: Certificate) -> str:
 
 
 def _compiled(made: CFilter, files: Mapping[str, str]) -> tuple[Memory | None, Single | None]:
-    """Compile a filter and run its test in single precision; None without a suitable compiler."""
+    """Compile a filter and test it in single precision; return None without a suitable compiler."""
     compiler = shutil.which("gcc")
     if compiler is None:
         return None, None
@@ -121,7 +123,7 @@ def _output_of(folder: Path, *command: str | Path, check: bool = True) -> str:
 
 
 def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
-    """Compile a filter and measure its memory; None if GCC is older than 10 and does not report it."""
+    """Compile a filter and measure its memory; return None if GCC before 10 does not report it."""
     try:
         _output_of(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
         version, target = (
@@ -136,7 +138,7 @@ def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
 
 
 def _single(compiler: str, folder: Path, name: str) -> Single | None:
-    """Run a filter's test; None if it cannot be built on this machine."""
+    """Run a filter's test, or return None if the test cannot be built on this machine."""
     program = folder / "tried"
     try:
         _output_of(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)

@@ -158,7 +158,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """Count the cost of a function at samples and of its mean, for the most iterations."""
+    """Count the cost of evaluating a function at samples and of its mean, for the most iterations."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -244,7 +244,7 @@ def _factored_algebra(m: int, t: int) -> Cost:
 
 
 def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) -> Products:
-    """Count the cost of products with a Jacobian, with all its entries and without the known ones."""
+    """Count the cost of products with a Jacobian, with all its entries and without the known entries."""
     if not step.has(jacobian):
         return NOTHING, NOTHING
     known = {

@@ -53,14 +53,14 @@ def deploy(
     """Write a filter as C99 for a robot, with a recorded log as its test.
 
     The C code has the same operations as the filter, in the same order. Its estimates equal those of
-    `replay` to the last bit if it is compiled in double precision, with -ffp-contract=off and with the
-    same libm.
+    `replay` to the last bit if the code is compiled in double precision, with -ffp-contract=off and with
+    the same libm.
 
     Args:
-        log: a log that the filter fits. The C code has the log's sensors, and the parameters in its
-            channels unless they are set; the first messages are the test.
-        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; or the result of
-            `modelled` for a model of your own and one of these; or a table of settings by label.
+        log: a log that the filter fits. The C code has the log's sensors. Parameters that are not set
+            have the values in the log's channels. The test is made from the first messages.
+        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`; the result of
+            `modelled` for a model of your own and one of these methods; or a table of settings by label.
         out: the folder to write, which must be empty or not exist; its name is the filter's name in C.
         single: use single precision, `float`.
         parameters: parameters of the estimator, such as `model="robot"`.

@@ -16,8 +16,8 @@ class Advice(NamedTuple):
         free: the parameter that can be tuned instead.
         otherwise: what else can be done, in words.
         more: further settings that are needed together with `key`.
-        is_moved: whether the value is a shift in metres along several axes, which is added to one
-            already set.
+        is_moved: whether the value is a shift in metres along several axes, which is added to a shift
+            that is already set.
     """
 
     key: str
@@ -64,7 +64,7 @@ class Trying:
     gate: float = 1.0
 
     def is_set(self, advice: Advice) -> bool:
-        """Test whether the advice is a gate, and one that is at least as narrow is already set."""
+        """Test whether the advice is a gate, and a gate that is at least as narrow is already set."""
         return advice.key == "gate_probability" and self.gate <= float(advice.value)
 
     def over(self, advice: Advice) -> Advice:

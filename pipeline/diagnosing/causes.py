@@ -60,7 +60,7 @@ class Cause(NamedTuple):
         hypothesis: the assumed fault.
         value: its size.
         ends: the ends of the 95 % interval of the size.
-        gain: the gain in log-likelihood after all causes before it are corrected.
+        gain: the gain in log-likelihood after all preceding causes are corrected.
         others: causes that explain the log equally well, or nearly so.
         of_halves: the gain over each half of the measurements, with all other causes corrected.
     """
@@ -74,7 +74,7 @@ class Cause(NamedTuple):
 
     @property
     def has_ends(self) -> bool:
-        """Test whether the interval of the value has two finite ends, as far as a fit shows."""
+        """Test whether the value's interval has two finite ends, as far as the fit determines them."""
         return not np.isinf(self.ends).any()
 
     @property
@@ -88,7 +88,7 @@ class Cause(NamedTuple):
 
     @property
     def numbers(self) -> list[Interval]:
-        """Return the values as reported, by component; factors instead of their logarithms."""
+        """Return the values by component as they are reported, with factors instead of logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Interval(self.value, low, high, name=of.part).rising(of.reported)]
@@ -157,7 +157,7 @@ class Found(NamedTuple):
 
     @property
     def supposed(self) -> Supposed:
-        """Return the fault that is corrected, the first of the names, with its value."""
+        """Return the fault that is corrected, which is the first of the names, with its value."""
         at, of = self.names[0]
         return Supposed(of, at.value)
 
@@ -167,7 +167,7 @@ class Look(NamedTuple):
 
     Attributes:
         found: the causes.
-        now: the log with these causes corrected.
+        now: the log in which the causes already found are corrected.
         ranked: every fault that may be added, with its largest gain.
     """
 
@@ -186,10 +186,10 @@ def find_causes(
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
     """Find at most `most` causes, the gain of each hypothesis, and a cause in doubt.
 
-    Each cause has the largest gain after all causes before it are corrected, where the gain is the
-    log-likelihood minus the cost of the values. Several causes are fitted together. The gains of
-    hypotheses are those in the unaltered log. A cause is in doubt if it would be the next one, or gains
-    more than the last one, but the parts of the log disagree about its value.
+    Each cause has the largest gain in log-likelihood, minus the cost of its values, after all causes
+    before it are corrected. Several causes are fitted together. The gains of hypotheses are computed in
+    the unaltered log. A cause is in doubt if the parts of the log disagree about its value although it
+    would be the next cause, or gains more than the last one.
     """
     search = _Search(likelihood, base, most, len(tried))
     peaks = search.peaks(base, tried)
@@ -236,7 +236,8 @@ class _Search:
 
         `peaks` contains the gains of the hypotheses in addition to the causes found. With a `target`,
         the search ends if the allowed number of causes cannot reach that log-likelihood. Without a
-        target, it also searches for causes whose gain is significant only after a new fit of the others.
+        target, the search also considers causes whose gain is significant only after a new fit of the
+        others.
         """
         found, doubtful, tried = list(found), list[Named](), list(tried)
         for _ in range(2 * self.most):  # because a cause may be removed again
@@ -269,7 +270,7 @@ class _Search:
         found: Sequence[Found],
         target: float,
     ) -> Look | None:
-        """Compute the gains of hypotheses in addition to the causes found; None if none can follow."""
+        """Compute gains of hypotheses in addition to the causes found; None if no cause can follow."""
         named = {id(of) for each in found for _, of in each.names}
         candidates = [each for each in tried if id(each) not in named]
         if not candidates or len(found) >= self.most:
@@ -281,7 +282,7 @@ class _Search:
         return look if self._reaches(look, lacking) else None
 
     def _reaches(self, look: Look, gain: float) -> bool:
-        """Estimate from single gains whether the allowed number of causes could gain this much.
+        """Estimate from single gains whether the allowed number of causes could gain at least `gain`.
 
         The causes found are included, because they gain more if they are fitted again with others.
         """
@@ -305,10 +306,10 @@ class _Search:
         return beside, _likeliest(self.likelihood, now, beside.ranked, self.count)[0] or alike, []
 
     def _with_less_noise(self, found: Sequence[Found], tried: Sequence[Hypothesis]) -> list[Found]:
-        """Remove a noise if the other causes, or others of their kinds, explain as much without it.
+        """Remove a noise if the other causes, or faults of the same kinds, explain as much without it.
 
-        For example, positions that are scaled and look imprecise may be explained by speeds that are too
-        small.
+        For example, speeds that are too small may explain positions that seem to be scaled and
+        imprecise.
         """
         for noise in found:
             rest = [self._widened(each, tried) for each in found if each is not noise]
@@ -342,7 +343,7 @@ class _Search:
         return self._together([*look.found, Found([*rivals, *alike[1:]], look.now, contenders)])
 
     def _without_noise(self, look: Look, noises: Sequence[Named]) -> list[Found]:
-        """Find causes that explain as much as a noise or outliers; an empty list if there are none.
+        """Find causes that explain as much as a noise or outliers; [] if there are no such causes.
 
         Errors of a model look like a noise that is larger than stated, and large errors look like
         outliers.
@@ -418,7 +419,7 @@ class _Search:
     def _likelier(self, found: Sequence[Found], place: int, log_likelihood: float) -> Found:
         """Replace a cause by a contender that explains more when all causes are fitted again.
 
-        `log_likelihood` is that of the log with all causes corrected.
+        `log_likelihood` is the log-likelihood of the log with all causes corrected.
         """
         each, before, after = found[place], found[:place], found[place + 1 :]
         others = [*before, *after]
@@ -518,7 +519,7 @@ def _is_physical(of: Hypothesis) -> bool:
 def _likeliest(
     likelihood: Likelihood, now: Trial, pairs: Names, count: int
 ) -> tuple[Names, list[Named]]:
-    """Find the hypothesis with the largest significant gain, its alternatives, and those in doubt.
+    """Find the hypothesis with the largest significant gain, its alternatives, and doubtful ones.
 
     Disagreement between parts is a property of the whole log. If the parts disagree about a larger
     gain, the smaller gains are therefore reduced as well. Burnham and Anderson, Model Selection and
@@ -556,15 +557,16 @@ def _likeliest(
 
 
 def _takes_all(at: Peak, of: Hypothesis) -> bool:
-    """Test whether a fault is one that explains part of any other: noise stated small, or outliers."""
+    """Test whether a fault explains part of any other fault: understated noise, or outliers."""
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
 def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | None:
-    """Find one of two gross faults that together gain more than any noise; None if there are none.
+    """Find one of two gross faults that together gain more than any noise; None if there is no pair.
 
-    One of two gross faults may gain little while the other is not corrected. The most likely faults are
-    therefore tried with all others, and special values, such as factors of units, with each other.
+    One of two gross faults may gain little while the other is not corrected. Therefore, the most likely
+    faults are tried together with all others, and special values, such as factors of units, are tried
+    together with each other.
     """
     supposed, most = list[Supposed](), 0.0
     for at, of in ranked:
@@ -592,7 +594,7 @@ def _companion(likelihood: Likelihood, now: Trial, ranked: Names) -> Supposed | 
 def _is_other_name(pair: Named, first: Named) -> bool:
     """Test whether a delay is opposite to the likeliest cause, which is a delay of another topic.
 
-    Except at the ends of the log, both are the same fault.
+    Except at the ends of the log, both delays describe the same fault.
     """
     (at, of), (best, early) = pair, first
     if of.kind != early.kind or of.topic == early.topic or not (_is_early(first) or _takes_back(pair)):
@@ -601,7 +603,7 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 
 
 def _is_early(pair: Named) -> bool:
-    """Test whether a fault makes a topic early or its clock slow; usually another one is late."""
+    """Test whether a fault makes a topic early or its clock slow; usually another topic is late."""
     at, of = pair
     is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
     return is_of_stamps and of.already + at.value < 0.0
@@ -645,7 +647,7 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
 
 
 def _with_rival(gains_of: GainsOf, pair: Named, apart: float) -> list[Named]:
-    """Return the value of a delay or angle, and a rival value whose gain may be less by chance.
+    """Return the value of a delay or angle, and a rival value whose gain may be less only by chance.
 
     The likelier value comes first.
     """

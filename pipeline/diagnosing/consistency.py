@@ -109,7 +109,7 @@ class _Seen(NamedTuple):
 
     @property
     def times(self) -> float:
-        """Return the factor by which the innovations are larger or smaller."""
+        """Return the factor by which the innovations are larger or smaller than stated."""
         deviation = float(np.sqrt(self.nis))
         return 1.0 / deviation if self.is_small else deviation
 
@@ -122,9 +122,9 @@ class _Seen(NamedTuple):
 def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
     """Yield findings on each sensor's innovations, for an estimator that cannot be replayed.
 
-    Autocorrelated innovations point to the motion or a delay, others to the noise of the sensor. If a
-    channel states which parameter of its estimator sets this noise, the finding names the parameter.
-    Components with the same finding share one sentence.
+    Autocorrelated innovations point to the motion or a delay; other inconsistencies point to the noise
+    of the sensor. If a channel states which parameter of its estimator sets this noise, the finding
+    names the parameter. Components with the same finding share one sentence.
     """
     for topic, stream in innovations.items():
         case, alike = split_topic(topic)[1], dict[tuple[bool, str], list[_Seen]]()

@@ -1,7 +1,8 @@
 """Diagnosis of an inconsistent estimator from its innovations and errors, with the likely causes.
 
-Faults are ranked by the gain in log-likelihood without them, not by their apparent size: if a bearing's
-noise is stated too small, the innovations of the range are too large as well.
+Faults are ranked by the gain in log-likelihood from correcting them, not by their apparent size. For
+example, if the stated noise of a bearing is too small, the innovations of the range become too large as
+well.
 """
 
 import json
@@ -121,7 +122,7 @@ def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -
 
 
 class Portion(NamedTuple):
-    """The messages of a log that the estimator reads, until `end_ns`; None for the whole log."""
+    """The messages that the estimator reads from a log, up to `end_ns` (None means the whole log)."""
 
     source: MemorySource
     end_ns: int | None
@@ -239,7 +240,7 @@ class Diagnosis:
 
     @property
     def told(self) -> list[str]:
-        """Return the numbered sentences, or a sentence that no fault was found."""
+        """Return the numbered sentences, or a sentence stating that no fault was found."""
         if not self.sentences:
             why = (
                 f"none of {self.hypotheses} faults reaches the required gain in log-likelihood, "
@@ -290,7 +291,7 @@ class Diagnosis:
 
     @property
     def marks(self) -> dict[str, Stream]:
-        """Return the sentences as messages by topic for the timeline, at the stamps where they begin."""
+        """Return the sentences as messages by topic for the timeline, at the findings' first stamps."""
         first_ns = self.replay.logs[0].extent("publish_time")[0]
         return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
@@ -336,7 +337,7 @@ class Diagnosis:
 
 
 def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outcome:
-    """Replace the tables of an outcome by these and a new summary, without empty tables."""
+    """Replace the tables of an outcome by `tables` and a new summary; omit empty tables."""
     found = {**tables, "summary": summary_table(outcome.metrics)}
     return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
 
@@ -358,9 +359,9 @@ def diagnose(
     Args:
         log: a path, an opened log, or a recording; or an estimates log next to its source log.
         estimator: a registered name, or a label of your own mapped to an estimator (see `replay`). For
-            an estimates log, one of its labels; by default its only one.
+            an estimates log, one of its labels; by default its only label.
         set: parameters of the estimator, and alterations of topics; see `replay`.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: the longest gap over which the truth is interpolated.
 
     Returns:
         At most five sentences on what is wrong, and tables of the evidence.
@@ -497,7 +498,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """A log that an estimator can replay, the replay, and the findings corrected before it."""
+    """A log that an estimator can replay, the replay, and the findings corrected before the replay."""
 
     source: LogSource | MemorySource
     done: Replay

@@ -1,7 +1,7 @@
 """Findings on unusual innovations and estimates, and on the log itself.
 
-The thresholds are listed here with their meaning. They are far from values that chance causes in a log
-that follows its model.
+The thresholds are listed here with their meaning. The thresholds are far from values that chance causes
+in a log that follows its model.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -78,7 +78,8 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
 
     The columns describe the normalised innovations: their number, mean with its 95 % interval, mean
     square, the share beyond 3 standard deviations (0.27 % of a Gaussian), excess kurtosis, the
-    correlation of successive ones, and the probability that white ones have a larger Ljung-Box Q.
+    correlation of successive innovations, and the probability that white innovations have a larger
+    Ljung-Box Q.
     """
     rows = []
     for topic, stream in innovations.items():
@@ -122,8 +123,8 @@ def of_innovations(
 ) -> Iterator[Finding]:
     """Yield findings on rejected measurements and on divergence of the filter.
 
-    `gate` is the gate's probability, if it is a gate of fuselog. If outliers come in stretches, the gate
-    rightly rejects measurements for a long time.
+    `gate` is the probability of the estimator's gate, if it is a gate of fuselog. If outliers come in
+    stretches, the gate rightly rejects measurements for a long time.
     """
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
@@ -190,7 +191,7 @@ def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
 
 
 def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Yield findings on variances that many estimates have and that never become smaller."""
+    """Yield findings on components whose smallest variance occurs in many of the estimates."""
     for topic, stream in estimates.items():
         if len(stream) < FEWEST or not stream.components:
             continue

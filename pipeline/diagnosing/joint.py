@@ -1,7 +1,7 @@
 """A joint fit of the sizes of several faults, with the search that `tune` and `calibrate` use.
 
 Each fault hides parts of the others. If the sizes were estimated one after the other, each size and
-interval would be that of a log in which other faults are still present.
+interval would refer to a log that still contains other faults.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ class Supposed(NamedTuple):
 
     @property
     def is_special(self) -> bool:
-        """Test whether the value is one that is tried exactly."""
+        """Test whether the value is among the values that are tried exactly."""
         return self.value in self.of.specials
 
     @property
@@ -73,10 +73,10 @@ class Fit(NamedTuple):
     """The values with which several faults together explain a log best.
 
     Attributes:
-        faults: the faults with these values.
+        faults: the faults with the values that explain the log best.
         log_likelihood: log-likelihood of the log with the faults corrected.
-        losses: loss of log-likelihood if a fault is removed and all others are refitted, from the
-            curvature; infinite for a fault without a value.
+        losses: loss of log-likelihood, approximated from the curvature, if a fault is removed and all
+            others are refitted; infinite for a fault without a value.
         are_estimates: whether the values of a fault are estimates; they are not if the search ended at
             their limit, or if they have no effect.
         ends: ends of the 95 % profile-likelihood intervals of each fault's values; NaN if the search
@@ -138,7 +138,7 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
     """Estimate, from the curvature, the gain of the last of several faults if all are fitted again.
 
     The estimate is a generous upper bound: the fault's gain in addition to the others, plus WIDE times
-    the gain of the next step of a search. It is infinite if the log-likelihood is not concave.
+    the gain of the next step of a search. The estimate is infinite if the log-likelihood is not concave.
     """
     together = _Together(likelihood, base, [Supposed(of, at.value) for at, of in faults])
     steps = np.concatenate([np.empty(0), *(_errors(at, of) for at, of in faults)])
@@ -182,7 +182,7 @@ class _Together:
         ]
 
     def cost(self, points: Floats) -> Floats:
-        """Compute minus the log-likelihoods (n,) of the log without faults of values (n, k)."""
+        """Compute negative log-likelihoods (n,) of the log with faults of values (n, k) corrected."""
         of_points = [
             [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
             for point in points
@@ -217,7 +217,7 @@ class _Together:
 
 
 def _loss(own: Floats, covariance: Floats) -> float:
-    """Compute the loss of log-likelihood without values (m,) that have a covariance (m, m)."""
+    """Compute the loss of log-likelihood if values (m,) with a covariance (m, m) are set to zero."""
     return 0.5 * float(own @ np.linalg.solve(covariance, own)) if len(own) else np.inf
 
 

@@ -2,14 +2,14 @@
 
 A trial is a log with an estimator's settings, in which faults may be corrected. All trials have the same
 measurements, and start by the same rule. In some trials, the filter cannot score some measurements, for
-example a fix that a delay moves beyond the odometry's span. A broad model scores these, in which
-successive messages differ by as much as is usual for their topic.
+example a fix that a delay moves beyond the odometry's span. These measurements are scored by a broad
+model, in which successive messages differ by the amount that is usual for their topic.
 
-A measurement that the gate rejects is an outlier, uniform in the volume that the innovations span, with
-the observed share of outliers. Without a gate there are no outliers, and the log-likelihood is that of
-the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
-2001, section 5.4; Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012, chapter
-7.
+A measurement that the gate rejects is scored as an outlier. Outliers are uniform in the volume that the
+innovations span, and have the observed share of outliers as their probability. Without a gate there are
+no outliers, and the log-likelihood is that of the filter. Bar-Shalom, Li and Kirubarajan, Estimation
+with Applications to Tracking and Navigation, 2001, section 5.4; Durbin and Koopman, Time Series Analysis
+by State Space Methods, 2nd ed. 2012, chapter 7.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -54,7 +54,7 @@ class Scored(NamedTuple):
         source: its messages.
         begin_ns: the stamp at which the filter begins if there is no prior.
         left: log-likelihood of all other messages under the broad model, by estimate.
-        beyond: number of these messages, by estimate.
+        beyond: number of messages that the broad model scores, by estimate.
         stretch: correction for units that differ from the log's, by estimate.
     """
 
@@ -103,7 +103,7 @@ class Likelihood:
     _bound: dict[Hashable, list[Bound]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
-        """Set the trial with which others are compared, and return its innovations by topic.
+        """Set the trial with which other trials are compared, and return its innovations by topic.
 
         If the log has no initial state, the innovations from the most likely broad start are returned.
         Raises BadInput if the estimator cannot begin.
@@ -143,7 +143,7 @@ class Likelihood:
     def over_parts(self, trials: Sequence[Trial], count: int) -> Floats:
         """Compute log-likelihoods (trials, count) of equal shares of the measurements, in order.
 
-        They are minus infinity if the estimator fails or loses measurements.
+        The log-likelihoods are minus infinity if the estimator fails or loses measurements.
         """
         together: dict[Hashable, list[int]] = {}
         bound: dict[int, list[Bound]] = {}
@@ -214,7 +214,7 @@ class Likelihood:
     def _innovations(
         self, bounds: Sequence[Sequence[Bound]], scored: Sequence[Scored]
     ) -> list[list[dict[str, Stream]]]:
-        """Replay trials of similar estimators; return innovations by part and topic, none on failure."""
+        """Replay trials of similar estimators; return innovations by part and topic, {} if they fail."""
         count = part_count(self.starts)
         bound = [_together(each, count) for each in zip(*bounds, strict=True)]
         sources = [each.source for each in scored for _ in range(count)]
@@ -248,7 +248,7 @@ class Likelihood:
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float
     ) -> dict[str, float]:
-        """Compute the log-likelihood of the first share by estimate; {} if too few are scored."""
+        """Compute the first share's log-likelihood by estimate; {} if too few innovations are scored."""
         found = {}
         for name, all_ in self.count.items():
             topic = _topic(name)
@@ -322,7 +322,7 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 
 
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
-    """Limit the broad likelihood of topics that a conservative filter predicts better than it states.
+    """Limit the broad likelihood of topics that a filter predicts better than its variances suggest.
 
     For a body at rest, the broad model is more precise than a conservative filter. Without the limit, a
     delay would gain by moving messages out of the scored span.
@@ -341,7 +341,8 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
     """Test which innovations are in the first share of their sensor's innovations.
 
-    A share of the innovations of all sensors would contain other ones if a delay changes their order.
+    A share of the innovations of all sensors together would select other innovations if a delay changes
+    their order.
     """
     known = np.isfinite(innovations["innovation"])
     sensor = known @ 2.0 ** np.arange(known.shape[1])
@@ -353,7 +354,7 @@ def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
 
 
 def _within(stream: Stream, span_ns: tuple[int, int, int]) -> Stream:
-    """Return the messages that can be scored in a span (see `_span`), earlier ones at its start."""
+    """Return the messages that can be scored in a span (see `_span`); move earlier ones to its start."""
     (begin_ns, end_ns, step_ns), stamps_ns = span_ns, stream.publish_time_ns
     is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
     if is_in.all() and stamps_ns.min() >= begin_ns:
@@ -381,13 +382,13 @@ def _key(trial: Trial) -> str:
 
 
 def _alike(bound: Sequence[Bound]) -> Hashable:
-    """Return a key that is equal for estimators that can be replayed together; None if these cannot."""
+    """Return a key that is equal for estimators that can be replayed together; None for all others."""
     keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
     return tuple(keys) if len(keys) == len(bound) else None
 
 
 def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator for the runs of all trials, `count` for each, with the trial's parameters."""
+    """Make one estimator for the runs of all trials, `count` per trial, with the trial's parameters."""
     first = bounds[0]
     alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
     if all(each is first for each in bounds):

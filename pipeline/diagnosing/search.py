@@ -1,7 +1,7 @@
 """Search for the values at which correcting a fault gains most, for all faults in parallel.
 
 A search is a generator that yields values, receives their gains, and returns its `Peak`. Thus one replay
-can compute the next values of all faults.
+can compute the gains of the next values of all faults.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,7 +48,7 @@ def peak(
         of: the fault, whose gain is zero at the value zero.
         floor: a gain below which a search is not worthwhile.
         greatest: function that returns the largest known gain of any fault. Distant values are tried
-            only if this gain, or one at a near or special value, is large enough.
+            only if this gain, or the gain at a near or special value, is large enough.
     """
     if of.size > 1:
         return (yield from _of_several(of, floor, greatest))
@@ -81,7 +81,7 @@ def peak(
 
 
 def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
-    """Return the value with the largest gain and its neighbours; None if one is missing."""
+    """Return the value with the largest gain and its neighbours; None if a neighbour is missing."""
     values = sorted(known)
     place = max(range(len(values)), key=lambda place: known[values[place]])
     if place in (0, len(values) - 1):
@@ -90,7 +90,7 @@ def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
 
 
 def _vertex(known: Mapping[float, float], low: float, best: float, high: float) -> float | None:
-    """Find the maximum of the parabola through three values; None if a gain is infinite."""
+    """Find the maximum of the parabola through three values, or None if a gain is infinite."""
     left, right = known[best] - known[low], known[best] - known[high]
     if not np.isfinite(left + right) or left + right <= 0.0:
         return None
@@ -100,7 +100,7 @@ def _vertex(known: Mapping[float, float], low: float, best: float, high: float) 
 
 
 def _promised(known: Mapping[float, float]) -> float:
-    """Compute by how much the parabola around the largest gain exceeds this gain."""
+    """Compute by how much the maximum of the parabola around the largest gain exceeds that gain."""
     around = _around(known)
     if around is None:
         return np.inf
@@ -116,7 +116,7 @@ def _promised(known: Mapping[float, float]) -> float:
 
 
 def _next(known: Mapping[float, float], limit: float) -> list[float]:
-    """Choose the next values: around the largest gain, or beyond it if it is at the end."""
+    """Choose the next values: around the best value or, if that value is at an end, beyond it."""
     around = _around(known)
     if around is None:
         best = max(known, key=lambda value: known[value])
@@ -141,7 +141,7 @@ def _is_lopsided(low: float, best: float, high: float) -> bool:
 
 
 def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
-    """Compute the maximum of the parabola through zero and both sides; infinity if there is none."""
+    """Compute the maximum of the parabola through zero and both sides; infinity without a maximum."""
     if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
         return np.inf
     low, high = sorted(sides)
@@ -157,8 +157,8 @@ def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
 def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search[Number, Peak]:
     """Search for several values with repeated paraboloids around the best values.
 
-    The gain of a diverging filter is rough and has no paraboloid. In this case, the best evaluated point
-    is used, and the steps around it are reduced.
+    The gain of a diverging filter is rough and has no paraboloid. Without a paraboloid, the best
+    evaluated point is used, and the steps around it are reduced.
     """
     size, steps = of.size, np.array(of.tried[0])
     at, gain = np.zeros(size), 0.0
@@ -200,9 +200,9 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
 
 
 def rival(of: Hypothesis, at: Peak, least: float) -> Search[Number, Peak | None]:
-    """Search for another value of a fault that gains at least `least`; None if there is none.
+    """Search for another value of a fault that gains at least `least`; None if there is no such value.
 
-    It is another local maximum, for example of a delay on laps of equal length.
+    The rival value is another local maximum, for example of a delay on laps of equal length.
     """
     values = np.linspace(-of.limit, of.limit, GRID).tolist()
     known = dict(zip(values, (yield values), strict=True)) | {at.value: at.gain}

@@ -45,7 +45,7 @@ class CauseFinding(Finding):
 
 
 def cause_of(found: Finding) -> Cause | None:
-    """Return the cause of a finding that the search for causes made; None for other findings."""
+    """Return the cause of a finding that the search for causes made, or None for other findings."""
     return found.cause if isinstance(found, CauseFinding) else None
 
 
@@ -61,8 +61,9 @@ def ranked(
 ) -> list[Finding]:
     """Order findings: stamps, causes, and other findings that need no filter.
 
-    A finding with a setting that corrects it comes before causes that are only its consequence, such as
-    noise. Findings that a cause names or advises are not repeated.
+    A finding with a setting that corrects it comes before causes that are only consequences of the
+    finding, such as noise. Findings that are among the causes, or whose settings are already advised,
+    are not repeated.
     """
     remedies = [cause.hypothesis.remedy(cause.value) for cause in causes]
     advised = {key for remedy in remedies if remedy is not None for key in remedy.settings}
@@ -88,7 +89,7 @@ def ranked(
 
 
 def _is_advised(setting: str, advised: Collection[str]) -> bool:
-    """Test whether a setting, or that of the vector to which it belongs, is advised."""
+    """Test whether a setting, or the setting of the vector that contains it, is already advised."""
     stem = setting.partition("=")[0].removesuffix("_scale")
     return any(stem.startswith(each.removesuffix("_scale")) for each in advised)
 

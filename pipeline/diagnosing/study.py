@@ -2,8 +2,8 @@
 
 Faults that cannot be distinguished count as one kind, such as a bearing's bias and its sensor's rotated
 frame. A rotation or a drift is only visible between two frames or clocks, so either may be named. The
-gain in log-likelihood from removing a fault shows whether it is visible at all. Some are not, such as a
-delay of the only sensor of a vehicle without controls.
+gain in log-likelihood from removing a fault shows whether it is visible at all. Some faults are
+invisible, such as a delay of the only sensor of a vehicle without controls.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -44,7 +44,8 @@ class Options(Parameters):
         faults: the names of the faults to plant, such as `landmarks-bias`; `landmarks-none` is a log
             without a fault. By default all are planted.
         battery_seed: first seed of the benchmark, see `fuselog.pipeline.diagnosing.battery.battery`.
-        battery_runs: runs of each cell of the benchmark, at most as many as of each fault; 0 by default.
+        battery_runs: number of runs of each benchmark cell, limited to the number of runs of each fault;
+            0 by default.
     """
 
     faults: tuple[str, ...] = ()
@@ -58,10 +59,11 @@ class Fault(NamedTuple):
     Attributes:
         kind, topic: the kind and topic to be named; any topic if `topic` is empty.
         value: its size, which the 95 % interval should cover; None for a fault without a size.
-        record: parameters of the recorder that cause it.
-        settings: settings of the estimator that cause it.
-        alteration: function of the run and its number that returns an alteration of the topic
-            `altered` (by default `topic`), which is applied with the value `by` (by default `value`).
+        record: recorder parameters that cause the fault.
+        settings: estimator settings that cause the fault.
+        alteration: function that takes the run and its number and returns an alteration. The alteration
+            is applied to the topic `altered` (by default `topic`) with the value `by` (by default
+            `value`).
         exchanged: two topics whose messages are swapped.
     """
 
@@ -239,7 +241,7 @@ def _chosen(names: Collection[str]) -> list[tuple[str, str]]:
 
 
 def battery_seeds(options: Options, runs: int) -> range:
-    """Return the seeds of each cell of the benchmark, at most as many as runs of each fault."""
+    """Return the seeds of each benchmark cell; a cell has at most as many runs as each fault."""
     return range(options.battery_seed, options.battery_seed + min(options.battery_runs, runs))
 
 
@@ -291,7 +293,7 @@ def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Count the runs in which the fault matters, and how often it is named and its size covered."""
+    """Count the runs in which the fault matters, is named, and has its size covered."""
     counted = rows[rows["worth"] >= WORTH]
     return pd.Series(
         {
@@ -309,7 +311,7 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
 
 
 def _overall(runs: pd.DataFrame) -> dict[str, float]:
-    """Compute the overall shares over all scenarios."""
+    """Compute the shares of correct diagnoses and of covered sizes over all scenarios."""
     counted = runs[runs["worth"] >= WORTH]
     sized = counted[counted["fault"].isin(SIZED)].dropna(subset=["covers"])
     return {

@@ -190,7 +190,7 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def typical_time_s(case: Case) -> float | None:
-    """Choose the second whose share of NEES above the interval is closest to that of the run.
+    """Choose the second whose share of NEES above the interval is closest to the whole run's share.
 
     If there are several such seconds, choose the one closest to the middle of the run. Without truth,
     return None.
@@ -217,7 +217,7 @@ def instant_of(case: Case | None) -> float:
 
 
 def true_path(source: MemorySource, topic: str) -> Path | None:
-    """Return the path of a log's truth; None if it has no position."""
+    """Return the path of a log's truth, or None if the truth has no position."""
     if topic not in source.topics:
         return None
     stream = source[topic]

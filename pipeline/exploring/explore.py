@@ -35,7 +35,7 @@ def explore(
         log: a path, an opened log, or a recording.
         estimators: one or two, in the form that `replay` accepts.
         set: parameters of the filters and alterations of topics, in the form that `replay` accepts.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: the longest gap over which the truth is interpolated.
         show: whether to open the page in the browser; this has no effect in a notebook.
 
     Returns:

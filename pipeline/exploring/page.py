@@ -177,7 +177,7 @@ class Page:
             self._along(case=self._chosen_case())
 
     def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
-        """Replace the filters, with the same values of parameters."""
+        """Replace the filters, and keep the values of parameters."""
         first, second = (each.value for each in choices)
         labels = [first] if second in (NONE, first) else [first, second]
         try:

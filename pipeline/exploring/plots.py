@@ -125,7 +125,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
-    """Make the plot of a component's errors, with the 95 % interval that the filter states tinted."""
+    """Make the plot of a component's errors, in which the filter's 95 % interval is tinted."""
     plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
     plot.figure.yaxis.ticker = FixedTicker(ticks=[])
     for of in (1, 0):
@@ -357,7 +357,7 @@ def show_likelihood(
 
 
 def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
-    """Scale the axis of errors so that all except rare errors are visible, also of pinned replays."""
+    """Scale the axis of errors so that all except rare errors are visible, including pinned replays."""
     most, ends = 0.0, [0.0]
     for each in played.values():
         one = each.cases.get(case)
@@ -380,7 +380,7 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
-    """Add a line for pinned results and one per filter; the second filter's is dashed and on top."""
+    """Add a line for pinned results and a line per filter; the second filter's is dashed and on top."""
     for of in (PINNED, 0, 1):
         colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
         source = plot.source(of, "line", x, y)

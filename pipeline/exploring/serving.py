@@ -171,7 +171,7 @@ def _guard(application: Handlers, origin: str, prefix: str) -> None:
 def _code_of(request: HTTPServerRequest, origin: str, prefix: str) -> int | None:
     """Return the HTTP code for a request to refuse, or None.
 
-    The code is 404 without the secret, and 403 from another host or origin.
+    The code is 404 for a request without the secret, and 403 for one from another host or origin.
     """
     path = (request.path or "").encode()
     begin = f"{prefix}/".encode()

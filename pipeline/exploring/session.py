@@ -94,7 +94,7 @@ def _squares_of(case: Case) -> list[Squares]:
 
 
 def mean_nis(case: Case) -> float:
-    """Compute the mean square of the whitened innovations; NaN without any."""
+    """Compute the mean square of the whitened innovations; NaN if there are no innovations."""
     known = {name: each for name, each in case.whiteness.items() if np.isfinite(each.mean_square)}
     count = sum(each.size for each in known.values())
     if not count:
@@ -200,7 +200,7 @@ class Session:
 
     @property
     def methods(self) -> list[str]:
-        """Return the methods that can follow the log with the first filter's settings."""
+        """Return the methods that can replay the log with the first filter's settings."""
         found = []
         for method in METHODS:
             with suppress(BadInput):
@@ -209,14 +209,14 @@ class Session:
         return found
 
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
-        """Make a session of the same log with other filters; raise BadInput if one cannot follow it."""
+        """Make a session of the same log with other filters; raise BadInput if any cannot replay it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
         """Make a session with these parameters in the state.
 
         Their initial standard deviation is a quarter of the slider's range. Raises BadInput if a filter
-        cannot estimate one of them.
+        cannot estimate one of the parameters.
         """
         for label in self.filters:
             if names and not self._takes(label, "estimate"):

@@ -98,7 +98,8 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
     """List the parameters of filters that can be dragged, by group.
 
     For an estimator with a model, these are the parameters that the model's functions use on this log.
-    For other estimators, they are all declared numbers, except settings of how a program is run.
+    For other estimators, they are all declared numbers, except settings that control how a program is
+    run.
 
     Args:
         source: the log.
@@ -139,7 +140,7 @@ def _order(group: str, topics: Sequence[str]) -> int:
 
 
 def _slider(name: str, group: str, source: LogSource | MemorySource, bound: Bound) -> Slider | None:
-    """Make the slider of a parameter; None if it is not a number, or has no value on this log."""
+    """Make the slider of a parameter, or None if it is not a number or has no value on this log."""
     assert bound.parameters is not None
     try:
         each = number_of(type(bound.parameters), name)

@@ -65,7 +65,7 @@ def tags_of(slider: Slider, value: float) -> list[str]:
 
 
 def time_range(epoch_ns: int) -> Range1d:
-    """Make the range of all plots over time, whose label states its zero."""
+    """Make the range of all plots over time; its label states the zero of time."""
     if epoch_ns == SIMULATION_EPOCH_NS or epoch_ns < YEAR_2000_NS:
         return Range1d(0.0, 1.0, name="time since the log began (s)")
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)

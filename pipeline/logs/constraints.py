@@ -1,6 +1,6 @@
 """Zero-velocity and non-holonomic pseudo-measurements from the samples of an inertial unit.
 
-They are topics that the model `inertial` uses in addition to those of sensors.
+They are topics that the model `inertial` uses in addition to the topics of sensors.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ class ConstraintParameters(Parameters):
     """Rates of the pseudo-measurements, and thresholds for detecting that the body is at rest.
 
     Attributes:
-        standing_hz: rate of messages that state whether the body is at rest; 0 for none.
-        rolling_hz: rate of messages that the body moves neither sideways nor up, as on wheels; 0 for
-            none.
-        window_s: length of the window before the current time in which rest is detected.
+        standing_hz: rate of messages that state whether the body is at rest; 0 for no messages.
+        rolling_hz: rate of messages that state that the body, like a wheeled one, moves neither sideways
+            nor up; 0 for no messages.
+        window_s: length of the window in which rest is detected; the window ends at the current time.
         still_mps2: threshold for the standard deviation of the specific force. The body is at rest if
-            the values in the window are below both thresholds.
+            both quantities are below their thresholds in the window.
         still_radps: threshold for the root mean square of the turn rate.
     """
 
@@ -33,7 +33,7 @@ class ConstraintParameters(Parameters):
 
 
 def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
-    """Make the topics `standing` and `rolling` next to that of a unit.
+    """Make the topics `standing` and `rolling` next to the topic of a unit.
 
     A message has the value 1 if its constraint applies, and 0 otherwise.
 

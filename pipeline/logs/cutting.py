@@ -1,4 +1,4 @@
-"""Decimation of streams, and the topics that a cut log keeps completely."""
+"""Decimation of streams, and choice of the topics that a cut log keeps completely."""
 
 import math
 from collections import Counter
@@ -39,9 +39,10 @@ def is_prior(log: Log, topic: str) -> bool:
 
 @dataclass
 class Thinner:
-    """A filter that keeps the first stamp of every interval, which is a number of stamps or a time.
+    """A filter that keeps the first stamp of every interval of a number of stamps or of a duration.
 
-    `stamps` is the number of stamps in earlier blocks, `last` the index of the last stamp's interval.
+    `stamps` is the number of stamps in earlier blocks, and `last` is the index of the last stamp's
+    interval.
     """
 
     every: int = 0
@@ -64,7 +65,7 @@ class Thinner:
 
 
 def thinner(topic: str, rate: int | str, zero_ns: int) -> Thinner:
-    """Make the thinner of a topic: a `rate` of 10 keeps every tenth stamp, "5Hz" five per second."""
+    """Make a topic's thinner: a `rate` of 10 keeps every tenth stamp; "5Hz" keeps five per second."""
     text = str(rate)
     try:
         if text.lower().endswith("hz"):

@@ -1,6 +1,6 @@
 """Editing of logs: cutting, merging, renaming topics and components, adding pseudo-measurements.
 
-Logs are processed block by block, so memory does not grow with their length. The result is a new log
+Logs are processed block by block, so memory use does not grow with their length. The result is a new log
 whose metadata states the operation; the original logs are not changed.
 """
 
@@ -127,14 +127,14 @@ def merge(
 ) -> Changed:
     """Merge several logs that have no topic in common into one.
 
-    Times in seconds count from the epoch of the first log. Messages with equal stamps are in the order
-    of the logs.
+    Times in seconds count from the epoch of the first log. Messages with equal stamps are written in the
+    order of the logs.
 
     Args:
         paths: the logs.
         out: the log to write.
-        offsets_s: offsets to add to all stamps of a log, by log, to correct differences between clocks.
-            The sensors' own clock readings do not change.
+        offsets_s: offsets by log; each is added to all stamps of its log, to correct differences between
+            clocks. The sensors' own clock readings do not change.
         recover: read the intact parts of logs that were cut off or damaged.
 
     Returns:
@@ -194,15 +194,16 @@ def relabel(
 ) -> Changed:
     """Write a log with renamed topics and components.
 
-    References to a renamed topic, such as that of an estimate to its truth, are updated.
+    References to a renamed topic are updated, such as an estimate's reference to its truth.
 
     Args:
         path: the log, or estimates log.
         out: the log to write.
-        topics: new names by old names. If both end in a slash, as "/robot1/": "/robot2/", they are
-            prefixes, and all topics with the old prefix are renamed. Topics to which estimates refer,
-            such as their truth, need not be in the log.
-        components: new names by old names, such as "x_m": "east_m", in all topics that have them.
+        topics: new names by old names. If the old and the new name both end in a slash, as in
+            "/robot1/": "/robot2/", they are prefixes, and all topics with the old prefix are renamed.
+            Topics to which estimates refer, such as their truth, need not be in the log.
+        components: new names of components by old names, such as "x_m": "east_m", for all topics that
+            have these components.
         recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
@@ -246,13 +247,13 @@ def constrain(
 ) -> Changed:
     """Write a log with zero-velocity and non-holonomic pseudo-measurements from its inertial unit.
 
-    The topics `standing` and `rolling` are added next to that of the unit; see
+    The topics `standing` and `rolling` are added next to the unit's topic; see
     `fuselog.pipeline.logs.constraints`.
 
     Args:
         path: the log.
         out: the log to write.
-        unit: the topic of the inertial samples; required if the log has several.
+        unit: the topic of the inertial samples; required if the log has several such topics.
         settings: values of `ConstraintParameters`, such as {"rolling_hz": 10}.
         recover: read the intact part of a log that was cut off or damaged.
 
@@ -340,7 +341,7 @@ def _shifted(stream: Stream, offset_ns: int) -> Stream:
 
 
 def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
-    """Return the new name of each topic to rename, by old name, also for topics in metadata only."""
+    """Return the new names of topics by old name, including topics that only metadata mention."""
     stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
     known = [
         *log.topics,
@@ -366,7 +367,7 @@ def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
 
 
 def _check_components(log: Log, components: Mapping[str, str]) -> None:
-    """Raise BadInput if a component does not exist, or a topic would have two components of one name."""
+    """Raise BadInput if a component does not exist, or two would have the same name in a topic."""
     stated = {
         topic: found["components"].split(",")
         for topic, found in ((name, each.metadata) for name, each in log.topics.items())

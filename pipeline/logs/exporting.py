@@ -1,6 +1,6 @@
 """Export of logs to other tools: estimates and truths as trajectories, any stream as a table.
 
-A log is read once, block by block, so memory does not grow with its length. Tracks are an exception:
+A log is read once, block by block, so memory use does not grow with its length. Tracks are an exception:
 they are exported frame by frame. Existing files are never replaced.
 """
 
@@ -41,7 +41,7 @@ FramesOf = Callable[[Log, Sequence[str]], dict[str, tuple[list[str], list[str]]]
 
 
 class Exported(NamedTuple):
-    """The written files by topic, and sentences on what they do not contain."""
+    """The written files by topic, and sentences on what the files do not contain."""
 
     files: dict[str, Path]
     notes: list[str]
@@ -61,18 +61,18 @@ def export(
     Args:
         path: the log, or estimates log.
         to: the format. "tum" and "kitti" are trajectories of poses, and of estimates and truths with a
-            position. "ros2" and "ros2-sqlite3" are a bag of ROS 2 with these and geodetic fixes, as
-            MCAP or SQLite; see `fuselog.pipeline.logs.ros2`. "mot" has a file of tracks for each
+            position. "ros2" and "ros2-sqlite3" are a bag of ROS 2 with the same data and geodetic fixes,
+            as MCAP or SQLite; see `fuselog.pipeline.logs.ros2`. "mot" has a file of tracks for each
             tracker and one of all truths; see `fuselog.pipeline.families.tracking.mot`. "csv" and
             "parquet" are tables. "foxglove" is one log with messages that Foxglove shows; see
             `fuselog.pipeline.logs.foxglove`.
-        out: the folder of the files, by default named after the log; the file itself for a single topic
-            (except with "mot" and bags) and for "foxglove".
+        out: the folder for the files, by default named after the log. If a single topic is given (except
+            with "mot" and bags), and for "foxglove", this is the path of the file.
         topics: the topics to export; all suitable topics if empty.
         recover: read the intact part of a log that was cut off or damaged.
 
     Returns:
-        The written files by topic, and sentences on what they do not contain.
+        The written files by topic, and sentences on what the files do not contain.
 
     Raises BadInput if a topic does not exist or does not suit the format, or the output already exists.
     """
@@ -196,7 +196,7 @@ def _new(to: To) -> Kind:
 
 
 def _lacking(empty: Stream, to: To) -> str:
-    """Return why a stream, without its messages, has no poses; a prior does not count as an estimate."""
+    """Return why a stream, regardless of its messages, has no poses; priors are not estimates."""
     schema = empty.schema.full_name
     if to in BAGS and schema == schemas.GEODETIC_FIX.full_name:
         return ""

@@ -1,4 +1,4 @@
-"""The Foxglove mirror of a log's streams: messages that Foxglove shows without fuselog.
+"""The Foxglove mirror of a log's streams: messages that Foxglove can show without fuselog.
 
 Only viewers use these messages: no replay reads them, and they are not counted as a log's streams. The
 schemas are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.
@@ -44,13 +44,14 @@ Made = Iterator[tuple[str, Message, int]]
 
 
 def mirrors(stream: Stream) -> Iterator[Mirror]:
-    """Yield the messages of the Foxglove mirror of a stream or of a block of it.
+    """Yield the Foxglove messages that mirror a stream, or a block of one.
 
     Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
     FrameTransforms. Orientations without a position become poses at the origin. Lines of sight of moving
-    sensors become poses at the sensor whose x axis is the line. 95 % ellipses, tracks and landmarks
-    become SceneUpdate, particles and detections PosesInFrame, geodetic fixes LocationFix. The topic is
-    `/foxglove`, followed by the stream's topic and a word for the content. Priors have no mirror.
+    sensors become poses at the sensor, with the x axis along the line. 95 % ellipses, tracks and
+    landmarks become SceneUpdate, particles and detections become PosesInFrame, and geodetic fixes become
+    LocationFix. The topic is `/foxglove`, followed by the stream's topic and a word for the content.
+    Priors have no mirror.
     """
     make = _MAKERS.get(stream.schema.full_name)
     is_stated = stream.topic.startswith("/estimates/")
@@ -75,7 +76,7 @@ def left_out(log: Log) -> str:
 
 
 def sentence_of(topics: Sequence[str]) -> str:
-    """Write a sentence that these topics have no Foxglove mirror."""
+    """Write a sentence which states that these topics have no Foxglove mirror."""
     return f"omitted, because Foxglove has no message for them: {some_of(topics)}"
 
 
@@ -106,7 +107,7 @@ def _states(stream: Stream) -> Made:
 
 
 def _fixes(stream: Stream) -> Made:
-    """Make poses from positions, with the orientation of the course if the fixes have one."""
+    """Make poses from positions, oriented along the course if the fixes have one."""
     places, quaternions = _padded(stream["position_m"]), None
     if "course_rad" in stream.columns:
         heading_rad = 0.5 * np.pi - np.nan_to_num(stream["course_rad"])
@@ -131,7 +132,7 @@ def _turns(stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], quaternion
 
 
 def _sights(stream: Stream) -> Made:
-    """Make poses at moving sensors whose x axis is the line of sight."""
+    """Make poses at moving sensors, with the x axis along the line of sight."""
     angles = np.stack([stream["azimuth_rad"], -stream["elevation_rad"]], axis=1)
     known = np.flatnonzero(np.isfinite(angles).all(axis=1))
     seen = stream.take(known)
@@ -163,7 +164,7 @@ def _poses(
 
 
 def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
-    """Yield a pose for each position (n, 3) and quaternion (n, 4); the default is the identity."""
+    """Yield a pose for each position (n, 3) and quaternion (n, 4), by default without rotation."""
     for row, place in enumerate(places):
         pose = PoseInFrame(frame_id=world_of(stream.metadata))
         pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
@@ -228,7 +229,7 @@ def _detections(stream: Stream) -> Made:
 
 
 def _scans(stream: Stream, places: Floats) -> Made:
-    """Make a message for each stamp with its positions, from the positions (n, 3) of all stamps."""
+    """Make a message for each stamp, from the positions (n, 3) of all stamps."""
     for rows in _by_stamp(stream):
         poses = PosesInFrame(frame_id=world_of(stream.metadata))
         poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))

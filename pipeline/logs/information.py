@@ -36,7 +36,7 @@ ESTIMATES = "/estimates/"  # prefix of the topics in estimates logs
 
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
-    """Print the run, duration and topics of a log; for other data, how to import them.
+    """Print the run, duration and topics of a log, or how to import other data.
 
     Result folders and timelines are also described.
     """
@@ -104,7 +104,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 def main_span(log: Log) -> tuple[int, int] | None:
-    """Find the first and last stamp of most messages if others are years away; otherwise return None."""
+    """Return the span of most messages if the others are years away from it; otherwise return None."""
     try:
         return LogSource(log).main_span
     except BadInput:
@@ -179,7 +179,7 @@ def _topics_used(bound: Sequence[Bound]) -> list[str]:
 
 
 def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
-    """Print which models and other estimators fit the log, and with `is_all` what other models need."""
+    """Print which models and other estimators fit the log and, with `is_all`, what other models need."""
     fittings = fitting_of(log.topics)
     fit = {name: each for name, each in fittings.items() if each.methods}
     others = {name: each for name, each in fittings.items() if name not in fit}
@@ -306,7 +306,7 @@ def _say_run(run: RunMetadata) -> None:
 
 
 def _changed(run: RunMetadata) -> dict[str, Any]:
-    """Return the parameters that differ from the recorder's defaults; all if the recorder is unknown."""
+    """Return the parameters that differ from the recorder's defaults, or all if it is unknown."""
     try:
         described = describe(load("recorders", run.scenario, Recorder).parameters)
     except BadInput:

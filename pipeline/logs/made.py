@@ -36,7 +36,7 @@ def _what(result: Result) -> str:
 
 
 def show_timeline(path: Path, *, as_json: bool) -> None:
-    """Print the entities of a timeline and the number of rows of each.
+    """Print the entities of a timeline, each with its number of rows.
 
     Raises BadInput if the timeline cannot be read.
     """

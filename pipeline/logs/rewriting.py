@@ -1,4 +1,4 @@
-"""Functions that rewrite logs block by block: the choice of topics, notes on losses, and the new log."""
+"""Functions that rewrite logs block by block, choose topics, report losses and write the new log."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -56,12 +56,12 @@ def write_changed(
 
 
 def ranked(log: Log) -> list[str]:
-    """Sort the topics as the log declares them; messages with equal stamps have the same order."""
+    """Sort topics as the log declares them; messages with equal stamps follow the same order."""
     return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
 
 
 def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
-    """Return the topics that match a name or pattern; all topics if there are no patterns."""
+    """Return the topics that match a name or pattern, or all topics if there are no patterns."""
     for pattern in patterns:
         if not any(fnmatchcase(topic, pattern) for topic in log.topics):
             raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
@@ -128,7 +128,7 @@ def readable_log(
 
 
 def run_of(log: Log, target: Path) -> RunMetadata:
-    """Return the run of a log; for estimates, with the path of their log relative to the target."""
+    """Return a log's run; for estimates, with the source log's path relative to the target's folder."""
     run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
     if "log" not in run.notes:
         return run
@@ -137,7 +137,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
 
 
 def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """Return the common run of the logs; if runs or clocks differ, an unknown run with all notes."""
+    """Return the logs' common run or, if runs or clocks differ, an unknown run with all notes."""
     runs = [run_of(log, target) for log in logs]
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):

@@ -7,10 +7,10 @@
     Pose         PoseWithCovarianceStamped
     GeodeticFix  NavSatFix
 
-Units, axes and frames are those of REP 103 and REP 105. Covariances are row-major, of positions and of
-rotations about the fixed axes; unknown ones are zero. A robot in the plane has zero height, roll and
-pitch with zero variances, as in amcl. If a covariance is known only in part, the other variances are
-`UNKNOWN`, as in configurations of diff_drive_controller.
+Units, axes and frames are those of REP 103 and REP 105. Covariances are row-major and refer to positions
+and to rotations about the fixed axes. Unknown covariances are zero. A robot in the plane has zero
+height, roll and pitch with zero variances, as in amcl. If a covariance is known only in part, the other
+variances are `UNKNOWN`, as in configurations of diff_drive_controller.
 """
 
 import re
@@ -56,10 +56,10 @@ class _Sent(NamedTuple):
 
 
 class _Bodies(NamedTuple):
-    """Positions (n, 3), quaternions (n, 4) x, y, z, w, and velocities (n, 3), or None, of bodies.
+    """Positions (n, 3), quaternions x, y, z, w (n, 4), and velocities (n, 3) or None, of bodies.
 
-    The covariance (n, 9, 9) is that of position, rotation and velocity about the fixed axes, or zero if
-    it is unknown.
+    The covariance (n, 9, 9) is of position, rotation and velocity along the fixed axes; it is zero if
+    unknown.
     """
 
     position_m: Floats
@@ -74,7 +74,7 @@ def write_bag(
     """Write topics of a log to the new bag `folder`; notes report what its messages do not contain.
 
     Returns the topics that have messages. Raises BadInput if two topics would have the same name in ROS,
-    or ROS cannot state a stamp.
+    or if ROS cannot represent a stamp.
     """
     origin = common_origin({name: topic.metadata for name, topic in log.topics.items()})
     frames = _body_frames(log, topics)
@@ -112,7 +112,8 @@ def write_bag(
 def _body_frames(log: Log, topics: Sequence[str]) -> dict[str, str]:
     """Return the body's frame for each topic of estimates: as stated, or `base_link`.
 
-    A frame has one parent, so a frame that several topics have is named after each of them.
+    A frame can have only one parent, so if several topics state the same frame, each gets its own frame,
+    named after the topic and the stated frame.
     """
     stated = {
         topic: log.topics[topic].metadata.get(BODY) or BASE
@@ -163,8 +164,8 @@ def _tangent(stream: Stream) -> dict[str, str]:
 def _rows(stream: Stream) -> dict[str, int]:
     """Return the row in the covariance of `_Bodies` for each row of a state's covariance, by name.
 
-    Velocities of truths are not written, nor those of estimates without an orientation, since Odometry
-    has them along the axes of the body.
+    Velocities of truths are not written, and neither are velocities of estimates without an orientation,
+    because Odometry states velocities along the axes of the body.
     """
     kinds = _tangent(stream)
     turns = [name for name, kind in kinds.items() if kind == "rotation"]

@@ -180,7 +180,7 @@ def _of_errors(
     nees: Mapping[tuple[str, str], _Range],
     diverged: Mapping[tuple[str, str], _Range],
 ) -> Iterator[Finding]:
-    """Find NEES outside its interval if the estimator did not diverge, or a constant position error."""
+    """Find constant position errors, and NEES outside its interval if the estimator did not diverge."""
     constants, positions = judge.constants, _beyond(judge, "position_nees")
     for topic in judge.judged:
         what = estimator, case = split_topic(topic)
@@ -202,7 +202,7 @@ def _of_errors(
 
 
 def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
-    """Name the run that dominates the mean NEES; empty if none does."""
+    """Name the run that dominates the mean NEES; return "" if no run does."""
     if judge.runs < FEWEST_DOMINATED:
         return ""
     table = judge.runs_table
@@ -212,7 +212,7 @@ def _of_one_run(judge: Judge, estimator: str, case: str) -> str:
 
 
 def dominating_run(nees: "pd.Series[float]") -> str:
-    """Describe the run that contributes more to the mean NEES than all others; empty if none does."""
+    """Describe a run that contributes more to the mean NEES than all others together, or return ""."""
     values = np.asarray(nees, np.float64)
     place = dominating(values)
     if place is None:
@@ -290,7 +290,7 @@ def _of_digits(judge: Judge) -> Iterator[Finding]:
 
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
-    """Find measurements that were not used for a stated reason, such as a rejection by a gate."""
+    """Find measurements left unused for a stated reason, such as rejection by a gate."""
     measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
         is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
@@ -302,7 +302,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find estimators that are not comparable: their gates differ and have rejected measurements."""
+    """Find estimators that cannot be compared because their gates differ and rejected measurements."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

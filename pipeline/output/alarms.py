@@ -1,7 +1,7 @@
-"""Types of the warnings, causes and stress verdicts that results store with their numbers.
+"""Types for the warnings, causes and stress verdicts that results store next to their metrics.
 
-`fuselog.pipeline.output.alarming` finds the warnings, `fuselog run --diagnose` the causes, and
-`--stress` the verdicts.
+`fuselog.pipeline.output.alarming` finds the warnings, `fuselog run --diagnose` finds the causes, and
+`--stress` finds the verdicts.
 """
 
 from collections.abc import Mapping
@@ -42,9 +42,9 @@ class Cause:
     Attributes:
         estimator: the estimator's label.
         words: description of the cause in one sentence.
-        short: the same in a few words, for the report's first sentence.
+        short: description of the cause in a few words, for the report's first sentence.
         setting: the `--set` value that corrects the cause; empty if no setting does.
-        mended: the outcome of the same runs with that setting; empty if they were not replayed.
+        mended: the outcome of the same runs with `setting`; empty if they were not replayed.
     """
 
     estimator: str
@@ -64,10 +64,10 @@ class Stressing:
 
     Attributes:
         estimator: the estimator's label.
-        verdict: the worst verdict that more than 1 % of the runs have.
+        verdict: the worst verdict among those that more than 1 % of the runs have.
         words: the verdict with its numbers, then an explanation.
-        moved: the largest change of a metric's mean over the runs, by `quantity.case`, and by
-            `quantity` over all cases.
+        moved: the largest change of a metric's mean over the runs, by `quantity.case`, and by `quantity`
+            for all cases together.
     """
 
     estimator: str

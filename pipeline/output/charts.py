@@ -1,7 +1,8 @@
 """Charts as data: panels of series and bands over axes.
 
 A study describes what to draw: series, bands, labels with units. The result folder keeps the description
-as JSON next to an SVG picture that is drawn here; the report draws it as an interactive chart.
+as JSON, next to an SVG picture that this module draws. The report draws the description as an
+interactive chart.
 """
 
 import math
@@ -52,7 +53,7 @@ class Axis(Parameters):
         label: the quantity, with its unit.
         log: whether the axis is logarithmic.
         limits: ends of the axis; by default those of the data.
-        ticks: texts by position, if the axis has its own ticks.
+        ticks: tick labels by position, if the axis has its own ticks.
     """
 
     label: str = ""
@@ -69,8 +70,8 @@ class Axis(Parameters):
 class Drawn(Parameters):
     """Something that is drawn over x, an array of numbers or names.
 
-    Everything with the same label has the same colour in all panels, and is hidden together. A
-    reference, such as the truth, is drawn for comparison with the others.
+    All items with the same label have the same colour in all panels, and are hidden together. A
+    reference, such as the truth, is drawn for comparison with the other items.
     """
 
     label: str
@@ -112,7 +113,7 @@ class Panel(Parameters):
 
     Attributes:
         x, y: the axes.
-        series: curves over these axes.
+        series: curves over the panel's axes.
         bands: ranges over x.
         title: the text above the panel.
         plane: whether both axes have the same scale.
@@ -142,7 +143,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Assign a colour to every label; equal `first` labels have equal colours in all charts."""
+        """Assign a colour to every label; `first` labels get theirs first, so charts can share them."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -174,7 +175,7 @@ def curve(
         x: (n,), numbers or names.
         y: (n,), values at x.
         style: how the series is drawn.
-        reference: whether the other curves and bands are compared with it.
+        reference: whether it is a reference with which the other curves and bands are compared.
 
     Returns:
         The series, for `Panel.series`.
@@ -183,7 +184,7 @@ def curve(
 
 
 def curves(table: "pd.DataFrame", by: list[str], x: str, y: str, style: Style = "line") -> list[Series]:
-    """Make a series of y over x for each group of a table's rows, in order.
+    """Make a series of y over x for each group of a table's rows, in the table's order.
 
     Args:
         table: table with the columns below.
@@ -207,7 +208,7 @@ def path(
         label: name in the legend.
         points: (n, 2), x and y.
         style: how the series is drawn.
-        reference: whether the other curves and bands are compared with it.
+        reference: whether it is a reference with which the other curves and bands are compared.
 
     Returns:
         The series, for `Panel.series`.
@@ -223,7 +224,7 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
         x: (n,), numbers or names.
         low: (n,), lower end of the range at x.
         high: (n,), upper end of the range at x.
-        reference: whether the other curves and bands are compared with it.
+        reference: whether it is a reference with which the other curves and bands are compared.
 
     Returns:
         The band, for `Panel.bands`.

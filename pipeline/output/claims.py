@@ -64,7 +64,7 @@ _MIRRORED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a paper, with the paper's result, ours, our verdict and its reason.
+    """A statement of a paper, with the paper's result, our result, and our verdict with its reason.
 
     A claim about another recording has no verdict.
 
@@ -72,7 +72,7 @@ class Claim:
         claim: the statement.
         paper: the result in the paper, or where the paper states it.
         ours: what we measured.
-        verdict: a `Claimed`, or its text.
+        verdict: the verdict, as a `Claimed` or its text.
         why: the reason for the verdict; for a refuted claim, at least the numbers that contradict it.
     """
 
@@ -117,8 +117,8 @@ def known(claim: Claim) -> Claim:
 class StatedClaim(Parameters):
     """A claim as written in an experiment's file.
 
-    In texts, `{EXPRESSION:FORMAT}` is replaced by the value of the expression; everywhere `$NAME` is
-    replaced by its value in `each`.
+    In texts, `{EXPRESSION:FORMAT}` is replaced by the value of the expression. In all entries, `$NAME`
+    is replaced by its value in `each`.
 
     Attributes:
         sentence: the claim.
@@ -133,11 +133,11 @@ class StatedClaim(Parameters):
         reproducible: a comparison; if it is false, the claim is not reproducible, whatever `holds`
             says.
         each: names and lists of their values; a claim is made for every value or, if there are several
-            names, for every combination. A table as a value sets several names; `nees[ekf, *]` is a list
-            of everything that its `*` matches.
+            names, for every combination. If a value is a table, it sets several names; `nees[ekf, *]` is
+            a list of everything that its `*` matches.
         given: numbers or expressions, by their names in texts and in the comparison.
-        optional: whether the claim is left out, instead of not reproducible, if the result lacks one
-            of its metrics.
+        optional: whether the claim is omitted, rather than called not reproducible, if the result lacks
+            one of its metrics.
         least_runs: the number of runs below which the claim is inconclusive, unless each number that
             decides it has an interval. The default is the number of runs in the experiment's file.
         recording: the experiment's recording to which the claim refers, by default the first; `any`
@@ -172,7 +172,7 @@ class StatedClaim(Parameters):
 
     @property
     def recordings(self) -> set[str]:
-        """Return the claim's recordings: "" is the first, `*` means that they depend on the result."""
+        """Return the claim's recordings: "" is the first; `*` means that the result determines them."""
         return {_named(self, meant).recording for meant in _combinations(self.each)}
 
     @property
@@ -200,7 +200,7 @@ def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
 
 
 def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: str) -> None:
-    """Raise BadInput with `where` and the claim if a claim uses the name of an unknown number."""
+    """Raise BadInput, naming `where` and the claim, if a claim uses the name of an unknown number."""
     for claim in stated:
         for name in sorted(claim.names.difference(names)):
             raise BadInput(
@@ -209,7 +209,7 @@ def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: 
 
 
 def require_recordings(stated: Sequence[StatedClaim], recordings: Collection[str], where: str) -> None:
-    """Raise BadInput with `where` and the claim if a claim is about an unknown recording."""
+    """Raise BadInput, naming `where` and the claim, if a claim is about an unknown recording."""
     if ANY in recordings:
         raise BadInput(f"{where}: '{ANY}' stands for all recordings; give recordings.{ANY} another name")
     known = {"", "*", ANY, *recordings}
@@ -244,7 +244,7 @@ def decide(
 
 
 def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
-    """Return the claim, without its verdict if it is about another recording; "" is the first."""
+    """Return the claim, without its verdict if it is about another recording; "" means the first one."""
     name = recording or next(iter(recordings), ANY)
     if name == ANY or recordings.get(name):
         return claim
@@ -379,7 +379,7 @@ class _Comparison(NamedTuple):
 
 
 def refutation(comparison: str, stated: Mapping[str, str], values: Values) -> str:
-    """Describe the parts of a comparison that make it false; empty if it is true.
+    """Describe the parts of a comparison that make it false; return "" if it is true.
 
     Args:
         comparison: the expression that decides a claim.
@@ -397,7 +397,7 @@ class _Reader(NamedTuple):
     values: Values
 
     def read(self, node: ast.expr, *, wanted: bool) -> list[_Comparison]:
-        """List the comparisons of a condition that should be true, or false if not `wanted`."""
+        """List the comparisons in a condition that has to be true or, if not `wanted`, false."""
         match node:
             case ast.Name(id=name) if name in self.stated:
                 return self.read(parse(self.stated[name]), wanted=wanted)
@@ -464,7 +464,7 @@ def _compared(op: type[ast.cmpop], number: Interval, limit: Interval) -> _Entry:
 
 
 def _only(found: _Comparison, truths: Sequence[Truth], *, wanted: bool) -> _Comparison:
-    """Ignore entries for which the enclosing condition already has the required outcome."""
+    """Ignore entries whose enclosing condition already has the required outcome."""
     of_each = truths if len(truths) == len(found.entries) else [*truths[:1]] * len(found.entries)
     entries = [
         entry._replace(truth=found.wanted) if truth is wanted else entry
@@ -474,7 +474,7 @@ def _only(found: _Comparison, truths: Sequence[Truth], *, wanted: bool) -> _Comp
 
 
 def _sentence(found: _Comparison) -> str:
-    """List the numbers that are on the wrong side of their limits; empty if there are none."""
+    """List the numbers on the wrong side of their limits; return "" if there are no such numbers."""
     against = [
         (place, each)
         for place, each in enumerate(found.entries, start=1)

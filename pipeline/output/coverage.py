@@ -98,8 +98,8 @@ def recounted(
 ) -> list[Row]:
     """Compute the coverage table of a replay from its estimates logs and their source logs.
 
-    `stated` contains the estimators' settings by label, `doubts` the doubts about truths. If an
-    estimator cannot be bound to the logs, its row states this.
+    `stated` contains the estimators' settings by label, and `doubts` contains the doubts about truths.
+    If an estimator cannot be bound to the logs, its row states this.
     """
     rows: list[Row] = []
     bound: list[Bound] = []
@@ -132,7 +132,7 @@ def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock
 
 
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
-    """Return the note REPLAYED for a source's estimates; empty for a whole log in publish order."""
+    """Return the note REPLAYED for a source's estimates, or {} for a whole log in publish order."""
     ends = source.start_ns, getattr(source, "end_ns", None)
     text = json.dumps([*ends, order])
     return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
@@ -252,7 +252,7 @@ def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
 
 
 def stored_rows(folder: Path) -> list[Row]:
-    """Read the table `coverage` of a result; older results have none."""
+    """Read the table `coverage` of a result; older results do not have this table."""
     path = folder / "tables" / "coverage.parquet"
     if not path.is_file():
         return []

@@ -47,7 +47,7 @@ class Values(NamedTuple):
     """Everything that an expression may name.
 
     Attributes:
-        metrics: by their keys, `estimator.quantity[.case]`.
+        metrics: the metrics by their keys, `estimator.quantity[.case]`.
         intervals: the 95 % intervals of metrics that have one.
         names: other numbers by name.
     """
@@ -79,7 +79,7 @@ def truth(expression: str, values: Values) -> Truth:
 
 
 def formatted(template: str, values: Values) -> str:
-    """Fill a sentence with the values of its expressions: `{EXPRESSION:FORMAT}`, lists with commas.
+    """Replace every `{EXPRESSION:FORMAT}` in a sentence by its value; join lists with commas.
 
     If a number has an interval, the interval follows the number; `{EXPRESSION!n:FORMAT}` also writes the
     names of numbers. Raises as `evaluate` does.
@@ -159,7 +159,7 @@ def names_in(expression: str) -> frozenset[str]:
 def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bool:
     """Test whether chance could change the result of a comparison, so that it needs many runs.
 
-    This is the case if the comparison reads a metric without an interval, uses only the value or one end
+    A comparison needs many runs if it reads a metric without an interval, uses only the value or one end
     of an interval, or tests whether an interval contains a number: fewer runs make intervals wider.
 
     Args:
@@ -182,7 +182,7 @@ def needs_runs(expression: str, stated: Mapping[str, str], values: Values) -> bo
 def lacks_interval(expression: str, stated: Mapping[str, str], values: Values) -> bool:
     """Test whether an expression reads a metric whose interval is unknown for lack of runs.
 
-    The arguments are those of `needs_runs`.
+    The arguments are the same as for `needs_runs`.
     """
     keys = {*_keys_in(_expanded(expression, stated), values)} & values.intervals.keys()
     ends = [end for key in keys if values.metrics[key] is not None for end in values.intervals[key]]
@@ -223,7 +223,7 @@ class _Expanded(ast.NodeTransformer):
 
 
 def metrics_of(tree: ast.expr) -> list[tuple[str, str]]:
-    """Return the metrics that an expression names: the quantity, and the text in brackets."""
+    """Return the metrics that an expression names, as pairs of the quantity and the text in brackets."""
     found = []
     for node in ast.walk(tree):
         match node:
@@ -277,7 +277,7 @@ def value_of(node: ast.expr, values: Values) -> Value:
 def metric(quantity: str, of: str, values: Values) -> Value:
     """Look up the metric of `estimator, case`, or a list of metrics if the text contains `*` or `|`.
 
-    Raises `NoMetric` if there is none.
+    Raises `NoMetric` if there is no such metric.
     """
     keys = keys_of(quantity, of, values.metrics)
     if not keys:
@@ -289,7 +289,7 @@ def metric(quantity: str, of: str, values: Values) -> Value:
 def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
     """Find the keys of the metrics of `estimator, case`, and the names that `*` and `|` match in each.
 
-    Raises `NoMetric` if a metric is missing that the expression names without `*`.
+    Raises `NoMetric` if a metric that the expression names without `*` is missing.
     """
     estimator, _, case = (part.strip() for part in of.partition(","))
     found = {}

@@ -21,7 +21,7 @@ Value = Interval | Truth | list[Any]
 
 
 def exactly(value: float | None, name: str = "") -> Interval:
-    """Make an exact number, whose interval has no width; NaN for None."""
+    """Make an exact number, whose interval has no width; None becomes NaN."""
     value = math.nan if value is None else float(value)
     return Interval(value, value, value, name=name)
 
@@ -67,7 +67,7 @@ def _of_known(compare: Callable[[Interval, Interval], Truth]) -> Callable[[Inter
 
 
 def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Interval, Interval], Truth]:
-    """Make a test of whether the whole interval of one number is below, or above, that of another."""
+    """Make a test of whether one number's whole interval is below, or above, the other's."""
 
     def compare(one: Interval, other: Interval) -> Truth:
         if one.low == one.high and other.low == other.high:
@@ -113,7 +113,7 @@ def all_hold(truths: Sequence[Any]) -> Truth:
 
 
 def any_holds(truths: Sequence[Any]) -> Truth:
-    """Test whether any truth value, nested lists included, is true; undecided as in `all_hold`."""
+    """Test whether any truth value, nested lists included, is true; missing if any value is missing."""
     return negated(all_hold([negated(each) for each in flat(truths)]))
 
 
@@ -137,7 +137,7 @@ def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Inter
 
 
 def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
-    """Make an increasing function of a number or of the entries of a list."""
+    """Make an increasing function that applies to a number, or to each entry of a list."""
 
     def of(number: float) -> float:
         try:
@@ -177,7 +177,7 @@ def _plus_minus(number: Interval, spread: Interval) -> Interval:
 
 
 def _chi_square(share: Interval, size: Interval) -> Interval:
-    """Compute a quantile of the chi-square distribution; NaN without a degree of freedom."""
+    """Compute a quantile of the chi-square distribution; return NaN for zero degrees of freedom."""
     from fuselog.replay.engine import chi2
 
     return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)

@@ -91,7 +91,7 @@ def _refuse_link(path: Path) -> None:
 
 
 def _is_of_result(path: Path) -> bool:
-    """Test whether the result folder that contains a file lists it."""
+    """Test whether a file is listed by the result folder that contains it."""
     place = Path(os.path.realpath(path))
     for folder in place.parents:
         if (folder / RESULT_FILE).is_file():
@@ -117,7 +117,7 @@ def run_written(path: Path) -> RunMetadata | None:
 
 
 def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
-    """Describe how the settings of a replaced log differ from those of the new log; else empty."""
+    """Describe how the settings of a replaced log differ from the new ones; empty if they agree."""
     if before is None or now is None:
         return ""
     old, new = _settings_of(before), _settings_of(now)
@@ -142,7 +142,7 @@ def _shown(settings: Mapping[str, str], name: str) -> str:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """Return the run of a log that fuselog wrote and did not change (did change if `is_changed`)."""
+    """Return the run of a log that fuselog wrote and, unless `is_changed`, did not change; else None."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None

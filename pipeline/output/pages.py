@@ -1,4 +1,4 @@
-"""Everything that is HTML comes from a Jinja2 template: the report, the page of `explore`, notebooks."""
+"""HTML from Jinja2 templates, for the report, the page of `explore`, and notebooks."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from fuselog.recorders.errors import printable
 
 
 def templates(package: str, filters: Mapping[str, Any]) -> Environment:
-    """Open the templates of a package; they can use these filters, and escape all text."""
+    """Open the templates of a package. The templates can use these filters, and escape all text."""
     environment = Environment(
         loader=PackageLoader(package, "."),
         autoescape=select_autoescape(),

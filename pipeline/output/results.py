@@ -100,13 +100,13 @@ class Outcome:
 class Result(Parameters):
     """The content of result.json.
 
-    `files` lists the files in the folder with their SHA-256. The hash of result.json itself is that of
-    its text without this entry. Files that depend on the clock have no hash: timelines, whose rows
+    `files` lists the files in the folder with their SHA-256. The hash of result.json itself is computed
+    from its text without this entry. Files that depend on the clock have no hash: timelines, whose rows
     Rerun numbers by time, and `TIMINGS`. `bounds` are the 95 % ranges of metrics of a consistent
-    estimator, `intervals` the 95 % intervals of the true metrics; `alarms` are warnings about the
-    metrics, the worst first; `causes` explain why estimators are inconsistent, if diagnosed;
-    `stress` is the effect of changes that should not matter, and is left out of the text if it was
-    not tested. `kind` is the command that made the result; older results do not state it.
+    estimator, and `intervals` are the 95 % intervals of the true metrics. `alarms` are warnings about
+    the metrics, the worst first. `causes` explain why estimators are inconsistent, if they were
+    diagnosed. `stress` is the effect of changes that should not matter; it is left out of the text if it
+    was not tested. `kind` is the command that made the result; older results do not state it.
     """
 
     format: int = FORMAT
@@ -161,7 +161,7 @@ def split_metric(key: str) -> tuple[str, str, str]:
 
 
 def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
-    """Sort metrics: those of these estimators first, in this order; the others keep their order."""
+    """Sort metrics by these estimators, in this order; other metrics follow in their old order."""
     place = {label: index for index, label in enumerate(estimators)}
     keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
     return {key: metrics[key] for key in keys}
@@ -175,7 +175,7 @@ class Measured(NamedTuple):
 
     @property
     def place(self) -> Literal["below", "within", "above", ""]:
-        """Return the position of the value relative to its bounds; empty if either is missing."""
+        """Return the position of the value relative to its bounds; return "" if either is missing."""
         if self.bounds is None or not isinstance(self.value, int | float):
             return ""
         low, high = self.bounds
@@ -194,7 +194,7 @@ class MetricTable:
 def read_table(path: Path) -> "pd.DataFrame":
     """Read a table from a result's folder; raise BadInput if it is damaged.
 
-    Arrow itself cannot open file names that the locale's encoding does not contain.
+    Arrow itself cannot open files whose names the locale's encoding cannot represent.
     """
     import pandas as pd
 

@@ -221,14 +221,15 @@ def panel_over_time(
     of_band: str = "",
     others: Sequence[Series] = (),
 ) -> Panel:
-    """Draw values (n,) over their range, with a strip along the bottom where they are outside.
+    """Draw values (n,) over a range, with a strip along the bottom that marks where they are outside it.
 
     Args:
         label: name of the estimator; without `of_band`, also the name of the range.
         time_s: (n,).
         values: (n,).
         ends: the lower and upper ends (n,) of the range.
-        y: vertical axis; the strip is drawn at its lower limit.
+        y: vertical axis; the strip that marks values outside the range is drawn at the axis's lower
+            limit.
         title: text above the panel.
         of_band: name of a range that is the same for all estimators.
         others: further curves.

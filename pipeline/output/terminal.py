@@ -59,7 +59,7 @@ class OnceAMinute:
         self.begin()
 
     def begin(self) -> None:
-        """Start timing when a command begins, so that its first line appears after a minute."""
+        """Start timing when a command begins, so that its first progress line appears after a minute."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
@@ -183,7 +183,7 @@ def _drawn(printed: PrintedTable) -> Table:
 
 
 def format_value(value: object) -> str:
-    """Format a value: floats with four significant digits, the range of many numbers, or text.
+    """Format a value: floats with four digits, long lists of numbers as their range, others as text.
 
     Missing values, such as NaN and infinity, are empty; see `is_value`.
     """
@@ -213,7 +213,7 @@ def is_value(value: object) -> bool:
 
 
 def has_many_cases(metrics: "Mapping[str, MetricValue]") -> bool:
-    """Test whether metrics have so many cases that they are summarised."""
+    """Test whether the metrics have too many cases to be printed one by one."""
     return _number_of_cases(metrics) > MOST_CASES
 
 
@@ -231,8 +231,8 @@ def print_metrics(
 ) -> None:
     """Print metrics as tables, one per case, with a row per quantity and a column per estimator.
 
-    If a value has bounds, the 95 % range of a consistent estimator, they follow the value. If there is a
-    table of runs, the mean NEES over the runs is added, or the reason why it is missing (see
+    If a value has bounds (the 95 % range of a consistent estimator), the bounds follow the value. If
+    there is a table of runs, the mean NEES over the runs is added, or the reason why it is missing (see
     `metric_tables`). Many cases are summarised in one table of medians; `details` names the place that
     lists each case.
     """

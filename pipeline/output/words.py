@@ -20,8 +20,8 @@ class Quantity(NamedTuple):
     Attributes:
         name: the usual name.
         meaning: a sentence that explains the quantity.
-        group: the group of table rows to which it belongs.
-        unit: the unit in which it is stored; empty if it has none.
+        group: the group of table rows to which the quantity belongs.
+        unit: the unit in which the quantity is stored; empty if it has no unit.
         aim: the ideal value, if it is the same number for all estimators.
     """
 
@@ -241,12 +241,12 @@ def _bare(text: str) -> str:
 
 
 def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
-    """Format the two ends of an interval in one unit, without the unit."""
+    """Format the two ends of an interval in the same unit, without writing the unit."""
     return " to ".join(alike([low, high], own, digits))
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Format numbers shown together with the decimals of the largest; separately if they differ much.
+    """Format numbers together, with the decimals of the largest; separately if they differ greatly.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])

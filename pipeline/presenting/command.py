@@ -51,9 +51,9 @@ def view_path(paths: Sequence[Path], options: Options) -> None:
 
 
 def _runs_to_show(paths: Sequence[Path], options: Options) -> Runs | None:
-    """Return the runs of results or folders; None if there is only a timeline to show.
+    """Return the runs of results or folders, or None if there is only a timeline to show.
 
-    Raises BadInput if several runs are requested and there are none.
+    Raises BadInput if several runs are requested but the paths do not contain several.
     """
     path = paths[0]
     is_asked = options.runs is not None or len(paths) > 1 or options.port is not None
@@ -96,7 +96,7 @@ def _save_dataset(runs: Runs, chosen: Sequence[Segment], folder: Path) -> None:
 def _show_dataset(runs: Runs, chosen: Sequence[Segment], options: Options) -> None:
     """Show the runs in the viewer or in a browser until it is closed, or take a picture of the table.
 
-    The table comes first; chosen runs are added as they are drawn.
+    The table is shown first; chosen runs are added as they are drawn.
     """
     if options.screenshot is not None:
         from fuselog.pipeline.output.outputs import PICTURE, check_files  # slow to import

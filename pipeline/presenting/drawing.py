@@ -34,7 +34,7 @@ Recorded = LogSource | MemorySource
 def draw(segment: Segment, gap_limit_s: float, folder: Path) -> list[str]:
     """Draw a segment into an existing folder: a file for each layer, and the layout.
 
-    Returns sentences on errors that differ from those of the result, since the code has changed.
+    Returns sentences on errors that differ from the result's errors because the code has changed.
     """
     source, estimates, versions = open_run(segment)
     whole = folder / "whole.rrd"
@@ -66,7 +66,7 @@ def worst_times(judge: Judge) -> dict[tuple[str, str], float]:
 
 
 def differing(segment: Segment, judge: Judge) -> list[str]:
-    """Describe the first error of a replay that differs from what the result states, if any does."""
+    """Describe the first metric of a replay that differs from the result's; return [] if all agree."""
     if segment.parts[0].result is None:
         return []
     for row in judge.runs_table.to_dict("records"):
@@ -90,7 +90,7 @@ def open_run(segment: Segment) -> tuple[Recorded, MemorySource, dict[str, str]]:
     If an earlier version has an estimator with the same label, the version's title is appended to the
     label.
 
-    Raises BadInput if the logs are gone and the run cannot be recorded again.
+    Raises BadInput if the logs no longer exist and the run cannot be recorded again.
     """
     source, first = _open_part(segment.parts[0])
     versions = dict.fromkeys(labels_of(first), segment.parts[0].title)

@@ -112,7 +112,7 @@ class Kept:
         self._clear()
 
     def properties(self) -> Path:
-        """Return the folder of the layer of properties of all segments; make it if it is not there."""
+        """Return the folder with the properties of all segments (a layer); make it if it is missing."""
         runs = self._runs
         place = self.folder / LIST / runs.key
         if not place.is_dir():
@@ -132,7 +132,7 @@ class Kept:
         return [Made(each, place, []) for each in drawn if (place := self._place(each)).is_dir()]
 
     def make(self, segments: Sequence[Segment], open_pool: PoolFactory) -> Generator[Made]:
-        """Draw segments in parallel, yield each when it is finished; memory holds those in progress.
+        """Draw segments in parallel, and yield each when finished; only those in progress are in memory.
 
         If the drawing is interrupted, unfinished files are removed.
         """
@@ -158,7 +158,7 @@ class Kept:
                 sleep(0.05)
 
     def _clear(self) -> bool:
-        """Remove what interrupted drawings left; return whether one is still active."""
+        """Remove what interrupted drawings left; return whether another drawing is still active."""
         is_active = False
         for part in glob("*/.*.part", root_dir=self.folder):  # noqa: PTH207  # others may remove some
             place = self.folder / Path(part).parent / Path(part).name.split(".")[1]

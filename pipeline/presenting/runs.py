@@ -57,7 +57,7 @@ class Part:
     """The estimates of one run: a log of them, or the result whose settings replay the run again.
 
     Attributes:
-        title: name of this version, if the run has several.
+        title: name of this version, if the run has several versions.
         log: the log of the run, if there is one.
         estimates: the log of the estimates, if they were kept.
         result: folder of the result that replays the run, if its estimates were not kept.
@@ -95,7 +95,7 @@ class Segment:
     Attributes:
         name: the run's name, from which file names are made.
         of: what was recorded: its log, or a hash of the scenario's settings, seed and number.
-        parts: the versions of its estimates, the current one first.
+        parts: the versions of the run's estimates, the current one first.
         properties: what is known about the run, and about each estimator.
     """
 

@@ -77,7 +77,7 @@ def _runs_in(path: Path, gap_limit_s: float, *, recover: bool) -> Runs | None:
 def _together(given: Sequence[Runs]) -> Runs:
     """Join lists of the same runs, with the estimates of each list as a version.
 
-    Raises BadInput if they are not the same runs.
+    Raises BadInput if the results are not of the same runs.
     """
     first, *others = given
     _, *titles = _distinct([each.path for each in given])
@@ -111,7 +111,7 @@ def _distinct(paths: Sequence[Path]) -> list[str]:
 
 
 def _of_result(folder: Path, result: Result) -> Runs | None:
-    """Return the runs of a result; None if its runs are not numbered."""
+    """Return the runs of a result; return None if its runs are not numbered."""
     import pandas as pd
 
     from fuselog.pipeline.output.report.evidence import findings  # slow to import
@@ -183,7 +183,7 @@ def _segments(
 
 
 def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float, *, recover: bool) -> Runs:
-    """Return a run for each log, with the estimates in all estimates logs of it as versions.
+    """Return a run for each log, with each of its estimates logs as a version of the estimates.
 
     Raises BadInput if a log cannot be read, or the log of estimates is missing.
     """
@@ -242,7 +242,7 @@ def _sorted(
     tables: Mapping[str, "pd.DataFrame"] | None = None,
     verdicts: Mapping[str, str] | None = None,
 ) -> Runs:
-    """Combine what is known about runs, and sort them: failed ones, then by error, the worst first.
+    """Combine what is known about runs, and sort them: failed runs first, then the largest errors.
 
     Runs are sorted by the error of the estimator that has the smallest error over all runs.
     """
@@ -298,7 +298,7 @@ def _worst_spans(times: "pd.DataFrame | None", quantity: str) -> list[dict[Hasha
 def _failures(
     rows: "pd.DataFrame", segments: Mapping[str, Segment], failures: "pd.DataFrame | None"
 ) -> dict[str, str]:
-    """Return by run why estimators failed, or which estimators have no errors."""
+    """Return for each run why estimators failed, or for which estimators there are no errors."""
     found: dict[str, list[str]] = {}
     if len(rows):
         for label, own in rows.groupby("estimator", sort=False):

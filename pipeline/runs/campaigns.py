@@ -1,8 +1,9 @@
 """Cells of an experiment, which are processed in any order and merged in a fixed order.
 
-A cell is a part of the runs. Its result depends only on its description and on the code, so it can be
-computed anywhere and needs to be computed only once. Finished cells are kept until all are done, and
-after an interruption the same command continues with them; see `fuselog.pipeline.runs.checkpoints`.
+A cell is a part of the runs. A cell's result depends only on its description, its data and the code, so
+it can be computed anywhere and needs to be computed only once. Finished cells are kept until all are
+done, and after an interruption the same command continues with them; see
+`fuselog.pipeline.runs.checkpoints`.
 """
 
 import hashlib
@@ -74,7 +75,8 @@ class Cell:
     """The runs from `first` to `end` (exclusive) of an experiment.
 
     Attributes:
-        experiment: the complete experiment; its result depends on no other file except its logs.
+        experiment: the complete experiment; apart from its logs and its estimators' programs, the result
+            depends on no other file.
         first, end: the number of the first run, and of the run after the last.
         logs: number of runs whose logs are kept.
         draws: whether the timeline of the first run is drawn.
@@ -102,7 +104,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Hash everything that determines the result: this description, the data, and the code."""
+        """Hash everything that determines the result: the cell's description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
@@ -223,7 +225,7 @@ def work_off(
 ) -> Iterator[Any]:
     """Yield the results of cells in order; cells that are already done are not computed again.
 
-    Memory holds the cells in progress. Raises BadInput if the workers of a cell died repeatedly.
+    Only the cells in progress are in memory. Raises BadInput if the workers of a cell died repeatedly.
     """
     checkpoints.begin()
     keys = [cell.key for cell in cells]

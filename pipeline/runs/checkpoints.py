@@ -9,7 +9,8 @@ The result of a cell begins with its key and contains the SHA-256 of each of its
 files have changed is computed again. Other users may be able to write to the parent folder, such as a
 shared disk, but the folder itself and each file that is read must belong to this user only.
 
-The folder is created when the work begins. It is removed when the result is complete, or if it is empty.
+The folder is created when the work begins. The folder is removed when the result is complete, or if the
+folder is empty.
 """
 
 import logging
@@ -84,7 +85,7 @@ class Checkpoints:
         return self._left(key) is not None
 
     def read(self, key: str) -> Any:
-        """Read the result of a cell; None if it is not done."""
+        """Read the result of a cell; return None if the cell is not done."""
         left = self._left(key)
         return None if left is None else pickle.loads(left.pickled)
 

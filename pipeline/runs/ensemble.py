@@ -59,7 +59,8 @@ class RunGroup:
         sources: the runs.
         first_run: the number of the first run.
         estimates: paths of estimates and source log, for the first runs.
-        origins: initial states of runs whose spans begin after their priors; empty, or one per run.
+        origins: initial states, one per run, for runs whose spans begin after their priors; may be
+            empty.
         is_all: whether these are all runs of the ensemble.
     """
 
@@ -71,7 +72,7 @@ class RunGroup:
 
 
 def parts_of(runs: int) -> Iterator[slice]:
-    """Yield slices of runs that are replayed together; they depend only on the number of runs."""
+    """Yield slices of runs that are replayed together. The slices depend only on the number of runs."""
     for first in range(0, runs, RUNS_AT_ONCE):
         yield slice(first, min(first + RUNS_AT_ONCE, runs))
 
@@ -81,7 +82,7 @@ def cut_in_parts(
     estimates: Sequence[tuple[Path, Path]],
     origins: Sequence[Origin] = (),
 ) -> Iterator[RunGroup]:
-    """Yield groups of existing runs; `estimates` and `origins` are those of all runs."""
+    """Yield groups of existing runs; `estimates` and `origins` contain the entries of all runs."""
     for now in parts_of(len(sources)):
         yield RunGroup(
             sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
@@ -96,7 +97,7 @@ class Pass:
         judge: judge of all runs.
         parameters: parameters of every estimator by label, including defaults.
         stated: parameters in the first log's channels; see `stated_of`.
-        usages: how many measurements were used, by bound estimator.
+        usages: how many measurements each bound estimator used.
         untaken: topics that estimators do not use.
         left_out: counts of messages with impossible values.
         seconds: the run time of each estimator in s, by label.
@@ -166,7 +167,7 @@ def replay_parts(
 ) -> Pass:
     """Replay an ensemble in parts, and send blocks to estimates logs, judge and timeline.
 
-    Memory holds the current blocks, and the runs of a part if they were in memory before.
+    Memory holds the current blocks, and those runs of the part that were in memory before.
 
     Args:
         parts: the runs.
@@ -178,7 +179,7 @@ def replay_parts(
         save: the file for the first run's timeline.
         connect: the viewer to which the timeline is streamed; see `Drawing`.
         on_errors: function that is called with the errors of every block.
-        block_messages: approximate number of messages of a run in memory at a time.
+        block_messages: approximate number of a run's messages that are in memory at a time.
         mirrors: function that makes the Foxglove mirror, which is written next to the estimates.
         progress: function that reports progress after every block.
 

@@ -1,6 +1,6 @@
 """Functions that find the source logs and estimators of estimates logs, and hash the input of replays.
 
-The tables of all individual errors are also written here.
+The module also writes the tables of all individual errors.
 """
 
 import hashlib
@@ -55,7 +55,7 @@ def source_of_estimates(
 
 
 def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
-    """Return parameters by label, in the order of the replay; empty if the log does not contain them."""
+    """Return parameters by label, in the order of the replay; return {} if the log has no parameters."""
     notes = estimates.run.notes if estimates.run else {}
     try:
         stated = parse_json(notes.get("estimators", "{}"))

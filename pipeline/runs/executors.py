@@ -44,8 +44,8 @@ class WorkerPool(NamedTuple):
     Attributes:
         executor: the executor that distributes the work.
         workers: number of tasks that run concurrently.
-        require: function that raises BadInput unless all workers see these absolute paths as this
-            process does.
+        require: function that raises BadInput unless all workers see the same files at given absolute
+            paths as this process does.
         lost: exceptions of a future whose worker has died.
     """
 
@@ -62,9 +62,10 @@ PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 def pool_for(
     workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
 ) -> PoolFactory:
-    """Choose the workers for a number of runs: those of the options, else all cores if that saves time.
+    """Choose the workers for a number of runs: from the options, or all cores if that saves time.
 
-    If an executor is given, it does all the work. Raises BadInput if both options are given.
+    If an executor is given, it does all the work. Raises BadInput if both `workers` and `scheduler` are
+    given without an executor.
     """
     if executor is not None:
         return pool_of(executor)
@@ -81,7 +82,7 @@ def pool_for(
 
 
 def pool_of(executor: Executor) -> PoolFactory:
-    """Wrap an existing executor as a pool with as many concurrent tasks as there are cores."""
+    """Wrap an existing executor as a pool with one concurrent task per core."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -94,7 +95,7 @@ class InlineExecutor(Executor):
     """An executor that does the work immediately in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do the work immediately; the future has its result or its exception, except interrupts."""
+        """Do the work immediately; the future gets its result or exception. Interrupts are raised."""
         future: Future[Any] = Future()
         try:
             future.set_result(work(*args, **kwargs))
@@ -105,9 +106,10 @@ class InlineExecutor(Executor):
 
 @cache
 def keep_freed_memory() -> None:
-    """Keep the memory of freed arrays for new ones, because the system clears each page that it gives.
+    """Keep freed memory for new arrays, because the system clears every page before handing it out.
 
-    Only glibc has such settings; arrays above 32 MB, its largest limit, are not affected.
+    Only glibc has such settings; arrays above 32 MB, the largest limit that it accepts, are not
+    affected.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:

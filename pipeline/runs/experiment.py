@@ -38,7 +38,7 @@ from fuselog.replay.judging.metrics.measuring import find_metrics
 class Experiment(Parameters):
     """One experiment as described by its TOML file.
 
-    The runs are recorded from a scenario, imported, or existing logs.
+    The runs are recorded from a scenario, imported, or read from existing logs.
 
     Attributes:
         title: a description in one line.
@@ -49,8 +49,8 @@ class Experiment(Parameters):
         record: what to simulate.
         import_: what to import.
         logs: logs to replay.
-        estimators: parameters by label; `kind` names the estimator if the label is not its name; `like`
-            names another label from which kind and parameters are taken unless they are set.
+        estimators: parameters by label. `kind` names the estimator if the label is not its name. `like`
+            names another label, whose kind and parameters apply unless they are set here.
         alterations: changes of topics before the replay, as for `--set /TOPIC.WHAT`.
         metrics: names of the metrics; by default all registered ones.
         gap_limit_s: longest gap over which truth is interpolated.
@@ -154,7 +154,7 @@ class Setting:
         logs: number of runs whose logs are kept.
         draws: whether the first run's timeline is drawn.
         errors: whether all individual errors are kept.
-        options: options of the study, of the type that it defines.
+        options: options of the study, of the type that the study defines.
         progress: function that reports progress.
         open_pool: function that opens the workers for the cells; by default this process.
         checkpoints: storage of finished cells until all are done.
@@ -180,9 +180,9 @@ class Study:
         summary: a description in one line.
         run: (experiment, setting) -> its outcome; logs and timeline go to the setting's folder.
         options: the type of the experiment's `options`.
-        is_campaign: whether it replays only through `fuselog.pipeline.runs.campaigns`, so that the runs
-            can be distributed.
-        runs: description of what the number of runs counts; empty if the study makes no runs.
+        is_campaign: whether the study replays only through `fuselog.pipeline.runs.campaigns`, so that
+            the runs can be distributed.
+        runs: what the option for the number of runs counts, in words; empty if the study makes no runs.
     """
 
     summary: str
@@ -197,10 +197,10 @@ class Stated(NamedTuple):
 
     Attributes:
         name: its name.
-        source: the file from which it was read, for messages.
+        source: the file from which the experiment was read, for messages.
         values: the entries of the file.
-        folder: the folder to which the paths of its logs are relative.
-        files: other files from which it was read.
+        folder: the folder to which the paths of the experiment's logs are relative.
+        files: other files from which the experiment was read.
     """
 
     name: str
@@ -211,7 +211,7 @@ class Stated(NamedTuple):
 
     @property
     def labels(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return the labels of its estimators, with their settings."""
+        """Return the labels of the experiment's estimators, with the estimators' settings."""
         return self.with_settings({}, {}).estimators
 
     @property
@@ -248,9 +248,9 @@ def load_experiment(
     """Load an experiment by its shipped name or TOML file, and apply settings and then `over`.
 
     A setting applies to the entry of the experiment or to the estimator that its first word names.
-    Otherwise it applies to a parameter of the scenario or importer, or else to all estimators with such
-    a parameter: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`,
-    `/fix.delay_s=0.3`.
+    Otherwise, a setting applies to a parameter of the scenario or importer or, if these have no such
+    parameter, to all estimators that have it: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`,
+    `gate_probability=1`, `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)
     return stated.name, stated.with_settings(settings, over)
@@ -304,7 +304,7 @@ def _logs_of(stated: Logs, folder: Path, where: str) -> Logs:
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
-    """Find the files that match patterns, without duplicates; raise BadInput if one matches none."""
+    """Find the files that match patterns, without duplicates; raise BadInput if one has no match."""
     files: dict[str, None] = {}
     for pattern in patterns:
         place = located(pattern)

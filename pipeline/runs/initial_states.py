@@ -1,8 +1,8 @@
-"""Starts of replays from a state other than the log's own prior.
+"""Replays that start from a state other than the log's own prior.
 
 An estimator with a prior begins at the prior's stamp. If the replayed span begins later, the prior does
 not apply, and the state must come from the truth or from the estimates of an earlier replay. The
-estimator receives this state as a prior, so it needs no special handling.
+estimator receives this state as a prior, so such starts need no special handling.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -78,7 +78,7 @@ def origins_of(
     order: Clock,
     gap_limit_s: float,
 ) -> list[Origin]:
-    """Find the initial state of each run; empty if no start is requested.
+    """Find the initial state of each run; return [] if no start is requested.
 
     Args:
         sources: the runs.
@@ -155,7 +155,7 @@ def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clo
 def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
     """Start a run from its truth.
 
-    The covariance is that of the log's prior. `sigmas` replace the standard deviations of some
+    The covariance is the one of the log's prior. `sigmas` replace the standard deviations of some
     components, which are then uncorrelated with all others.
     """
     return partial(_true_state, source, order, gap_limit_s, sigmas)
@@ -244,7 +244,7 @@ def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int
 
 
 def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
-    """Find the estimate that replaces a prior: of the same case, with all its components."""
+    """Find the estimate that replaces a prior: it has the same case and all components of the prior."""
     case = prior.topic.rpartition("/")[0].removeprefix("/")
     found = [
         name

@@ -18,7 +18,7 @@ class Record(Parameters):
 
     Attributes:
         scenario: a scenario by name or TOML file.
-        parameters: values that differ from its defaults, by name.
+        parameters: parameter values that differ from the defaults, by name.
     """
 
     scenario: str
@@ -30,7 +30,7 @@ class Import(Parameters):
 
     Attributes:
         source: name of the importer.
-        parameters: values that differ from its defaults, by name.
+        parameters: parameter values that differ from the defaults, by name.
     """
 
     source: str
@@ -67,7 +67,7 @@ class Recording(Parameters):
     sha256: str = ""
 
     def digest_of(self, files: Sequence[Path]) -> str:
-        """Hash the decompressed files of this recording with SHA-256; "" if there are none."""
+        """Hash the decompressed files of this recording with SHA-256; return "" if it has no files."""
         digests = sorted(_digest(path) for path in files if path.match(self.files))
         return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 

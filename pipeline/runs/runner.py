@@ -32,11 +32,11 @@ NO_REPLAY = "its settings are not sufficient for a replay; estimates logs can be
 
 @dataclass(frozen=True)
 class Runner:
-    """The runs of an experiment, and where and how it runs.
+    """The runs of an experiment, and where and how the experiment runs.
 
     Attributes:
         experiment: the experiment.
-        setting: where and how it runs.
+        setting: where and how the experiment runs.
     """
 
     experiment: Experiment
@@ -53,8 +53,8 @@ class Runner:
         """Load runs into memory, from a simulation, an import or logs.
 
         Args:
-            parameters: values that differ from the scenario's.
-            seed: by default the experiment's.
+            parameters: scenario parameters that replace the experiment's.
+            seed: the seed of the runs, the seed of the runs, by default the experiment's.
             first_run: the number of the first run.
             runs: number of runs, by default the experiment's.
 
@@ -101,7 +101,7 @@ class Runner:
         drawn: str | None = "",
         first_run: int = 0,
     ) -> None:
-        """Write logs and estimates of the first runs; the others can be recorded again from the seed.
+        """Write logs and estimates of the first runs; other runs can be recorded again from the seed.
 
         Args:
             sources: the runs.
@@ -109,7 +109,7 @@ class Runner:
             folder: the folder for logs and estimates, in the setting's folder.
             drawn: the folder for the timeline of the first run, in the setting's folder; None for no
                 timeline.
-            first_run: the number of the first of these runs, if they are only a part of all runs.
+            first_run: the number of the first of these runs, if they are only some of all runs.
         """
         count = max(0, min(self.setting.logs - first_run, len(sources)))
         for run in self.setting.progress(range(count), "writing logs", count) if count else ():
@@ -142,7 +142,8 @@ class Runner:
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
         """Replay each of the `cases`, which map names to different scenario parameters, as `run` does.
 
-        Files are written to a folder per case; the first case's timeline is that of the experiment.
+        Files are written to a folder per case. The first case's timeline is also the experiment's
+        timeline.
         """
         for number, (name, differing) in enumerate(cases.items()):
             replayed = self.replay(self.obtain(differing))

@@ -115,7 +115,7 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
     """Return the names of the estimators' parameters by label; `estimators` contains the settings.
 
-    Raises BadInput if there is no such estimator.
+    Raises BadInput if an estimator does not exist.
     """
     names: dict[str, set[str]] = {}
     for label, settings in estimators.items():
@@ -128,8 +128,8 @@ def pairs_of(
 ) -> dict[str, Value]:
     """Parse an option's NAME=VALUE texts as a dictionary.
 
-    Raises BadInput with the `expected` form if a text has no name or `read` raises ValueError, and if a
-    name occurs twice.
+    Raises BadInput, which states the `expected` form, if a text has no name or `read` raises ValueError.
+    Also raises BadInput if a name occurs twice.
     """
     found: dict[str, Value] = {}
     for text in texts:

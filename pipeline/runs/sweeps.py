@@ -54,7 +54,7 @@ class Over(NamedTuple):
         taken: values on the grid.
         ends: ends of the range from which samples are drawn; None for a list.
         is_log: whether the range is logarithmic.
-        name: its meaning in a few words, if known.
+        name: the parameter's meaning in a few words, if known.
     """
 
     key: str
@@ -65,7 +65,7 @@ class Over(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Return the label of its axis."""
+        """Return the label of the swept parameter's axis."""
         return label_of(self.key, self.name) if self.name else self.key
 
 
@@ -187,7 +187,7 @@ def run_sweep(
 ) -> Result:
     """Run an experiment at every point, and write a result folder; return result.json.
 
-    The metrics in the result are lists with a number for each point; the table has a row for each.
+    The metrics in the result are lists with a number for each point; the table has a row for each point.
     Raises BadInput if the study of the experiment does more than replay and judge, or if the experiment
     cannot be run.
     """
@@ -263,7 +263,7 @@ def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
 
 
 def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
-    """Describe a parameter of an estimator or scenario in a few words; empty if unknown."""
+    """Describe a parameter of an estimator or scenario in a few words; return "" if it is unknown."""
     for label, words in done.meanings.items():
         name = key.removeprefix(f"{label}.")
         if name in experiment.estimators.get(label, {}):
@@ -276,7 +276,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
-    """Collect every metric as a list by point; NaN if it is missing at a point."""
+    """Collect every metric as a list by point, with NaN for points at which the metric is missing."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
         values = dict(zip(rows["point"], rows["value"], strict=True))

@@ -1,4 +1,4 @@
-"""Trials: an estimator over runs in memory, replayed again with other settings or altered runs."""
+"""An estimator over runs in memory, for repeated replays with other settings or altered runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ class Trial:
         return self.runs[0]
 
     def bind(self) -> list[Bound]:
-        """Bind the estimator to the runs; raises BadInput as `bind`."""
+        """Bind the estimator to the runs; raise BadInput as `bind` does."""
         return bind(self.label, self.runs, self.settings)
 
     def with_settings(self, values: Mapping[str, Any]) -> "Trial":
@@ -52,7 +52,7 @@ class Trial:
         return replace(self, runs=runs, stretched=by_topic if stretched else self.stretched)
 
     def outputs(self) -> dict[str, Ragged]:
-        """Replay the runs: outputs by topic; raises BadInput as `replay`."""
+        """Replay the runs, and return the outputs by topic; raise BadInput as `replay` does."""
         return collect(replay(self.runs, self.bind()))
 
 

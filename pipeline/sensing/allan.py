@@ -1,7 +1,8 @@
 """The overlapping Allan deviation, with intervals from a model's degrees of freedom.
 
-NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms: with M
-second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of (M - |k|) g_k^2.
+NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms. For M
+second differences with autocovariance g, their number is M^2 g_0^2 / sum over |k| < M of (M - |k|)
+g_k^2.
 """
 
 from typing import NamedTuple
@@ -34,7 +35,7 @@ def multiples_of(count: int) -> Integers:
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Compute the step between differences; adjacent differences of long windows are nearly equal."""
+    """Compute the step between used differences; adjacent ones are nearly equal for long windows."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 
@@ -71,7 +72,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
 
 
 def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
-    """Compute the degrees of freedom of an Allan variance of `pairs` differences from noise terms."""
+    """Compute an Allan variance's degrees of freedom from its `pairs` and the noise terms."""
     coarser = _stride(multiple, pairs + 2 * multiple)
     multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
     g = terms.autocovariance(multiple, step_s, pairs)

@@ -1,8 +1,8 @@
 """Noise as settings of other programs, in the units that each program uses.
 
-A filter receives the largest value of three axes, so no noise is stated too small. Continuous densities
-are N in unit/sqrt(Hz) and K in unit/sqrt(s). For a standard deviation per step, N is divided by the root
-of the step.
+A filter receives the largest value of the three axes, so the noise of no axis is understated. Continuous
+densities are N in unit/sqrt(Hz) and K in unit/sqrt(s). For a standard deviation per step, N is divided
+by the square root of the step.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ class Density(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """The exported noise densities by field, and sentences that should be read first."""
+    """The exported noise densities by field, and doubts about them that users should read first."""
 
     topic: str
     fields: Mapping[str, Density]
@@ -50,7 +50,7 @@ def settings(found: Densities) -> str:
 
 
 def kalibr(topic: str, force: Density, rate: Density) -> str:
-    """Format Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the root of the step itself."""
+    """Format Kalibr's imu.yaml: N and K, continuous; Kalibr divides by the square root of the step."""
     return (
         "# continuous: Kalibr makes them discrete with update_rate; no safety factor is applied\n"
         f"rostopic: {topic}\n"
@@ -63,7 +63,7 @@ def kalibr(topic: str, force: Density, rate: Density) -> str:
 
 
 def px4(_: str, force: Density, rate: Density) -> str:
-    """Format PX4's EKF2 parameters: discrete, N and K divided by the root of the filter's step."""
+    """Format PX4's EKF2 parameters: discrete; N and K are divided by the square root of the step."""
     root = _PX4_STEP_S**0.5
     return (
         f"# discrete, for the filter's step of {_PX4_STEP_S:g} s (EKF2_PREDICT_US), over its root\n"
@@ -101,7 +101,7 @@ def robot_localization(_: str, force: Density, rate: Density) -> str:
 def _of_unit(
     write: Callable[[str, Density, Density], str], mark: str = "#"
 ) -> Callable[[Densities], str]:
-    """Write a file of an inertial unit's topic, accelerometer and gyroscope; empty if one is missing."""
+    """Make a writer of an inertial unit's file; it returns "" without accelerometer or gyroscope."""
 
     def written(found: Densities) -> str:
         force, rate = found.fields.get(_FORCE), found.fields.get(_RATE)

@@ -66,7 +66,7 @@ class Fit(NamedTuple):
 
 
 def choose(samples: Samples) -> Fit:
-    """Choose the fit with the best BIC; it has white noise, and the other terms that improve the BIC."""
+    """Choose the fit with the best BIC: white noise, and those other terms that improve the BIC."""
     white = fit(samples, ())
     walk, markov = fit(samples, ("walk",)), fit(samples, ("markov", "markov_time_s"))
     best = max(white, walk, markov, key=lambda each: each.criterion)
@@ -141,7 +141,7 @@ def of_point(free: Sequence[str], point: Floats) -> Terms:
 
     Args:
         free: the names of the p parameters, as fields of `Terms`.
-        point: (p,), their natural logarithms.
+        point: (p,), natural logarithms of the parameters.
 
     Returns:
         The terms; all other parameters have the defaults of `Terms`.
@@ -150,7 +150,7 @@ def of_point(free: Sequence[str], point: Floats) -> Terms:
 
 
 def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fit:
-    """Take Newton steps while they improve the fit; none if a parameter is not determined."""
+    """Take Newton steps while they improve the fit; take none if a parameter is not determined."""
     [best] = cost(point[None])
     reach = np.full(len(point), 0.01)
     bent = np.zeros((len(point), len(point)))
@@ -173,7 +173,7 @@ def _polished(cost: Cost, free: tuple[str, ...], point: Floats, size: int) -> Fi
 def intervals(samples: Samples, found: Fit) -> dict[str, tuple[float, float]]:
     """Compute the 95 % profile-likelihood intervals of a fit's parameters, by name.
 
-    An end that the search does not reach is zero or infinite.
+    An end that the search does not reach is set to zero or infinity.
     """
     point = np.log([getattr(found.terms, each) for each in found.free])
     ends = profile_ends(

@@ -1,4 +1,4 @@
-"""The likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov noise, quantised angle.
+"""Likelihood of a sensor's noise from a Kalman filter: walk, Gauss-Markov noise, quantised angle.
 
 A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, the Gauss-Markov noise g, errors e
 of a quantised angle and white noise v. The start of the walk is exactly diffuse, so the first sample is
@@ -20,7 +20,7 @@ class Samples(NamedTuple):
     """The samples of one column, in the form that the likelihood accepts.
 
     Attributes:
-        values: (n, 1 + regressors) the samples, and regressors that they may depend on.
+        values: (n, 1 + regressors) the samples, and regressors on which the samples may depend.
         steps: (n,) the number of grid steps since the previous sample.
         step_s: the step of the grid.
     """

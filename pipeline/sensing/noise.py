@@ -1,6 +1,6 @@
 """The noise of a sensor at rest, with its terms, intervals, Allan deviation and notes.
 
-Begin here. `noise` processes the columns of a log's topics, `_analysed` a single column.
+Begin here. `noise` processes the columns of a log's topics, and `_analysed` processes a single column.
 """
 
 import math

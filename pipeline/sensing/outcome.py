@@ -99,7 +99,7 @@ class SensorNoise:
 
     @property
     def densities(self) -> Densities:
-        """Return the densities for other programs: N and K of each field, the largest of its axes.
+        """Return the densities for other programs: the largest N and K among each field's axes.
 
         Gauss-Markov noise without a walk is replaced by the walk with the same initial growth: s sqrt(2
         / T). If no axis has a walk, K is the upper limit of the walk, because Kalibr refuses a zero, and
@@ -142,7 +142,7 @@ class SensorNoise:
 
     @property
     def chart(self) -> Chart:
-        """Draw the measured curves with their intervals, and those of the models."""
+        """Draw the measured curves with their intervals, and the curves of the models."""
         panels = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)

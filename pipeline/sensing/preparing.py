@@ -25,7 +25,7 @@ _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """A grid for a topic's stamps: its step, and each message's index on the grid and row (n,)."""
+    """A grid for a topic's stamps: its step, and each message's grid index (n,) and row (n,)."""
 
     step_s: float
     places: Integers
@@ -167,7 +167,8 @@ def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) 
     Args:
         values: (n,), NaN where a sample was lost.
         step_s: the grid's step.
-        regressors: (n, k), which the samples may depend on; by default none.
+        regressors: (n, k), quantities on which the samples may depend; by default there are no
+            regressors.
 
     Returns:
         The samples that were not lost, relative to the first one.

@@ -1,8 +1,8 @@
 """The terms of a sensor's noise in IEEE Std 952-1997, annex C, whose Allan variances add.
 
 The terms are white noise N, random walk K, Gauss-Markov noise with standard deviation s and time T, and
-a quantised angle Q. With the unit u of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q
-in u s.
+a quantised angle Q. If the samples have the unit u, N is in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s,
+and Q in u s.
 """
 
 import math
@@ -33,8 +33,8 @@ class Terms(NamedTuple):
     def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
         """Compute the autocovariance of second differences, at lags 0, 1, ... below `count`.
 
-        The second differences are those of the phases (sums of samples times `step_s`) at a distance of
-        `multiple` samples; their mean square is 2 (`multiple` x `step_s`)^2 times the Allan variance. At
+        The second differences are taken of the phases (sums of samples times `step_s`), at a distance of
+        `multiple` samples. Their mean square is 2 (`multiple` x `step_s`)^2 times the Allan variance. At
         lags beyond twice this distance only the Gauss-Markov term remains; the result ends where this
         term has decayed.
         """

@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """Return the group of a topic; the topics of a scan have the same sign and are dropped together."""
+    """Return a topic's group; the topics of a scan form one group, with one sign and common drops."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -60,7 +60,7 @@ def _groups(source: MemorySource, inputs: Inputs) -> dict[str, list[str]]:
 
 
 def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]:
-    """Draw a share from -1 to 1 for each topic, so that stamps of different topics are never equal."""
+    """Draw a share from -1 to 1 for each topic, so that moved stamps of different groups differ."""
     groups = _groups(source, inputs)
     shares = np.linspace(1.0, -1.0, len(groups))
     drawn = np.random.default_rng(seed).permutation(shares).tolist()
@@ -165,7 +165,7 @@ def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray
 
 
 def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> MemorySource:
-    """Drop messages by one draw per stamp and group, so that a scan is dropped with its detections."""
+    """Drop messages with one draw per stamp and group, so that a scan is dropped with its detections."""
     streams = {}
     for number, topics in enumerate(_groups(source, inputs).values()):
         of_group = [source.streams[topic].publish_time_ns for topic in topics]
@@ -201,7 +201,7 @@ CHANGES: Mapping[str, Change] = {
 
 
 def inputs_of(source: MemorySource, topics: Collection[str], controls: Collection[str]) -> Inputs:
-    """Choose an estimator's topics that may be changed, without the truth and topics without stamps."""
+    """Choose the topics of an estimator that may be changed, except truths and topics without stamps."""
     streams = {topic: source.streams[topic] for topic in topics if topic in source.streams}
     names = {topic: stream.schema.full_name for topic, stream in streams.items() if len(stream)}
     priors = [t for t, name in names.items() if name == schemas.GAUSSIAN_ESTIMATE.full_name]

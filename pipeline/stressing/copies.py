@@ -32,7 +32,7 @@ class How(NamedTuple):
 
     Attributes:
         seed: the seed of random signs and of dropped messages.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: longest gap over which the truth is interpolated.
         order: the clock that orders messages.
         late: how out-of-sequence messages are treated if messages are in order of log time.
     """
@@ -70,7 +70,7 @@ class Replayed:
         }
 
     def failure(self, run: int) -> str:
-        """Describe when and why a run ends early; "" if it is complete."""
+        """Describe when and why a run ends early; return "" if the run is complete."""
         for rows in self.outputs.values():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 own = rows.of_run(run)
@@ -93,12 +93,12 @@ class Replayed:
         return found
 
     def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """Return the metrics of a run that are known, by case and quantity."""
+        """Return the known metrics of a run, by case and quantity."""
         return self._metrics.get(run, {})
 
 
 def replayed(trial: Trial, how: How) -> Replayed:
-    """Replay runs with one estimator; raise BadInput if it can replay no run."""
+    """Replay runs with one estimator; raise BadInput if it cannot replay any run."""
     settings = {trial.label: trial.settings}
     return Replayed(trial, replay_in_memory(trial.runs, settings, order=how.order, late=how.late), how)
 
@@ -141,10 +141,10 @@ def compared(
 
 
 def _reach(found: Sequence[Parting], main: str) -> float:
-    """Return the largest change of an RMSE that is possible at common stamps: the largest distance.
+    """Return the largest distance of estimates, which limits the change of an RMSE at common stamps.
 
-    If a message is lost, the copy has no estimate at its stamp. The RMSEs of run and copy then differ
-    also because they cover different stamps, which must not count as a change.
+    If a message is lost, the copy has no estimate at that message's stamp. The RMSEs of run and copy
+    then also differ because run and copy cover different stamps, which must not count as a change.
     """
     unit = main.rpartition("_")[2]
     if unit not in ("m", "deg", "rad"):
@@ -162,7 +162,7 @@ def _main(quantities: Sequence[str]) -> str:
 
 
 def _parameters(trial: Trial) -> dict[str, Any]:
-    """Return all parameters of an estimator: its own, and those that a single channel contains."""
+    """Return an estimator's own parameters, and those with a single value in the log's channels."""
     bound, stated = trial.bind(), {}
     for name, words in stated_of(bound, trial.source).get(trial.label, {}).items():
         number, _, topics = words.partition(" (")

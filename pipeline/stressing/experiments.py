@@ -31,7 +31,7 @@ class _Part(NamedTuple):
 
     Attributes:
         experiment: the whole experiment.
-        data: the folder from which it imports data.
+        data: the folder from which the experiment imports data.
         first, end: the range of runs; `end` is exclusive.
     """
 
@@ -92,9 +92,9 @@ def claims_under_stress(
 ) -> list[Claim]:
     """Return the claims of a result; a claim is inconclusive if stress may reverse it.
 
-    Claims are decided again, with each metric's interval, or its value, widened on both sides by the
-    largest change under stress. Verdicts on metrics that do not belong to single estimators do not
-    change.
+    Claims are decided again. Each metric's interval, or its value if it has no interval, is widened on
+    both sides by the largest change under stress. Verdicts on metrics that do not belong to single
+    estimators do not change.
     """
     moved = {f"{each.estimator}.{key}": by for each in stress for key, by in each.moved.items()}
     intervals = dict[str, Sequence[float | None]](result.intervals)

@@ -1,4 +1,4 @@
-"""The distance of two replays in sigmas of the first, in metres and degrees, and when it begins.
+"""The distance between two replays, in sigmas of the first and in metres and degrees, and its beginning.
 
 A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
 replay. After a moved start, A never grows if the filter is linear: d' P^-1 d does not increase (Deyst
@@ -23,7 +23,7 @@ AXES = ("x_m", "y_m", "z_m")
 
 
 class Parting(NamedTuple):
-    """The distance of two replays of one estimate.
+    """The distance between two replays of one estimate.
 
     Attributes:
         topic: the topic of the estimate.
@@ -31,7 +31,8 @@ class Parting(NamedTuple):
         amplification: (n,) A.
         metres, degrees: (n,) distances of positions and of angles; NaN if the state has none.
         spread: the largest relative difference of standard deviations; NaN if none is known.
-        explained: (n,) largest A due to chance if the other replay had less data; 0 otherwise.
+        explained: (n,) the largest A that chance explains if the other replay had less data; 0
+            otherwise.
     """
 
     topic: str
@@ -55,7 +56,7 @@ class Parting(NamedTuple):
 
     @property
     def parted(self) -> int | None:
-        """Return the row from which the replays diverge; None if they do not."""
+        """Return the row from which the replays diverge; return None if they do not."""
         there = np.flatnonzero(self.amplification > 0.0)
         if not len(there):
             return None
@@ -147,7 +148,7 @@ class Undetermined(NamedTuple):
     """A direction of the state that the measurements do not determine.
 
     Attributes:
-        components: the names of its components, which have the same unit.
+        components: the names of the direction's components, which have the same unit.
         direction: (n,) the unit vector, with a positive largest entry.
         sigma: the standard deviation along the direction, at the end.
         next_sigma: the largest standard deviation perpendicular to the direction.
@@ -179,7 +180,8 @@ def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermi
     Args:
         stream: Gaussian estimates.
         row: the index of the estimate.
-        least: the smallest ratio of its standard deviation to the largest one in the other directions.
+        least: the smallest ratio of the direction's standard deviation to the largest one in the other
+            directions.
     """
     kinds = stream.metadata["kinds"].split(",")
     names = [name for name, _ in tangent_components(stream.metadata["components"].split(","), kinds)]

@@ -46,15 +46,15 @@ def stress(
 ) -> Stress:
     """Replay under changes that should not matter, and report their effect on the result.
 
-    At most twelve replays are made per run and estimator: one without changes, one for each change, one
-    with half of each of the three changes with the largest effect, and one with a quarter of each of
-    these whose half has neither half of the effect nor all of it.
+    At most twelve replays are made per run and estimator: one without changes, one for each change, and
+    one with half of each of the three changes with the largest effect. If half of a change has neither
+    half of the effect nor all of it, there is one more replay with a quarter of this change.
 
     Args:
         logs: paths, opened logs, or recordings.
         estimators: the estimators, in the form that `replay` accepts.
         seed: the seed of random signs and of dropped messages.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: longest gap over which the truth is interpolated.
         set: parameters of estimators and alterations of topics, in the form that `replay` accepts; the
             alterations are applied first.
 
@@ -87,7 +87,7 @@ def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -
     Args:
         sources: the runs; those with the same topics are replayed together.
         settings: the settings of the estimators, by label.
-        how: how they are replayed.
+        how: how the runs are replayed.
 
     Raises BadInput if an estimator cannot replay a run.
     """
@@ -170,7 +170,7 @@ def _stressed(
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
 
     def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
-        """Try smaller versions of these changes of these runs."""
+        """Try smaller versions of the given changes of the given runs."""
         own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
         if own:
             lesser = again(copies(own, size))
@@ -207,7 +207,7 @@ def _stressed(
 def _bent(
     found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
 ) -> list[tuple[int, str]]:
-    """Choose the changes to quarter: half of the change has less effect, but more than half of it.
+    """Choose the changes to quarter: half of such a change has less effect, but more than half as much.
 
     A nonlinear effect is proportional if the change is small enough. No run is replayed more than twelve
     times.

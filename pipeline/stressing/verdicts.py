@@ -38,7 +38,7 @@ class Tried(NamedTuple):
         name: a key of `CHANGES`.
         parting: the distance of the estimate with the largest change; None if no estimate is Gaussian.
         moved: by (case, metric), the change of a metric from the unchanged replay.
-        beyond: the change of the main metric, in words; "" within the margin.
+        beyond: the change of the main metric, in words; "" if it is within the margin.
         why: the reason why the change was not tried; "" if it was.
         failed: when and why the copy fails although the unchanged replay does not. For a change that was
             not tried, when and why the unchanged replay fails before its first estimate.
@@ -58,7 +58,7 @@ class Tried(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Return the largest A; without covariances the largest distance, in m or degrees."""
+        """Return the largest A or, without covariances, the largest distance in m or degrees."""
         if self.parting is None or self.parting.has_sigmas:
             return self.largest
         return float(np.nanmax([self.parting.metres, self.parting.degrees], initial=0.0))
@@ -76,7 +76,7 @@ class Tried(NamedTuple):
 
     @property
     def is_wider(self) -> bool:
-        """Test whether moved stamps change a covariance by more than is usual for noise per second."""
+        """Test whether moved stamps change a covariance by more than noise per second explains."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -132,9 +132,9 @@ class Stressed:
         return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
-        """Compute the ratio of a change's effect to that of half of it, in A; NaN if it was not halved.
+        """Divide the effect of a change, in A, by the effect of half of it; NaN if it was not halved.
 
-        If the change was also quartered, the ratio of the half's effect to the quarter's is returned.
+        If the change was also quartered, this is the ratio of the half's effect to the quarter's.
         """
         half, quarter = self.halves.get(name), self.quarters.get(name)
         more, less = (half, quarter) if half and quarter else (self.tried[name], half)
@@ -172,7 +172,7 @@ class Stressed:
 
     @property
     def _jumps(self) -> bool:
-        """Test whether stamps moved by a microsecond change a sigma, and half of it as much."""
+        """Test whether moving stamps by 1 us changes a sigma, and moving them by 0.5 us does equally."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -180,7 +180,7 @@ class Stressed:
 
     @property
     def is_redrawn(self) -> bool:
-        """Test whether an ulp of the inputs changes a covariance, so that stamps are not the cause."""
+        """Test whether an ulp of the inputs changes a covariance; if so, stamps are not the cause."""
         ulp = self.tried["ulp"].parting
         return ulp is not None and ulp.spread > PER_PREDICTION
 
@@ -293,7 +293,7 @@ class Stress:
 
     Attributes:
         stressed: one `Stressed` per run and estimator.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: longest gap over which the truth is interpolated.
     """
 
     stressed: Sequence[Stressed]

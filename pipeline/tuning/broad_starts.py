@@ -1,9 +1,9 @@
-"""Replays from broad starts, for comparing likelihoods with other parameters or of altered logs.
+"""Replays from broad starts, to compare likelihoods of different parameters or of altered logs.
 
-Without a prior, a filter begins where the log's first messages put it, with a covariance that depends on
-the parameters. To score the same measurements from the same start, all trials begin at the log's first
-stamp from a broad start that is divided into equally likely parts; the likelihood is the mean over the
-parts.
+Without a prior, a filter begins with a state that follows from the log's first messages, and with a
+covariance that depends on the parameters. To score the same measurements from the same start, all trials
+begin at the log's first stamp from a broad start that is divided into equally likely parts; the
+likelihood is the mean over the parts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -49,12 +49,12 @@ def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
 
 
 def part_count(starts: Starts) -> int:
-    """Count the parts of a start, each of which is replayed."""
+    """Count the parts of a start; each part is replayed."""
     return max(map(len, starts.values()), default=1)
 
 
 def begun_at(bound: Bound, starts: Starts) -> Bound:
-    """Make an estimator for runs that repeat the log for each part, one part after another."""
+    """Make an estimator for runs that repeat the log, once for each part of its starts, in order."""
     parts = starts.get(bound.name)
     return bound if parts is None else with_find(bound, partial(_part_of_runs, parts))
 

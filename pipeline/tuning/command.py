@@ -89,7 +89,7 @@ def tune_logs(
 
 
 def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Refuse or warn about logs that would be used for tuning, but were probably meant to be held out.
+    """Reject or warn about logs for tuning that were probably meant to be held out.
 
     The shell expands `--validate test/*.mcap` to several words, and the option receives only the first.
     """
@@ -122,7 +122,7 @@ def progress_of(best: Best) -> str:
 
 
 def _in_words(logs: Sequence[Path]) -> str:
-    """Describe logs by their number, the first and the last."""
+    """Describe logs by their number, and by the names of the first and the last log."""
     if len(logs) > 1:
         return f"{len(logs)} logs, {logs[0]} to {logs[-1]}"
     return f"1 log, {logs[0]}" if logs else "none"

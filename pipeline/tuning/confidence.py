@@ -26,7 +26,7 @@ class Confidence(NamedTuple):
     """The confidence in those m of k parameters that are not at a bound.
 
     Attributes:
-        places: (m,) the indices of these parameters.
+        places: (m,) the indices of the parameters that are not at a bound.
         curvature: (m, m) the second derivatives of the cost in coordinates.
         covariance: (m, m) the inverse of the curvature; variances are infinite in directions in which
             the cost does not rise.
@@ -54,8 +54,8 @@ class SearchOutcome(NamedTuple):
     Attributes:
         coordinates: the coordinates that were searched.
         optimum: (k,) the parameter values with the least cost.
-        confidence: the confidence in these values; None if the search was not by maximum likelihood, was
-            stopped, or ended with all parameters at bounds.
+        confidence: the confidence in the parameter values; None if the search was not by maximum
+            likelihood, was stopped, or ended with all parameters at bounds.
         evaluations: the number of points tried.
         has_converged, was_stopped: how the search ended.
         is_spike: whether a search from a second start does not find this minimum.
@@ -63,7 +63,7 @@ class SearchOutcome(NamedTuple):
         begins_alike: whether filters begin at the same stamps at the optimum as in the search.
         held: calibration parameters that the motion does not determine, and that keep their start
             values.
-        lacks: sentences on these parameters, and on other values that depend on them.
+        lacks: sentences on the undetermined parameters, and on other values that depend on them.
     """
 
     coordinates: Coordinates
@@ -100,10 +100,10 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
 def with_noise(curvature: Floats, noise: Floats) -> Floats:
     """Reduce a curvature so that its inverse is the covariance of the parameters.
 
-    If slopes vary more than the curvature implies, the covariance of the estimates is that of the slopes
-    multiplied by the inverse curvature from both sides: White, Maximum likelihood estimation of
-    misspecified models, Econometrica 50, 1982. The curvature already contains noise that affects slopes
-    linearly, so the larger of the two is used in each direction.
+    If slopes vary more than the curvature implies, the covariance of the estimates is the slopes'
+    covariance, multiplied by the inverse curvature from both sides: White, Maximum likelihood estimation
+    of misspecified models, Econometrica 50, 1982. The curvature already contains noise that affects
+    slopes linearly, so in each direction the larger of the curvature and the noise is used.
 
     Args:
         curvature: (m, m), the second derivatives of the cost.
@@ -208,7 +208,7 @@ class Profile(NamedTuple):
         name: the name of the parameter.
         along: (n,) its values.
         rise: (n,) the cost relative to the minimum; infinite if it cannot be computed.
-        parabola: (n,) the same, computed from the curvature only.
+        parabola: (n,) the relative cost, computed from the curvature only.
     """
 
     name: str

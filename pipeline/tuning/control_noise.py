@@ -1,12 +1,12 @@
 """Noise that is added to a motion's controls, to measure how noise affects the likelihood.
 
 A measured control has noise (errors in variables). If a parameter shifts the stamps by part of a step,
-the noise is averaged over two messages; a scale factor below one attenuates it. Both increase the
-log-likelihood even if the log has no fault. Added noise of the same size reduces the log-likelihood as
-much as the existing noise, and less if it is averaged or attenuated. The corrected log-likelihood is
-therefore L(u) - c, where c is the mean of L(u + n) and L(u - n) minus L(u); the noise then affects all
-alternatives equally. Nakamura, Corrected score function for errors-in-variables models, Biometrika 77,
-1990; Cook and Stefanski, Simulation-extrapolation estimation, JASA 89, 1994.
+the noise is averaged over two messages; a scale factor below one attenuates it. Both effects increase
+the log-likelihood even if the log has no fault. Added noise of the same size reduces the log-likelihood
+as much as the existing noise does, and less if the added noise is averaged or attenuated. The corrected
+log-likelihood is therefore L(u) - c, where c is the mean of L(u + n) and L(u - n) minus L(u); the noise
+then affects all alternatives equally. Nakamura, Corrected score function for errors-in-variables models,
+Biometrika 77, 1990; Cook and Stefanski, Simulation-extrapolation estimation, JASA 89, 1994.
 
 An error of the mean over a few copies shifts the estimates of all logs of the same length in the same
 way. The signs of the noise are therefore those of a Hadamard matrix. Over all copies, the products of

@@ -1,4 +1,4 @@
-"""A study of tuning with unknown noise, in which the values are judged on other vehicles.
+"""A study of tuning with unknown noise; the tuned values are judged on vehicles not used for tuning.
 
 The experiment's only estimator is tuned by likelihood on some of the log's vehicles, starting from its
 settings or from values in the log. Held-out vehicles are replayed with the start values and the tuned

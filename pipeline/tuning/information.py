@@ -1,10 +1,10 @@
-"""Information on a calibration in the motion of logs, computed before any search.
+"""Information on a calibration that the motion in logs contains, computed before any search.
 
 With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives of v with respect to the parameters. In useful units, a direction with an eigenvalue
 below one is not determined. A pseudo-inverse is not used, because it would assign a small standard error
 to such a direction. Yang et al., arXiv 2201.09170, list such directions by kind of motion; Censi et al.,
-IEEE T-RO 2013, for wheels.
+IEEE T-RO 2013, list those for wheels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -116,7 +116,7 @@ def conditions(
 ) -> Iterator[str]:
     """Yield a sentence for each parameter whose interval is valid only if a fixed parameter is right.
 
-    Fixed parameters may be wrong as far as the logs allow, at most by `FURTHEST` useful units.
+    Fixed parameters may be wrong by as much as the logs allow, but at most by `FURTHEST` useful units.
 
     Args:
         scaled: (m, m), the information in useful units.
@@ -151,7 +151,7 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """Compute differences of innovations (n m,), ahead minus behind, whitened with the covariances here.
+    """Compute differences of innovations (n m,), ahead minus behind, whitened as innovations in `here`.
 
     A delay changes the order of messages between topics, but never within one.
     """

@@ -67,7 +67,7 @@ class Run(NamedTuple):
 
 
 def log_in_memory(source: LogSource | MemorySource, bound: Iterable[Bound]) -> Ensemble[MemorySource]:
-    """Read into memory the topics that estimators read, and the log's truths: an ensemble of one."""
+    """Read the topics that estimators read, and the log's truths, into an ensemble of one run."""
     topics = {topic for each in bound for topic in (*each.static, *each.streams)}
     truths = topics_of(source.topics, schemas.TRUTH_STATE)
     topics |= {name for name in truths if not name.startswith("/estimates/")}
@@ -75,7 +75,7 @@ def log_in_memory(source: LogSource | MemorySource, bound: Iterable[Bound]) -> E
 
 
 def for_likelihood(settings: Mapping[str, Any]) -> str:
-    """Describe how a user's own estimator can return innovations with a likelihood; "" for others."""
+    """Describe how a user's own estimator can return a likelihood; "" for other estimators."""
     kind = settings.get("kind")
     if isinstance(kind, Estimator):
         return (
@@ -159,8 +159,8 @@ class Criterion(NamedTuple):
     Attributes:
         sums: function that computes the sums over one log's outputs.
         cost: function that computes the cost from the sums; a run without values contributes nothing.
-        is_smooth: whether the criterion uses innovations. The gate is then open, because a gate could
-            change which innovations are used.
+        is_smooth: whether the criterion uses innovations. If the criterion uses innovations, the gate is
+            open, because a gate could change which innovations are used.
         lacks: description of what is missing in a log without such sums.
     """
 
@@ -199,7 +199,7 @@ class Objective:
         names: the names of the parameters that are searched for.
         runs: the logs, with one estimator.
         by: the criterion.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: longest gap over which the truth is interpolated.
         on_best: function that is called with the best point after every batch.
         pool: the workers that replay; None means threads of this process.
         best: the best of all points so far.
@@ -261,11 +261,11 @@ class Objective:
         return replace(self, runs=(), on_best=silent, pool=None)
 
     def begin(self, start: Floats) -> None:
-        """Record every log's number of messages and the filters' initial states at the start (k,).
+        """Record every log's message count, and the filters' initial states with start values (k,).
 
-        Both stay fixed, because likelihoods of different measurements cannot be compared. Raises
-        BadInput if a run fails, if a log lacks the quantity that is minimised, or if the estimator
-        cannot be sent to other processes.
+        The counts and the initial states stay fixed, because likelihoods of different measurements
+        cannot be compared. Raises BadInput if a run fails, if a log lacks the quantity that is
+        minimised, or if the estimator cannot be sent to other processes.
         """
         if self.pool is not None:
             try:
@@ -307,7 +307,7 @@ class Objective:
     def begin_after(self, start: Floats, reaches_s: Mapping[str, float]) -> None:
         """Begin without the messages that delays of up to `reaches_s` move to before the start.
 
-        With such delays, these messages have no innovation, so likelihoods could not be compared.
+        The messages that such delays move have no innovation, so likelihoods could not be compared.
         """
         runs = []
         for run in self.runs:
@@ -332,9 +332,9 @@ class Objective:
     def correct(self, values: Floats) -> None:
         """Correct the cost for the noise of the controls; see `fuselog.pipeline.tuning.control_noise`.
 
-        If the sizes of this noise are themselves searched for, the correction uses their values in
-        `values` (k,). Otherwise, the correction would remove the noise from the likelihood by which it
-        is estimated.
+        If the search also covers the sizes of this noise, the correction uses the sizes in `values`
+        (k,). If the correction varied with these sizes, it would remove the noise from the likelihood
+        from which the sizes are estimated.
         """
         noises: set[str] = set()
         for run in self.runs:
@@ -423,7 +423,7 @@ class Objective:
         return run.trial.with_settings(dict(zip(self.names, values.tolist(), strict=True))).bind()
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
-        """Replay a log with values (k,): outputs by topic. Raise BadInput as `replay` does."""
+        """Replay a log with values (k,); return outputs by topic. Raise BadInput as `replay` does."""
         bound = [
             with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
@@ -461,7 +461,7 @@ class Objective:
         ]
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
-        """Sum over all parts; None if all fail or their number of messages changes."""
+        """Sum over all parts; return None if all parts fail or their number of messages changes."""
         is_used = [not _failures(outputs) and self._count(outputs) == count for outputs in parts]
         if not any(is_used):
             return None

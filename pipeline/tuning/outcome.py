@@ -45,10 +45,11 @@ class Tuning:
         objective: the cost that was minimised.
         found: the outcome of the search.
         costs: (2,) costs of the logs with the start and the tuned values. If the likelihood was
-            optimised, they are minus the log-likelihoods, corrected for the noise of the controls if a
-            note says so.
-        held_out_costs: (2,) the same for the held-out logs, if any.
-        folds: a row per fold: the values found on all other logs, and the costs of its own logs.
+            optimised, each cost is minus the log-likelihood, corrected for the noise of the controls if
+            a note says so.
+        held_out_costs: (2,) costs of the held-out logs with the start and the tuned values, if there are
+            such logs.
+        folds: a row per fold: the values found on all other logs, and the costs of the fold's own logs.
         gate: the probability of the gate that was open in the search.
         advice: sentences on what to record next.
         files: texts that are written next to the settings, by file name.
@@ -165,7 +166,7 @@ class Tuning:
 
     @cached_property
     def held_out(self) -> Replay | None:
-        """Return the same replay of the held-out logs; None without such logs."""
+        """Return the replay of the held-out logs with both sets of values, or None without such logs."""
         if not self.held_out_logs:
             return None
         named = {f"{label}-held-out": values for label, values in self.settings.items()}
@@ -312,7 +313,7 @@ class Tuning:
 
     @property
     def _scale(self) -> str:
-        """Describe how the held-out logs' log-likelihood differs in scale from the tables."""
+        """Describe how the held-out logs' log-likelihood differs in scale from that in the tables."""
         count = len(self.held_out_logs)
         total = "of 1 log" if count == 1 else f"the sum over {count} logs"
         is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")

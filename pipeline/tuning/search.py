@@ -1,7 +1,7 @@
 """Search for the parameters with the lowest cost.
 
-Positive parameters, such as standard deviations, are searched as logarithms. Every other parameter has
-its own unit.
+Positive parameters, such as standard deviations, are searched as logarithms. Every other parameter is
+searched in a unit of its own.
 """
 
 from collections.abc import Callable, Sequence
@@ -112,7 +112,7 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
-    """Compute `UNIT` standard errors of a parameter from the curvature at a value, and three costs."""
+    """Return `UNIT` standard errors from the cost's curvature at a value, and the three costs used."""
     step = 1e-3 * max(abs(value), 1.0)
     for _ in range(LOOKS):  # the cost is not a parabola here, so a smaller or larger step is used
         costs = near([-step, 0.0, step])
@@ -123,7 +123,7 @@ def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[floa
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
-    """Return the start (k,) in coordinates, or the point of a grid between the bounds if it costs less.
+    """Return the start (k,) in coordinates, or a point of a grid between the bounds with lower cost.
 
     Raises BadInput if a bound is infinite or the grid has too many points.
     """

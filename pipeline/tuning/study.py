@@ -2,7 +2,8 @@
 
 Every run is tuned separately, for several durations, from the settings of the experiment's only
 estimator. The tuning does not know the true values. The study measures how often 95 % intervals cover
-the truth, the errors of the values, and how often the notes report that the logs determine too little.
+the truth, how large the errors of the values are, and how often the notes report that the logs determine
+too little.
 """
 
 from collections.abc import Mapping
@@ -66,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _rows(
     source: MemorySource, label: str, settings: Mapping[str, Any], true: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Tune on a log; return per parameter true and tuned value, interval, standard error, doubt."""
+    """Tune on a log; return a row per parameter: true and tuned value, interval, error, doubt."""
     found = tune(source, {label: settings}, list(true))
     tables, errors = found.parameters.to_dict("records"), found.standard_errors
     return [

@@ -93,16 +93,17 @@ def tune(
         logs: one or several logs with the same topics: paths, opened logs or recordings.
         estimator: a registered name, or a label of your own mapped to an estimator; see `replay`.
         free: the full names of the parameters to search for.
-        by: the criterion. "likelihood" is that of the measurements and needs no truth; "nis" brings the
-            mean squares of normalised innovations to one, "nees" those of normalised errors; "rmse"
-            minimises the RMSE. Default: "likelihood", or "rmse" if the estimator has no innovations.
-        set: values of other parameters, and start values; the default is the values in the log's
-            channels. It can also alter topics; see `replay`.
+        by: the criterion. "likelihood" maximises the likelihood of the measurements and needs no truth;
+            "nis" brings the mean squares of normalised innovations to one; "nees" does so for normalised
+            errors; "rmse" minimises the RMSE. Default: "likelihood", or "rmse" if the estimator has no
+            innovations.
+        set: values of other parameters, and start values of the free ones; by default those in the log's
+            channels. Settings can also alter topics; see `replay`.
         bounds: the interval of each parameter. If both bounds are positive, the parameter is positive.
         grid: number of values per parameter between its bounds; the search starts from the best point.
         validate: held-out logs on which the values are judged.
         folds: number of folds for cross-validation: each fold is judged with the values from all others.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: longest gap over which the truth is interpolated.
         workers: processes that share points and logs, as for `run`; by default threads of this process.
         scheduler: as for `run`.
         executor: as for `run`.
@@ -317,9 +318,9 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
 
 
 def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
-    """Return the largest values of calibration parameters whose increase loses measurements.
+    """Return the largest searched values of calibration parameters whose increase loses measurements.
 
-    This happens if a delay moves a message to before the start of the filter.
+    An increase loses measurements if a delay moves a message to before the start of the filter.
     """
     places = [place for place, each in enumerate(free) if each.useful and not each.is_fixed]
     if not places:
@@ -335,9 +336,9 @@ def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) ->
 def _is_moved_by_noise(objective: Objective, found: SearchOutcome) -> bool:
     """Correct the cost for the noise of the controls if this noise may move the minimum.
 
-    This is the case if, a few standard errors of a parameter away from the minimum, the noise changes
-    the cost by at least MOVED and by at least half of the cost's rise. One standard error is too close:
-    the noise matters most if stamps are shifted by half a step, and about equally on both sides.
+    This is the case if the noise changes the cost by at least MOVED, and by at least half of the cost's
+    rise, at a few standard errors of a parameter from the minimum. One standard error is too close: the
+    noise matters most if stamps are shifted by half a step, and about equally on both sides.
     """
     if found.confidence is None:
         return False
@@ -367,9 +368,9 @@ def _settled(objective: Objective, free: Sequence[Parameter], grid: int) -> Sear
     """Search until filters begin at the same stamps with the found values as in the search.
 
     Without a prior in the log, the stamp at which a filter begins depends on the values, for example on
-    how much the filter trusts its own path between the first fixes. This stamp is fixed during a search,
-    because likelihoods of different measurements cannot be compared. In the next search, it is
-    determined by the values that the previous search found.
+    how much the filter trusts its own path between the first fixes. The stamp at which a filter begins
+    is fixed during a search, because likelihoods of different measurements cannot be compared. In the
+    next search, this stamp is determined by the values that the previous search found.
     """
     start = np.array([each.default for each in free])
     free, open_ = _held(objective, free, start)
@@ -393,8 +394,8 @@ def _held(
 ) -> tuple[list[Parameter], dict[str, Any]]:
     """Fix calibration parameters at their start if the motion does not determine them at values (k,).
 
-    Innovations are large far from the best values, so this is tested again near them. Parameters
-    that were fixed before stay fixed.
+    Innovations are large far from the best values, so the test is repeated near the best values.
+    Parameters that were fixed before stay fixed.
     """
     places = [place for place, each in enumerate(free) if each.useful]
     if objective.by != "likelihood" or not places:
@@ -486,7 +487,7 @@ def _noisy_steps(
 ) -> Floats:
     """Choose the difference steps (m,) for a cost that the noise of the controls makes jagged.
 
-    The cost jumps, randomly up or down, where shifted stamps coincide with those of a control.
+    The cost jumps, randomly up or down, where shifted stamps coincide with the stamps of a control.
     Differences for calibration parameters are therefore as wide as the useful error, but at most
     NOISY_REACH standard errors.
     """
@@ -528,8 +529,8 @@ def _levelled(
 ) -> Floats:
     """Move a point towards one at which the costs one step (m,) ahead and behind are equal.
 
-    The mean of the cost over these steps has its minimum there; jumps of the cost do not attract this
-    minimum.
+    The mean of the cost over these steps has its minimum at such a point; jumps of the cost do not
+    attract this minimum.
     """
     low, high = coordinates.bounds
     rows = list(places)

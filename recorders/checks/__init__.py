@@ -1,4 +1,4 @@
-"""Checks of a log without a filter: units, stamps, frames, covariances, columns, motion.
+"""Checks of a log that need no filter: units, stamps, frames, covariances, columns, motion.
 
 Begin with `lint`, which has the checks in a table: each check is a function. `finding` defines the
 result of a check, `body` collects the topics of one body, and `motion` compares them in pairs. Checks

@@ -57,8 +57,8 @@ class Series:
 class PlaceSeries(Series):
     """Positions (n, 2) east and north, or along x and y, with their stated variances (n,).
 
-    If `is_flat`, the positions were logged in metres, so they may have a scale error; otherwise they
-    were logged as latitudes and longitudes.
+    If `is_flat`, the positions were logged in metres and may have a scale error; otherwise as latitudes
+    and longitudes.
     """
 
     variances_m2: Floats = field(default_factory=lambda: np.empty(0))
@@ -174,7 +174,7 @@ _TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
 def _fixes(
     places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True
 ) -> PlaceSeries:
-    """Return positions with the mean of their two stated horizontal variances, NaN without these."""
+    """Return positions with the mean of their two stated horizontal variances, NaN if not stated."""
     column = stream.columns.get("covariance_m2")
     variances = np.full(len(places.times_s), np.nan)
     if column is not None and len(places.times_s) == len(rows) and column.shape[1]:

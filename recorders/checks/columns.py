@@ -139,7 +139,7 @@ def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _apart(steps: Floats, half_turn: float) -> Floats:
-    """Return the sizes of steps; for angles, in the shorter direction."""
+    """Return the sizes of steps; the sizes of steps in an angle are those in the shorter direction."""
     sizes = np.abs(steps)
     return sizes if half_turn == np.inf else np.minimum(sizes, 2 * half_turn - sizes)
 
@@ -250,7 +250,7 @@ def _is_clipped(
 
 
 def resolution(values: Floats) -> float:
-    """Determine the spacing of the grid on which all values are; zero if there is none."""
+    """Determine the spacing of the grid on which all values are; return zero without such a grid."""
     levels = np.unique(values)
     if len(levels) < LEVELS or len(levels) > len(values) / 2:
         return 0.0
@@ -266,7 +266,7 @@ def resolution(values: Floats) -> float:
 
 
 def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of each component of a measured (or only of a regular) topic."""
+    """Yield field, name and values (n,) of each component of a measured, or only a regular, topic."""
     if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:

@@ -57,7 +57,7 @@ def _faults(
     """Yield each fault with the rows (n,) that have it, the most obvious first.
 
     With `is_partial`, zero may mean that a component does not exist or is known exactly. With
-    `is_exact`, it may mean this for all components.
+    `is_exact`, zero may mean this for all components.
     """
     width = values.shape[1]
     size = isqrt(width)

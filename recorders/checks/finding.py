@@ -80,10 +80,10 @@ class Finding:
             replay the ratio of a statistic to its bound for a consistent filter.
         evidence: what was found, in a sentence.
         setting: value for `--set` that corrects the fault in a replay, such as `/fix.delay_s=0.3`; empty
-            if there is none.
+            if no setting corrects it.
         otherwise: another correction, such as a line of the import's mapping.
-        severity: whether it is a fact, likely, or only a hint.
-        time_ns: when it began, if known.
+        severity: whether the finding is a fact, likely, or only a hint.
+        time_ns: when the fault began, if known.
     """
 
     kind: Kind
@@ -98,7 +98,7 @@ class Finding:
 
     @property
     def fix(self) -> str:
-        """Describe the correction; empty if none is known."""
+        """Describe the correction; return "" if no correction is known."""
         return " or ".join(filter(None, (self.setting and f"--set {self.setting}", self.otherwise)))
 
     @property

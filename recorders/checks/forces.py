@@ -27,7 +27,7 @@ UPRIGHT = {
 
 
 def unmeasured(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find sensors whose forces, turn rates or fields are zero throughout, so were not measured."""
+    """Find sensors whose forces, turn rates or fields are always zero, and thus were not measured."""
     if stream.schema.full_name not in UNITS or len(stream) < FEWEST:
         return
     for field, what in MEASURED.items():

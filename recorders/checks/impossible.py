@@ -48,7 +48,7 @@ def integers(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find stamps that are years away from those of most messages, which are in `span_ns`."""
+    """Find stamps that are years away from `span_ns`, the span of most messages."""
     if span_ns is None or stream.schema.full_name in TIMELESS:
         return
     stamps_ns = stream.publish_time_ns
@@ -71,7 +71,7 @@ def years(span_ns: tuple[int, int] | None, stream: Stream, _: Mapping[str, Strea
 
 
 def apart(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a topic whose stamps end before those of all others begin, or begin after they end."""
+    """Find a topic whose stamps end before all other topics begin, or begin after all others end."""
     others = [each for each in streams.values() if each is not stream and len(each) >= FEWEST]
     if len(stream) < FEWEST or not others:
         return

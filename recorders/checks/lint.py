@@ -104,8 +104,8 @@ def lint(
 
     Args:
         blocks: streams by topic; estimates are ignored.
-        span_ns: span of most messages of the log, if others are years away, see `main_span_of`; by
-            default that of each portion.
+        span_ns: span of most messages of the log if other messages are years away (see `main_span_of`);
+            by default the span of each portion.
         portions: number of portions to check; by default all.
 
     Returns:

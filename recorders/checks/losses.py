@@ -187,7 +187,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """Estimate the seconds on the recorder's clock per second of a topic's stamps; None if uncertain."""
+    """Estimate the recorder's seconds per second of a topic's stamps; return None if uncertain."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

@@ -89,7 +89,7 @@ class Ellipse(NamedTuple):
 
 
 def ellipse(field: Floats) -> Ellipse | None:
-    """Fit the ellipse of a full turn about one axis, by least squares; None without a full turn."""
+    """Fit the ellipse of a full turn about one axis by least squares; return None without a turn."""
     mean = field.mean(axis=0)
     spreads, axes = np.linalg.eigh(np.cov((field - mean).T))
     if spreads[1] <= 0.0 or spreads[0] > FLAT * spreads[1]:

@@ -82,7 +82,8 @@ def slope(x: Floats, y: Floats) -> Slope:
 def usual_slope(x: Floats, y: Floats) -> float:
     """Compute the slope of y on x through zero by least absolute deviations.
 
-    It is the median of y / x with the weights |x| (Laplace), so that a few outliers do not determine it.
+    The usual slope is the median of y / x with the weights |x| (Laplace), so that a few outliers do not
+    determine it.
 
     Args:
         x: (k,), finite.
@@ -191,7 +192,7 @@ class BodyMotion:
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
     def goes_where_it_points(self, lag: Lag) -> bool:
-        """Test, by forces in the body's axes, whether the body moves in the direction of its heading."""
+        """Test from forces in the body's axes whether the body moves in the direction of its heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
                 found = self.forces(force.moved(-lag.timing.lag_s))
@@ -200,7 +201,7 @@ class BodyMotion:
 
     @cached_property
     def gains(self) -> dict[str, float]:
-        """Return the gain in s/s of topics' clocks relative to that of the positions."""
+        """Return the gain in s/s of each topic's clock relative to the clock of the positions."""
         return {each.source: each.timing.gain for each in self.speed_lags if each.timing.gain}
 
     def aligned(self, source: Series) -> Series:
@@ -292,7 +293,7 @@ class BodyMotion:
         return wrap_angle(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
-        """Compute how horizontal forces fit changes of the velocity; None if this is impossible."""
+        """Compute how horizontal forces fit velocity changes; return None if this is impossible."""
         if not self.body.velocities or self.courses is None:
             return None
         velocity = self.body.velocities[0]
@@ -353,7 +354,7 @@ def _hold_s(source: Series) -> float:
 
 
 def _sure_lag_s(lag: Timing) -> float:
-    """Return the lag if it is certain, else zero; a clock that gains has no lag."""
+    """Return the lag if it is certain and not negligible, and the clock has no gain; else zero."""
     is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
     is_sure = lag.is_alone and lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
     return lag.lag_s if is_lag and is_sure else 0.0

@@ -50,7 +50,7 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find a topic alone in its namespace that duplicates another one, so a replay may ignore it."""
+    """Find a topic alone in its namespace that duplicates another, so that a replay may ignore it."""
     sensed = [each for each in streams.values() if each.schema.full_name in REGULARS]
     alike = [each for each in sensed if each.schema.full_name == stream.schema.full_name]
     if stream.schema.full_name not in REGULARS or len(alike) != 2:

@@ -76,7 +76,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find swapped latitudes and longitudes, by the distance according to the wheels."""
+    """Find swapped latitudes and longitudes, by comparison with the distance that the wheels measure."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     if np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]])) > 90.0:
@@ -129,7 +129,7 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes and longitudes in another unit, by the distance according to the wheels."""
+    """Find latitudes and longitudes in another unit, by comparison with the distance from the wheels."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
     as_is = _wheels(streams, stream)

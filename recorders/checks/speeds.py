@@ -1,4 +1,4 @@
-"""Checks of the timing of topics, and of the distances that they imply."""
+"""Checks of the timing of topics, and of the distances that the topics imply."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -84,7 +84,7 @@ def delays(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def clocks(motion: BodyMotion) -> Iterator[Finding]:
-    """Find clocks that run faster or slower than others, as the lag between two speeds then grows."""
+    """Find clocks that run faster or slower than others, from the growing lag between two speeds."""
     for topic, gain in motion.gains.items():
         against = next(each.against for each in motion.speed_lags if each.source == topic)
         yield Finding(
@@ -134,7 +134,7 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rest(motion: BodyMotion) -> Iterator[Finding]:
-    """Find variances of fixes that contradict their scatter at rest, if their errors are white."""
+    """Find stated variances that contradict the scatter of fixes at rest, if errors are white."""
     moving = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         source = next((each for each in moving if each.topic != fixes.topic), None)
@@ -196,7 +196,7 @@ def _filled(values: Floats) -> Floats:
 
 
 def chance(degrees: int, sigmas: float) -> float:
-    """Compute a quantile of chi-square over its degrees of freedom, from that of a Gaussian.
+    """Compute a quantile of chi-square, divided by its degrees of freedom, from a Gaussian's quantile.
 
     Wilson and Hilferty, PNAS 17, 1931: accurate to 2 % for at least 18 degrees of freedom.
     """

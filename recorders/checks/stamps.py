@@ -194,7 +194,7 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:
-    """Return the `thing_id` (n,) of every message, if another topic states it row by row; else zeros."""
+    """Return every message's `thing_id` (n,) if another topic states it row by row, or else zeros."""
     for each in streams.values():
         is_named = each.schema.full_name == schemas.IDENTITY.full_name
         if is_named and np.array_equal(each.publish_time_ns, stream.publish_time_ns):
@@ -217,7 +217,7 @@ def _ahead_s(stream: Stream) -> float:
 
 
 def _named_offset(offset_s: float, unix_s: float) -> str:
-    """Describe the known cause of a clock's offset in s at a Unix time; empty if there is none."""
+    """Describe the known cause of a clock's offset in s at a Unix time; return "" if it is unknown."""
     gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
     for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
         if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:

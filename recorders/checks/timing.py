@@ -23,17 +23,17 @@ VARIES = 1e-6  # relative variation that a motion needs to determine a time
 
 
 class Timing(NamedTuple):
-    """The lag and gain at which a source fits the motion in windows best, and how certain they are.
+    """The lag and gain at which a source fits the motion in windows best, with their uncertainty.
 
     Attributes:
         lag_s: how much later the windows are than the source.
         gain: gain of the source's clock, in s/s.
         likeness: correlation at this lag and gain, -1 to 1.
-        evidence: log-likelihood minus that without lag and gain.
+        evidence: log-likelihood with lag and gain, minus the log-likelihood without them.
         is_needed: whether the lag still fits clearly better if a share `MISFIT` of the motion always
             counts as unexplained.
         tolerance_s: lags up to this size are ignored.
-        spread_s: largest difference of equally likely lags, plus the tolerance.
+        spread_s: largest difference between equally likely lags, plus the tolerance.
         is_alone: whether only neighbouring lags explain the motion equally well, and no lag that is a
             period of the motion away.
     """
@@ -49,7 +49,7 @@ class Timing(NamedTuple):
 
 
 def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
-    """Find the lag and gain with the largest correlation; None if there are too few windows."""
+    """Find the lag and gain with the largest correlation; return None if there are too few windows."""
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
     count = _independent(windows)
@@ -121,7 +121,7 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
 
 
 def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
-    """Correlate at each lag; NaN if less than half of the windows are within the source's span."""
+    """Correlate at each lag; use NaN if less than half of the windows are within the source's span."""
     begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
     moves = account(source, begin_s, end_s)
     is_in = np.isfinite(moves)
@@ -139,8 +139,8 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
 def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
     """Estimate the number of independent windows.
 
-    Only windows that do not overlap are counted. They count less if residuals persist from one window to
-    the next, as those due to a lever arm do; the reduction follows from a first-order autoregression.
+    Only windows that do not overlap are counted. Windows count less if residuals persist from one window
+    to the next, as those due to a lever arm do; the reduction follows from a first-order autoregression.
     """
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)

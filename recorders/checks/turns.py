@@ -34,7 +34,7 @@ LARGEST_SHARE = 0.9
 
 
 def signs(motion: BodyMotion) -> Iterator[Finding]:
-    """Find turn rates, courses or headings that turn in the opposite direction to the others."""
+    """Find turn rates, courses or headings that turn opposite to all other topics."""
     orientations = motion.body.orientations
     orientation = orientations[0] if orientations else None
     beside = motion.heading_course(orientation) if orientation else None
@@ -57,7 +57,7 @@ def signs(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def _by_forces(motion: BodyMotion, source: Series) -> int:
-    """Test by forces whether a frame is mirrored (1) or correct, so that the rate is wrong (-1)."""
+    """Test by forces whether a frame is mirrored (1) or the rate is wrong (-1); 0 if undecided."""
     for force in motion.body.forces:
         if force.topic == source.topic:
             found = motion.forces(motion.aligned(force))
@@ -67,7 +67,7 @@ def _by_forces(motion: BodyMotion, source: Series) -> int:
 
 
 def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else the rate."""
+    """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else the sign."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
@@ -115,7 +115,7 @@ def _compass(orientation: Series, others: str) -> Finding:
 
 
 def degrees(motion: BodyMotion) -> Iterator[Finding]:
-    """Find turn rates in deg/s, or converted from it by mistake, by the course or by their size."""
+    """Find turn rates in deg/s, or converted from deg/s by mistake, from the course or their size."""
     for source in motion.body.turns:
         ratio = motion.turn(source)
         rates = np.abs(
@@ -198,7 +198,7 @@ def mounting(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def gravity(motion: BodyMotion) -> Iterator[Finding]:
-    """Find forces in g, or with z down, by the quietest second."""
+    """Find forces in g, or with z down, from the mean force in the quietest second."""
     for force in motion.body.forces:
         mean = quietest(force)
         if mean is None:
@@ -258,7 +258,7 @@ def _is_z_down(force: Series) -> bool:
 
 
 def quietest(force: Series) -> Floats | None:
-    """Average forces (3,) in the second in which they vary least; None if no second is complete."""
+    """Average forces (3,) in the second in which they vary least; return None without a full second."""
     second = np.floor(force.times_s - force.times_s[0]).astype(int)
     edges = np.flatnonzero(np.diff(second, prepend=-1, append=second[-1] + 1))
     parts = [force.values[begin:end] for begin, end in pairwise(edges) if end - begin >= 10]
@@ -276,7 +276,7 @@ ORDERS = {
 
 
 def quaternions(motion: BodyMotion) -> Iterator[Finding]:
-    """Find quaternions that are not of unit length, or in another order, by turn rates."""
+    """Find quaternions that are not of unit length or, compared with turn rates, in another order."""
     for orientation in (*motion.body.orientations, *motion.body.references):
         norm = np.linalg.norm(orientation.values, axis=1)
         off = float(np.median(np.abs(norm - 1.0)))
@@ -317,7 +317,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
-    """Compute rms differences (rad/s) of quaternions from rates, by component order; empty at rest."""
+    """Compare quaternions with turn rates: return rms differences (rad/s) by order, or {} at rest."""
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]

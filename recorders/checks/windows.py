@@ -44,14 +44,14 @@ def thinned(count: int, most: int) -> slice:
 def noise_of(places: Floats) -> float:
     """Estimate the standard deviation of white noise of samples (n, 2) from second differences.
 
-    Acceleration adds to the differences, so the estimate is rather too large than too small.
+    Acceleration adds to the differences, so the estimate is too large rather than too small.
     """
     bend = places[1:-1] - 0.5 * (places[:-2] + places[2:])
     return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(1.5)) if len(bend) else np.nan
 
 
 def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find pairs of stamps that are a span apart, or one step if the steps are longer.
+    """Find pairs of stamps that are a span apart, or one step apart if the steps are longer.
 
     Args:
         times_s: (n,), ascending.
@@ -135,7 +135,7 @@ def _moves(fixes: PlaceSeries) -> bool:
 
 
 def places_of(body: Body) -> Series | None:
-    """Return the body's positions: fixes, or integrated velocities; None if it is at rest."""
+    """Return the body's positions: fixes, or integrated velocities; return None if it is at rest."""
     if body.fixes:
         return body.fixes[0] if _moves(body.fixes[0]) else None
     if body.velocities and body.speeds:
@@ -145,7 +145,7 @@ def places_of(body: Body) -> Series | None:
 
 
 def distances(places: Series, span_s: float) -> Windows | None:
-    """Compute distances in windows of a span, or of a longer one if they vary too little."""
+    """Compute distances in windows of a span, or of a longer span if the distances vary too little."""
     for each_s in (span_s, *SPANS_S):
         moved = chords(places, each_s)
         found = replace(moved, values=np.linalg.norm(moved.values, axis=1))

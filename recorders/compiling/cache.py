@@ -76,7 +76,7 @@ def kept_files() -> Iterator[Path]:
 
 
 def read_own(path: Path) -> bytes | None:
-    """Read a file like `read_checked`; also return None if others may have written the file itself."""
+    """Read a file as `read_checked` does; also return None if others may have written the file."""
     try:
         with path.open("rb") as file:
             return _content(file.read()) if is_own(os.fstat(file.fileno())) else None
@@ -85,7 +85,7 @@ def read_own(path: Path) -> bytes | None:
 
 
 def read_checked(source: Path | Traversable) -> bytes | None:
-    """Read the content that `write_checked` wrote; None if the file is damaged or missing."""
+    """Read the content that `write_checked` wrote; return None if the file is damaged or missing."""
     try:
         return _content(source.read_bytes())
     except OSError:
@@ -100,7 +100,7 @@ def _content(written: bytes) -> bytes | None:
 def write_checked(path: Path, content: bytes, made_by: str) -> None:
     """Write a private file, which appears completely or not at all, in private folders.
 
-    Raises BadInput that begins with the path if this fails.
+    Raises BadInput, with a message that begins with the path, if the file cannot be written.
     """
     try:
         _make_private(path.parent)
@@ -113,7 +113,7 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
 
 @contextmanager
 def in_turn(path: Path) -> Iterator[bool]:
-    """Wait while another process makes this file; yield whether one did, as the file may exist now.
+    """Wait while another process makes this file; yield whether it waited, as the file may exist now.
 
     The system releases the lock if the process ends. If a process keeps the lock for very long, or the
     disk does not support locks, two processes make the file, which is harmless.

@@ -1,9 +1,9 @@
-"""Compilation of functions of one run into loops over all runs, which the cores share.
+"""Compilation of functions that process one run into loops over all runs, shared among the cores.
 
 A kernel is a plain Python function of numbers and arrays, together with all functions that it calls. It
 creates no arrays. `fuselog.recorders.compiling.kernels` translates it to LLVM IR in milliseconds. With
-FUSELOG_UNCOMPILED=1, kernels run as plain Python, which a debugger can follow and which is the reference
-for compiled code.
+FUSELOG_UNCOMPILED=1, kernels run as plain Python: a debugger can step through them, and their results
+are the reference for compiled code.
 """
 
 import os
@@ -34,7 +34,7 @@ class Loop(Protocol):
     ) -> Callable[[int, int], None]:
         """Return a function that processes the runs from a first one up to an end.
 
-        If `memory` is given, it is the last argument of the compiled function.
+        If `memory` is given, it is passed as the last argument of the compiled function.
         """
         ...
 
@@ -72,13 +72,13 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 
 def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
-    """Compile a function of one run into a loop over all runs, on all cores.
+    """Compile a function that processes one run into a loop over all runs, on all cores.
 
     Args:
         run_once: function `run_once(run, *arguments)` that processes run number `run` and writes only to
-            the elements of that run. It may be a closure over model functions and numbers, for which it
-            is specialised. It may use NumPy and functions with the same restrictions, and creates no
-            arrays.
+            the elements of that run. If it is a closure over model functions and numbers, the compiled
+            code is specialised for them. It may use NumPy and call functions with the same restrictions;
+            it must not create arrays.
         title: name in notices during compilation, such as "ekf of robot".
 
     Returns `loop(runs, *arguments, scratch=None, per_run=None)`, whose results do not depend on the
@@ -106,7 +106,7 @@ class OverRuns:
     """A loop over all runs, see `compile_over_runs`.
 
     Attributes:
-        run_once: the work of one run.
+        run_once: function that processes one run.
         compiled_loop: function that makes the compiled loop; None if the loop is always plain Python.
     """
 
@@ -120,7 +120,7 @@ class OverRuns:
         scratch: Callable[[], KernelArgument] | None = None,
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
-        """Process all runs; NaN and infinity raise no errors, even in plain Python."""
+        """Process all runs; NaN and infinity cause no warnings or errors, even in plain Python."""
         if self.compiled_loop is not None and not is_uncompiled():
             with done_once():
                 loop = self.compiled_loop()  # imports modules at first use
@@ -164,7 +164,7 @@ def _share(
 def _one_by_one(
     loop: Loop, arguments: Sequence[KernelArgument], per_run: Sequence[KernelArgument]
 ) -> Callable[[int, int], None]:
-    """Return a function that processes runs with a different last argument for each."""
+    """Return a function that processes runs, passing each run its own last argument."""
     by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}
 
     def through(first: int, end: int) -> None:
@@ -216,7 +216,7 @@ def core_count() -> int:
 
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """Make the threads in addition to the calling one; a forked process gets its own."""
+    """Make the additional worker threads; a forked process gets its own."""
     return ThreadPoolExecutor(max(1, core_count() - 1))
 
 

@@ -37,7 +37,7 @@ def digest_of(room: str) -> str:
 def _words(
     value: Value, known: dict[int, int], kept: list[Value], names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield the description of a value, with only those attributes whose `names` the code uses."""
+    """Yield the description of a value, including only the attributes that the code uses (`names`)."""
 
     def of(part: Value) -> Iterator[str]:
         return _words(part, known, kept, names)

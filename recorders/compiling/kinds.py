@@ -1,4 +1,4 @@
-"""Names for the types of kernels and their arguments that cannot be declared more precisely."""
+"""Names for types that cannot be declared more precisely: kernels and their arguments."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Notices about long compilations, and measurement of a thread's time for one-time work."""
+"""Notices about long compilations, and a measurement of the time that threads spend on one-time work."""
 
 import logging
 import sys
@@ -21,7 +21,7 @@ def seconds_done_once() -> float:
 
 @contextmanager
 def done_once() -> Iterator[None]:
-    """Attribute the time in this context to a first use instead of to an estimator."""
+    """Count the time spent in this context as one-time work, not as an estimator's run time."""
     begun_s, before_s = time.perf_counter(), seconds_done_once()
     try:
         yield

@@ -65,8 +65,8 @@ class Inflation(Parameters):
     """Conditions under which standard deviations are larger than stated.
 
     Attributes:
-        where: the values of each source for which standard deviations are larger.
-        by: factor by which standard deviations are multiplied there.
+        where: the values of each source at which standard deviations are larger.
+        by: factor by which the standard deviations are multiplied under these conditions.
     """
 
     where: dict[str, OneOrMore[Source]] = Field(min_length=1)
@@ -78,26 +78,26 @@ class StreamMapping(Parameters):
 
     Attributes:
         becomes: name of the message.
-        fields: for each field of the message a source, or a list of sources for a vector; numbers are
+        fields: for each field of the message, a source, or a list of sources for a vector. Numbers are
             constants, and an empty list is a vector without numbers.
         factors: factors of sources, by field.
         offsets: numbers added after the multiplication, by field.
         units: units of the sources (with factors and offsets), by field; by default fuselog's units.
-        deviations: for a covariance the standard deviations, given as in `fields`.
-        cross_deviations: for a covariance the square roots of the off-diagonal entries (1, 2), (1, 3)
+        deviations: for a covariance, the standard deviations, given as in `fields`.
+        cross_deviations: for a covariance, the square roots of the off-diagonal entries (1, 2), (1, 3)
             and (2, 3), with the signs of the entries.
         inflated: conditions under which standard deviations are larger than stated.
-        where: for each source the values that a row must have to be imported.
+        where: for each source, the values that a row must have to be imported.
         missing: numbers that mark a missing value.
-        each: further fields, one entry per message; every row makes one message for each entry.
+        each: further fields, with one entry per message; every row makes one message for each entry.
         mounting_deg: roll, pitch, yaw that rotate the sensor's axes into the body's (Rz Ry Rx); vectors
-            are rotated, and orientations become the body's.
+            are rotated, and orientations are converted to those of the body.
         components: names of a vector's components, separated by commas, for messages whose channels
             state them.
         kinds: kinds of these components, separated by commas; linear by default.
-        rotation_axes: axes of the rotations in the covariance of an estimate: those of the body, or of
-            the world, as in ROS.
-        states: numbers that the channel states for parameters of models, such as noise densities.
+        rotation_axes: axes of the rotations in the covariance of an estimate: the body's axes, or the
+            world's axes as in ROS.
+        states: values of model parameters that the channel states, such as noise densities.
     """
 
     becomes: str
@@ -126,7 +126,7 @@ class StreamMapping(Parameters):
             yield from (source for source in listed if isinstance(source, str))
 
     def conditions(self) -> Iterator[tuple[str, list[Source]]]:
-        """Yield the sources in conditions, each with the values that fulfil it."""
+        """Yield the sources in conditions, each with the values that fulfil its condition."""
         for where in (self.where, *(each.where for each in self.inflated)):
             for source, values in where.items():
                 yield source, _listed(values)
@@ -174,8 +174,8 @@ class Mapped(NamedTuple):
 def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: str) -> Mapped:
     """Make messages from `size` rows.
 
-    Raises BadInput that begins with `where` if units do not fit, or a list has the wrong length.
-    Exceptions from `read` and `holds` are passed on.
+    Raises BadInput, with a message that begins with `where`, if units do not fit or a list has the wrong
+    length. Exceptions from `read` and `holds` are passed on.
     """
     schema = schema_of(mapping, where)
     maker = _Maker(mapping, schema, size, read, where)
@@ -342,7 +342,7 @@ def _quaternion_of(kinds: str) -> list[int]:
 
 
 def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
-    """Convert orientations (n, 4) of the sensor to those of the body, without normalising them."""
+    """Convert a sensor's orientations (n, 4) to the body's, without normalising them."""
     return compose(quaternion, turn.inv().as_quat(scalar_first=True))
 
 
@@ -392,7 +392,8 @@ def off_unit(
         columns: columns of messages (n,), as in `with_unit_quaternions`.
         kinds: kinds of the components of a state or estimate, separated by commas.
         taken: (n,), the messages to check.
-        quaternions: what to do with such messages. A quaternion of zeros cannot be scaled.
+        quaternions: what to do with messages whose quaternions are far from unit length. A quaternion of
+            zeros cannot be scaled.
 
     Raises BadInput if there are such messages, and they are neither scaled nor left out.
     """
@@ -413,7 +414,7 @@ def off_unit(
 
 
 def with_unit_quaternions(columns: Mapping[str, NDArray], kinds: str) -> dict[str, NDArray]:
-    """Scale quaternions to unit length: those of a field, or in a state or estimate.
+    """Scale quaternions to unit length, in a field of quaternions or in a state or estimate.
 
     Args:
         columns: (n,) or (n, width), by field.

@@ -25,9 +25,9 @@ from fuselog.recorders.recording import Importer, Recording
 class MrclamParameters(Parameters):
     """Settings that the data do not state: the noise of odometry and sensor, and the prior's sigmas.
 
-    The values are the same for all sets and robots. The densities of the odometry are those of its
-    errors over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to
-    0.7), but a filter assumes that they are independent, so the standard deviations are a few times the
+    The values are the same for all sets and robots. The densities of the odometry describe its errors
+    over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to 0.7),
+    but a filter assumes that they are independent, so the standard deviations are a few times the
     scatter.
 
     Attributes:
@@ -161,7 +161,8 @@ def _timed(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
 
-    Stamps are printed to the millisecond and not exact as doubles; rounding restores them.
+    Stamps are printed to the millisecond, and are not exact as doubles; rounding restores the exact
+    values.
     """
     table = _table(path, columns, identifiers)
     bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)

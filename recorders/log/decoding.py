@@ -1,8 +1,9 @@
 """Decoding of opened regions into the columns of one topic.
 
 The layout of messages is checked before it is used. The fast path reads all messages of a region
-together by our fixed layout, if every constant byte of each agrees (`Layout.parse`). On the slow path,
-the protobuf library reads them one by one, so that logs of other writers are read slowly but correctly.
+together in fuselog's fixed layout, if every constant byte of every message matches (`Layout.parse`). On
+the slow path, the protobuf library reads the messages one by one, so logs of other writers are read
+slowly but correctly.
 """
 
 from collections.abc import Sequence
@@ -67,7 +68,7 @@ class Decoder:
         return schema
 
     def _check_fields(self) -> None:
-        """Require that a message named like one of fuselog's has its fields, except newer ones."""
+        """Require that a message with a fuselog message's name has its fields, except newer ones."""
         kinds = {entry.name: entry.kind for entry in self.schema}
         expected = SCHEMAS.get(self.schema.full_name, self.schema)
         wrong = [
@@ -111,7 +112,7 @@ class Decoder:
         )
 
     def _at_once(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> _Decoded | None:
-        """Read clocks and columns by the fixed layout; None if a message has another layout."""
+        """Read clocks and columns by the fixed layout; return None if a message has another layout."""
         if not self._is_fixed:
             return None
         if self._layout is None:

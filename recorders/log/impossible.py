@@ -79,11 +79,11 @@ def impossible(stream: Stream) -> Iterator[Impossible]:
 
 
 def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, Counter[str]]:
-    """Remove impossible messages, and count them by reason, each once.
+    """Remove impossible messages, and count each once, by reason.
 
     Args:
         stream: the messages.
-        span_ns: the span outside which a stamp is impossible, see `main_span`; None if there is none.
+        span_ns: the span outside which a stamp is impossible (see `main_span`); None allows all stamps.
     """
     found: Counter[str] = Counter()
     wrong = [(each.words, each.rows) for each in impossible(stream)]
@@ -99,7 +99,7 @@ def possible(stream: Stream, span_ns: tuple[int, int] | None) -> tuple[Stream, C
 
 
 def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
-    """Find the first and last stamp of most messages; None unless others are years away from them.
+    """Find the first and last stamp of most messages; None unless other messages are years away.
 
     Args:
         stamps_ns: several arrays (n,) in any order.
@@ -122,7 +122,7 @@ def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
 def main_span_of(
     extent_ns: tuple[int, int], blocks: Callable[[], Iterable[Mapping[str, Stream]]]
 ) -> tuple[int, int] | None:
-    """Compute `main_span` of a log; its blocks are read only if its ends are years apart."""
+    """Compute `main_span` of a log; its blocks are read only if its ends are over a year apart."""
     if extent_ns[1] - extent_ns[0] <= YEAR_NS:
         return None
     return main_span(each.publish_time_ns for block in blocks() for each in block.values())
@@ -162,7 +162,7 @@ def limit_of(name: str) -> float:
 
 
 def _components(stream: Stream, field: str) -> list[str]:
-    """Name the components of a field, from the channel or by the field."""
+    """Name the components of a field, by the channel's components or by the field's name."""
     column = stream.columns[field]
     if column.ndim == 1:
         return [field]

@@ -129,7 +129,7 @@ def _scan(
 ) -> int:
     """Fill in the positions of messages and declarations, and the first and last times of messages.
 
-    `sizes` gets the number of messages, of declarations, and one more than the highest channel.
+    `sizes` gets the number of messages, the number of declarations, and the highest channel plus one.
     """
     size, count, declared, channels, position = len(data), 0, 0, 0, 0
     while position + HEAD_BYTES <= size:

@@ -1,7 +1,7 @@
 """Foxglove mirrors: messages in Foxglove's schemas, written next to a log's streams for viewers.
 
 The channel of a mirror states in its metadata which stream it accompanies, and is not one of the log's
-topics. Its messages have no fixed layout; they are written one by one, into separate chunks.
+topics. Its messages have no fixed layout, and are written one by one into separate chunks.
 """
 
 import struct

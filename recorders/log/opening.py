@@ -66,7 +66,7 @@ class Log:
 
     @property
     def companions(self) -> dict[str, Topic]:
-        """Return `mirrors` under the name of the previous release."""
+        """Return `mirrors`; the previous release used this name."""
         warnings.warn(
             "Log: 'companions' was renamed to 'mirrors'; the old name will be removed in the next "
             "release",
@@ -108,7 +108,7 @@ class Log:
 
     @property
     def loss_statement(self) -> str | None:
-        """Return a sentence on what is missing from a recovered log; None if it is complete."""
+        """Return a sentence on what is missing from a recovered log; None if nothing is missing."""
         parts = [self._lost_messages(), _listed(self.container.damages, "damages")]
         stated = ": ".join(filter(None, parts))
         return f"{self.path}: {stated}" if stated else None
@@ -129,7 +129,8 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
     Args:
         path: an MCAP file, or its URL.
-        recover: read the intact part of a truncated or damaged file, without using its index.
+        recover: whether to read only the intact part of a truncated or damaged file; its index is then
+            not used.
 
     Raises BadInput if the file is missing or not MCAP, or is incomplete and `recover` is False.
 

@@ -51,7 +51,7 @@ class Origin(NamedTuple):
 
 
 def origin_of(parts: Sequence[str]) -> Origin | None:
-    """Parse an origin from two or three numbers; None if they are invalid."""
+    """Parse an origin from two or three numbers; return None if they are invalid."""
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
@@ -63,7 +63,7 @@ def origin_of(parts: Sequence[str]) -> Origin | None:
 
 
 def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
-    """Return the origin that a topic's channel states, by default at height zero; None without one.
+    """Return the origin that a topic's channel states, or None; without a height, it is at height zero.
 
     Raises BadInput if it is not a position on the earth.
     """
@@ -86,7 +86,7 @@ def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
 
 
 def frame_of(metadata: Mapping[str, str]) -> str:
-    """Return the frame that a channel names; empty for the plane of the log."""
+    """Return the frame that a channel names; an empty text means the plane of the log."""
     return "" if LATITUDE in metadata else metadata.get(FRAME, "")
 
 

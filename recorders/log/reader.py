@@ -62,7 +62,7 @@ def read_streams(
 
 
 def read_span(log: Log, clock: Clock) -> tuple[int, int]:
-    """Find the first and last stamp of a log in ns by one of its clocks; zeros without messages.
+    """Find the first and last stamp of a log in ns by one of its clocks; both are 0 without messages.
 
     Files of other writers state only the log times of chunks, so their chunks are opened to find publish
     times. Raises BadInput if a chunk is damaged.
@@ -100,8 +100,8 @@ def read_blocks(
         log: log from `open_log`.
         topics: names of topics.
         order: clock to sort by.
-        start_ns: leave out messages before this stamp of that clock.
-        end_ns: leave out messages at or after this stamp of that clock.
+        start_ns: messages before this stamp of that clock are left out.
+        end_ns: messages at or after this stamp of that clock are left out.
         block_messages: approximate number of messages in a block.
 
     Raises BadInput for an unknown topic, a schema without numeric columns, NaN that the schema does not
@@ -162,7 +162,7 @@ def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) ->
 
 
 def _timed(log: Log, file: BinaryIO, region: Region, clock: Clock) -> Region:
-    """Return the region with its span by the clock: known, noted by our writer, or read from it."""
+    """Return the region with its span by the clock: known, noted by fuselog, or read from the region."""
     if clock in region.spans:
         return region
     noted = noted_span(log.container.metadata.get(PUBLISH_SPANS, {}), *region.extent)
@@ -213,7 +213,7 @@ def _within(stream: Stream, window: _Window) -> Stream:
 def _released(
     log: Log, pending: Mapping[str, list[Stream]], clock: Clock, limit_ns: int | None
 ) -> tuple[dict[str, Stream], dict[str, list[Stream]]]:
-    """Split pending streams into sorted ones before `limit_ns`, and the rest."""
+    """Sort pending streams, and split them into the messages before `limit_ns` and the rest."""
     block: dict[str, Stream] = {}
     rest: dict[str, list[Stream]] = {}
     for topic, parts in pending.items():

@@ -119,7 +119,8 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
 def schema_of(message_type: type[message.Message]) -> Schema:
     """Return a schema with the numeric fields of any message type, without its other fields.
 
-    For messages of fuselog, the declaration here decides which fields may be NaN; for others, all may.
+    For messages of fuselog, the declaration here decides which fields may be NaN; in other messages, all
+    fields may be NaN.
     """
     descriptor = message_type.DESCRIPTOR
     ours = {field.name: field for field in SCHEMAS.get(descriptor.full_name, ())}

@@ -138,7 +138,7 @@ def make_stream(
     metadata: Mapping[str, str] | None = None,
     **columns: ArrayLike,
 ) -> Stream:
-    """Make a stream; clocks that are not given equal `publish_time_ns`.
+    """Make a stream; a clock that is not given is set to `publish_time_ns`.
 
     A vector that may be absent can be omitted. Raises BadInput if another column is missing, unknown, or
     has the wrong length or number of axes; if it contains NaN that its field does not allow, or a number
@@ -183,7 +183,7 @@ def stream_of(
         schema: schema of the messages.
         publish_time_ns: (n,), when the quantity was measured.
         given: columns by field, (n,), or (n, width) for a vector; one that may be absent can be omitted.
-        log_time_ns: (n,), when it reached the recorder; by default when it was measured.
+        log_time_ns: (n,), when it reached the recorder; by default the time of the measurement.
         metadata: metadata of the channel, as text.
         allow_nan: whether any column may contain NaN.
 
@@ -211,7 +211,7 @@ def stream_of(
 
 
 def _misfit(schema: Schema, given: Mapping[str, ArrayLike]) -> str:
-    """Describe how the given fields differ from those of the schema."""
+    """Describe how the given fields differ from the fields of the schema."""
     name, clock = schema.full_name, "sensor_time_ns"
     own = [entry.name for entry in schema if entry.name != clock]
     if clock not in {entry.name for entry in schema}:

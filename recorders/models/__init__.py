@@ -1,4 +1,4 @@
 """Models of motion and measurements, shared by simulators and estimators.
 
-Begin with `planar`, the robot's. Models of single families are in `fuselog.recorders.families`.
+Begin with `planar`, which models a robot. Models of single families are in `fuselog.recorders.families`.
 """

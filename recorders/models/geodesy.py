@@ -51,7 +51,7 @@ def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[n
 def out_of_tangent_plane(
     place_m: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Compute latitude, longitude (deg) and height (m) of a position: east, north and perhaps up.
+    """Convert a position (east, north, optionally up) to latitude, longitude (deg) and height (m).
 
     Bowring's formula, Survey Review 23, 1976: accurate to less than a micrometre near the ground.
     """

@@ -1,9 +1,8 @@
 """Inertial navigation in east, north, up: the motion according to an inertial unit.
 
-The body's axes are forward, left, up; a unit quaternion w, x, y, z rotates vectors from them to the
-plane's.
-Component-first, as in `planar`. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
-Navigation Systems, 2nd edition, 2013, chapters 2 and 5.
+The body's axes are forward, left, up; a unit quaternion w, x, y, z rotates vectors from the body's axes
+to the plane's. Component-first, as in `planar`. Groves, Principles of GNSS, Inertial, and Multisensor
+Integrated Navigation Systems, 2nd edition, 2013, chapters 2 and 5.
 """
 
 import numpy as np
@@ -86,7 +85,8 @@ def into_body(q: Components, v: Components) -> Vector:
 def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Components) -> Vector:
     """Rotate a vector from a unit's axes to the body's, given the mounting angles in rad.
 
-    The rotation is by `roll` about forward, then by `pitch` about left, then by `yaw` about up.
+    The rotation is by `roll` about the forward axis, then by `pitch` about the left axis, then by `yaw`
+    about the up axis.
     """
     sine, cosine = np.sin(roll), np.cos(roll)
     x, y, z = v[0], cosine * v[1] - sine * v[2], sine * v[1] + cosine * v[2]
@@ -133,7 +133,7 @@ def strapdown(
 
 
 def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """Compute the orientation in which the force points up and the field north; NaN if parallel."""
+    """Compute the orientation with the force up and the field north; NaN if the two are parallel."""
     up = unit(force)
     east = unit(cross(field, up))
     north = cross(up, east)

@@ -74,7 +74,7 @@ class CarParameters(Parameters):
         motion: kind of motion.
         rest_s: time at rest, before 5 s of acceleration.
         begin: "of the prior" draws the first pose from the prior, whose mean is zero; "any heading"
-            begins at zero in a random direction, which is the prior's mean.
+            starts the car at zero in a random direction, which is the mean of the prior.
         prior_sigma_m, prior_sigma_rad: standard deviations of the position, per axis, and of the heading
             in the prior.
         odometry_step_s, fix_step_s, compass_step_s: times between messages.
@@ -267,7 +267,7 @@ def streams_of(
     Args:
         car: the measurements.
         stamps: function that makes stamps in ns from times (n,) in s.
-        has_compass, has_prior: whether to include these.
+        has_compass, has_prior: whether to include the compass and the prior.
     """
     half = 0.5 * car.compass_rad
     zero = np.zeros_like(half)

@@ -1,7 +1,7 @@
 """Simulator of robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
 Each odometry message states the velocity until the next message; the true velocity is the stated one
-plus white noise. Robots are the targets 1, 2, ..., and landmarks have the numbers after them.
+plus white noise. Robots are the targets 1, 2, ...; the numbers of the landmarks follow.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -61,12 +61,12 @@ class Fixes(Parameters):
     """A receiver that measures positions.
 
     Attributes:
-        rate_hz: fixes per second; 0 switches it off.
+        rate_hz: fixes per second; 0 switches the receiver off.
         sigma_m: standard deviation of a fix, per axis.
         outages_per_minute: mean number of outages per minute.
         outage_s: length of an outage.
-        origin_deg: latitude and longitude of the origin of the local tangent plane; with it, fixes are
-            latitudes and longitudes, without it positions in the plane.
+        origin_deg: latitude and longitude of the origin of the local tangent plane. If they are given,
+            fixes are latitudes and longitudes; otherwise fixes are positions in the plane.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -89,11 +89,12 @@ class LandmarksParameters(Parameters):
         odometry_latency_s: time from a reading of the odometry to its arrival at the recorder.
         forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
         turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
-        forward_scale_error: relative excess of the robot's speed over the odometry's.
-        turn_bias_radps: excess of the robot's turn rate over the odometry's.
+        forward_scale_error: how much faster the robot moves than the odometry reports, as a fraction of
+            the reported speed.
+        turn_bias_radps: how much faster the robot turns than the odometry reports.
         prior_sigma_m: standard deviation of the position in the prior, per axis.
         prior_sigma_rad: standard deviation of the heading in the prior.
-        robots_see_each_other: whether robots are targets of the sensors, too.
+        robots_see_each_other: whether robots are also targets of the sensors.
         range_bearing: sensor of ranges and bearings.
         range: sensor of ranges.
         bearing: sensor of bearings.

@@ -26,7 +26,7 @@ GRID_S = 0.05  # between the knots of the path
 
 
 class Path(NamedTuple):
-    """The path of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
+    """The path of the body: its position (3,) and its yaw, pitch and roll, as splines over time."""
 
     position: BSpline
     attitude: BSpline
@@ -77,7 +77,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
 
 
 def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
-    """Compute the spline through the way points, at rest first, and the attitude along it."""
+    """Compute the spline through the way points, after a rest at the first, and the attitude on it."""
     points = np.array(parameters.way_points_m, float).reshape(-1, 3)
     if not len(points):
         points = _random_points(parameters, rng)
@@ -117,7 +117,7 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
 def _step(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Add the bobbing and swaying of steps, 1.9 per second, and slow turns to both sides, in place."""
+    """Add, in place, the bobbing and swaying of 1.9 steps per second, and slow turns to both sides."""
     phase, step = rng.uniform(0.0, 2 * np.pi, 4), 2 * np.pi * 1.9 * grid_s
     place[:, 2] += 0.03 * going * np.sin(step + phase[0])
     attitude[:, 0] += 0.8 * going * np.sin(0.5 * grid_s + phase[1])
@@ -128,7 +128,7 @@ def _step(
 def _lean(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Turn the body slowly, and tilt it so that its up axis follows the thrust, in place."""
+    """Set the attitude, in place: a slow yaw, and a tilt that aligns the up axis with the thrust."""
     phase = rng.uniform(0.0, 2 * np.pi, 2)
     yaw = phase[0] + 1.5 * going * np.sin(0.2 * grid_s + phase[1])
     thrust = make_interp_spline(grid_s, place, k=5).derivative(2)(grid_s)
@@ -140,7 +140,7 @@ def _lean(
 
 
 def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -> Floats:
-    """Draw way points a leg apart: ahead for a vehicle or person, in a box for a quadrotor."""
+    """Draw way points: a path of legs for a vehicle or person, points in a box for a quadrotor."""
     legs = max(3, round((parameters.duration_s - parameters.rest_s) / parameters.leg_s))
     length_m = parameters.speed_mps * parameters.leg_s
     if parameters.carrier == "quadrotor":
@@ -154,7 +154,7 @@ def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -
 def _inertial(
     parameters: NavigationParameters, path: Path, times_s: Floats, rng: np.random.Generator
 ) -> tuple[Stream, Floats, Floats]:
-    """Simulate the unit's samples; return them, and the biases of gyroscope and accelerometer (n, 3)."""
+    """Simulate the unit's samples; also return gyroscope and accelerometer biases (n, 3)."""
     unit = parameters.unit
     turned = path.orientation(times_s).inv()
     earth = np.array(earth_rate(parameters.origin_latitude_deg))
@@ -254,7 +254,7 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
 
 
 def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """Simulate wheels, compass and barometer, if they are on board."""
+    """Simulate the wheels, compass and barometer that are on board."""
     carried, streams = parameters.carried, []
 
     def times(rate_hz: float) -> Floats:
@@ -315,9 +315,9 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 
 
 def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
-    """Draw the prior: the truth with an error; the error of the orientation is a turn and a tilt.
+    """Draw the prior by adding an error to the truth; the orientation's error is a turn and a tilt.
 
-    The turn is about the up axis of the mean, so that an unknown heading does not affect the tilt.
+    The turn is about the vertical axis, so that an unknown heading does not affect the tilt.
     """
     prior, unit = parameters.prior, parameters.unit
     sigma = np.repeat(

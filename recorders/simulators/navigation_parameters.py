@@ -13,7 +13,7 @@ Span = tuple[float, float]
 
 
 class Unit(Parameters):
-    """The errors of an inertial unit; by default those of a phone.
+    """The errors of an inertial unit; the defaults are a phone's errors.
 
     Attributes:
         rate_hz: samples per second.
@@ -23,11 +23,11 @@ class Unit(Parameters):
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         force_bias_sigma_mps2: standard deviation of the accelerometer's bias at the start, per axis.
         gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
-        scale_sigma: standard deviation of the errors of scale, as a share.
+        scale_sigma: standard deviation of the scale errors, as a fraction.
         misalignment_sigma_rad: standard deviation of the misalignments of the axes.
-        force_quantum_mps2: specific forces are rounded to multiples of this; 0 does not round.
-        gyro_quantum_radps: turn rates are rounded to multiples of this; 0 does not round.
-        delay_s: delay of the stamps of samples.
+        force_quantum_mps2: specific forces are rounded to multiples of this; 0 for no rounding.
+        gyro_quantum_radps: turn rates are rounded to multiples of this; 0 for no rounding.
+        delay_s: time by which the stamps of samples are late.
     """
 
     rate_hz: PositiveFloat = 100.0
@@ -45,24 +45,24 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """The output of a GNSS receiver, and its disturbances: spans [start, end] in s since the epoch.
+    """The output of a GNSS receiver, and its disturbances as spans [start, end] in s since the epoch.
 
     Attributes:
         rate_hz: positions per second.
-        velocity_rate_hz: velocities per second; 0 leaves them out.
+        velocity_rate_hz: velocities per second; 0 for no velocities.
         sigma_m: standard deviation of a position, per horizontal axis.
         sigma_up_m: standard deviation of a height.
         sigma_mps: standard deviation of a velocity, per horizontal axis.
         sigma_up_mps: standard deviation of a vertical velocity.
         lever_m: position of the antenna in the body (forward, left, up).
-        delay_s: delay of the stamps of positions.
-        velocity_delay_s: delay of the stamps of velocities.
+        delay_s: time by which the stamps of positions are late.
+        velocity_delay_s: time by which the stamps of velocities are late.
         outages_s: spans without messages.
         floats_s: spans with float solutions.
-        float_factor: factor by which float solutions have larger errors, and state larger sigmas.
-        multipath_s: spans in which positions have the offset `multipath_m`, which their covariance does
-            not state.
-        multipath_m: offset of positions in these spans (east, north, up).
+        float_factor: factor by which the errors of float solutions and their stated sigmas are larger.
+        multipath_s: spans in which positions have the offset `multipath_m`, which their covariance
+            ignores.
+        multipath_m: offset of positions in the spans `multipath_s` (east, north, up).
     """
 
     rate_hz: PositiveFloat = 5.0
@@ -85,13 +85,13 @@ class Carried(Parameters):
     """Further sensors that a body may carry.
 
     Attributes:
-        wheel_rate_hz: forward speeds of the wheels per second; 0 leaves them out.
+        wheel_rate_hz: forward speeds per second from the wheels; 0 for no wheels.
         wheel_sigma_mps: standard deviation of a forward speed.
-        wheel_scale_sigma: standard deviation of the wheels' error of scale, as a share.
-        axle_m: position where wheels measure the speed, in the body (forward, left, up).
-        compass_rate_hz: orientations of the compass per second; 0 leaves it out.
+        wheel_scale_sigma: standard deviation of the scale error of the wheels' speed, as a fraction.
+        axle_m: position in the body at which the wheels measure the speed (forward, left, up).
+        compass_rate_hz: orientations per second from the compass; 0 for no compass.
         compass_sigma_rad: standard deviation of the compass's heading.
-        barometer_rate_hz: heights of the barometer per second; 0 leaves it out.
+        barometer_rate_hz: heights per second from the barometer; 0 for no barometer.
         barometer_sigma_m: standard deviation of a height.
     """
 
@@ -106,7 +106,7 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """The prior in the log; the standard deviations of the biases are those of the unit.
+    """The prior in the log; its standard deviations of biases are the unit's.
 
     Attributes:
         is_told: whether the log has a prior.
@@ -135,7 +135,7 @@ class NavigationParameters(Parameters):
         rest_s: time at rest at the beginning.
         leg_s: time between random way points.
         speed_mps: speed along the path.
-        way_points_m: points of the path (east, north, up); random if empty.
+        way_points_m: points of the path (east, north, up); if empty, points are random.
         origin_latitude_deg: latitude of the origin of the local tangent plane.
         origin_longitude_deg: longitude of the origin of the local tangent plane.
         origin_altitude_m: height of the origin above the WGS 84 ellipsoid.

@@ -25,7 +25,7 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def over_columns(ufunc: np.ufunc, matrix: AnyArray) -> AnyArray:
-    """Reduce each row of a matrix by combining whole columns, which is 30 times as fast as row by row.
+    """Reduce each row of a matrix by combining whole columns, 30 times as fast as a loop over rows.
 
     Args:
         ufunc: the reduction, such as np.logical_and for `all`.

@@ -128,7 +128,7 @@ def _tail(run: int, found: Floats, value: Floats, shape: Floats, log_gamma: Floa
 def _solve(
     run: int, found: Floats, below: Floats, above: Floats, shape: Floats, log_gamma: Floats
 ) -> None:
-    """Find the value with these probabilities below and above it, by Newton's method in its logarithm.
+    """Find the value with given probabilities below and above it, by Newton's method on its logarithm.
 
     The logarithm of the smaller tail, as a function of the logarithm of the value, is nearly linear at
     small values, and its curvature does not change sign.

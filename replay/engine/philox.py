@@ -65,8 +65,8 @@ def unit(word: np.uint64) -> float:
 def _ziggurat() -> tuple[Floats, Floats, Floats]:
     """Compute layers of equal area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
 
-    The lowest layer, number 0, includes the tail; its right end is that of a rectangle with the layer's
-    area. The inner share of a layer is the part of its width that is entirely below the curve.
+    The lowest layer, number 0, includes the tail; its right end is where a rectangle with the layer's
+    area would end. The inner share of a layer is the part of its width that is entirely below the curve.
     """
     area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * _BEYOND
     ends = np.zeros(_LAYERS + 1)
@@ -93,7 +93,7 @@ def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int
         numbers: (n,), overwritten; n is a multiple of four.
         words: (n,), work space.
         key: (2,), see `run_key`.
-        counter: number of the last block used before.
+        counter: number of the last block that was used before the call.
 
     Returns:
         The number of the last block that was used.

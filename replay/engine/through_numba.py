@@ -35,10 +35,10 @@ _INNER: dict[str, Value] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True
 
 
 def numba_over_runs(run_once: RunOnce, title: str = "") -> OverRuns:
-    """Compile a function of one run that creates arrays into a loop over all runs, on all cores.
+    """Make a compiled loop over all runs, on all cores, from a function of one run that creates arrays.
 
-    Args and Returns are those of `compile_over_runs`. The loop raises BadInput when it is called, if
-    numba is not installed or cannot compile the function.
+    Arguments and result are the same as for `compile_over_runs`. The loop raises BadInput when it is
+    called, if numba is not installed or cannot compile the function.
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
     return OverRuns(run_once, cache(lambda: _Loop(cast(FunctionType, run_once), title)))
@@ -168,7 +168,7 @@ def _take_apart(value: Value, kinds: list[Value], leaves: list[Value]) -> None:
 
 
 def _put_together(value: Value, places: Iterator[int], scope: dict[str, Value]) -> str:
-    """Write the expression that rebuilds an argument from `leaves`; named tuples are put in `scope`."""
+    """Write the expression that rebuilds an argument from `leaves`; put named tuples in `scope`."""
     if not isinstance(value, tuple):
         return f"leaves[{next(places)}]"
     parts = "".join(f"{_put_together(each, places, scope)}, " for each in value)

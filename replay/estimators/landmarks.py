@@ -38,10 +38,10 @@ class DeadReckoningParameters(ModelParameters):
             the square root of the step.
         turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
             square root of the step.
-        forward_scale: scale factor of the forward speed: true speed divided by that of the odometry.
-        turn_scale: scale factor of the turn rate: true turn rate divided by that of the odometry,
-            without the bias.
-        turn_bias_radps: bias of the turn rate, which is added to that of the odometry after scaling.
+        forward_scale: scale factor of the forward speed: the true speed divided by the odometry's speed.
+        turn_scale: scale factor of the turn rate: the true turn rate, without the bias, divided by the
+            odometry's turn rate.
+        turn_bias_radps: bias of the turn rate, which is added to the odometry's turn rate after scaling.
     """
 
     forward_noise_density: NonNegativeFloat | None = None
@@ -55,12 +55,12 @@ class LocalizationParameters(DeadReckoningParameters):
     """Noise and biases of the sensors.
 
     Attributes:
-        sigma_heading_rad: standard deviation of the heading in messages that state no variance of it.
+        sigma_heading_rad: standard deviation of a heading whose message states no variance.
         sigma_range_m: standard deviation of a range.
         sigma_bearing_rad: standard deviation of a bearing.
         bias_range_m: bias of ranges: measured minus true.
         bias_bearing_rad: bias of bearings: measured minus true.
-        bias_heading_rad: bias of headings: measured minus true; for example, of a compass that is
+        bias_heading_rad: bias of headings, measured minus true; for example, because a compass is
             mounted at an angle.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
         lever_x_m, lever_y_m: position of the antenna on the robot: ahead of, and to the left of, the
@@ -98,7 +98,7 @@ def velocity_noise(duration_s: Any, parameters: Any) -> Components:
 
 
 def sight(pose: Components, place: Components) -> Components:
-    """Return range and bearing of a position; NaN if the pose is at this position."""
+    """Return range and bearing of a position, or NaN if the pose is at this position."""
     distance, bearing = range_bearing(pose, place)
     # 0, or NaN if the distance is 0: numba has no np.where for numbers
     defined = np.minimum(np.inf * (distance > 0.0), 0.0)
@@ -144,7 +144,7 @@ def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix whose message states none."""
+    """Return the variances of a fix whose message states no covariance."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
@@ -154,7 +154,7 @@ def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components
 
 
 def pose_noise(parameters: Any) -> Components:
-    """Return the variances of a pose whose message states none."""
+    """Return the variances of a pose whose message states no covariance."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
@@ -164,7 +164,7 @@ def heading_alone(pose: Components, reference: Any, parameters: Any) -> Componen
 
 
 def heading_noise(parameters: Any) -> Components:
-    """Return the variance of a heading whose message states none."""
+    """Return the variance of a heading whose message states no variance."""
     return (parameters.sigma_heading_rad**2,)
 
 
@@ -195,7 +195,7 @@ def align(
 
     The path is rotated and shifted by least squares. The covariance includes the error of the odometry,
     which is a random walk: the variance of the difference between the walk's mean over the span and its
-    end is a third of its variance at the end.
+    end is a third of the walk's variance at the end.
 
     Args:
         path: poses (k, 3) at the stamps of the fixes, from the odometry only, starting at zero.
@@ -233,7 +233,7 @@ def align(
 
 
 def read_turn_rate(stream: Stream) -> Floats:
-    """Return the turn rates (n, 1) about the vertical axis of a gyro that is mounted upright."""
+    """Return turn rates (n, 1) about the vertical axis from a gyro that is mounted upright."""
     return stream["turn_rate_radps"][:, 2:]
 
 

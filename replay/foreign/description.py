@@ -24,7 +24,7 @@ class ForeignParameters(Parameters):
     Attributes:
         time_limit_s: limit of the time for one message; a run that exceeds it fails.
         memory_limit_mb: limit of the memory of the filter's process; a run that exceeds it fails.
-        every_s: interval of additional estimates, at multiples of this time.
+        every_s: interval of additional estimates, which are made at multiples of this time.
         seed: seed of the filter's random numbers.
     """
 
@@ -44,12 +44,13 @@ class TopicRead(_Part):
     """Topic that a filter reads.
 
     Attributes:
-        topic: name of the topic; a name without a leading slash is searched under every prefix.
+        topic: name of the topic; a name without a leading slash is looked for under every prefix.
         fields: fields that the filter reads, in this order; `position_m[2]` is a vector of two numbers.
         message: schema of its messages, such as `fuselog.RangeBearing`; "" for any schema.
-        static: whether all of its messages are passed to the filter before the start, as for a map.
+        static: whether all messages of the topic are passed to the filter before the start, as for a
+            map.
         optional: whether the filter also runs on logs without the topic.
-        estimates: whether the filter is asked for an estimate after each of its messages.
+        estimates: whether the filter is asked for an estimate after each message of the topic.
         target: field with the identifier of the measured target.
     """
 
@@ -104,10 +105,11 @@ class Description(_Part):
         state: components of the state by name, with their kinds.
         innovation: components of its innovations; empty if it has none.
         parameters: parameters by name.
-        prior: topic of the prior; "" if it starts without one.
+        prior: topic of the prior; "" if the filter starts without a prior.
         truth: topic of the truth.
         output: last part of the name of its topic of estimates.
-        failures: descriptions of failures: if a function of the filter returns n, the n-th applies.
+        failures: descriptions of failures: if a function of the filter returns n, the n-th description
+            applies.
         digest: for a filter written by `fuselog deploy`, the digest of its graphs and numbers.
         protocol: for a streaming program, its version of the protocol.
     """
@@ -135,7 +137,7 @@ class Description(_Part):
         return max(each.width for each in self.topics)
 
     def bindings(self, topics: Mapping[str, Topic]) -> Iterator[tuple[str, dict[str, Topic]]]:
-        """Yield each prefix under which a log has all topics, and the topics found by name."""
+        """Yield each prefix under which a log has all topics, and the topics found there, by name."""
         own = [each.topic for each in self.topics if not each.topic.startswith("/")]
         prefixes = dict.fromkeys(
             name.removesuffix(f"/{topic}")

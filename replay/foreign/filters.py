@@ -71,8 +71,8 @@ class LibraryParameters(ForeignParameters):
 
     Attributes:
         path: the library, which has the functions of `fuselog_filter.h`.
-        in_process: whether it is called in this process; this is faster, but a crash of the filter ends
-            the replay.
+        in_process: whether the library is called in this process; this is faster, but a crash of the
+            filter ends the replay.
     """
 
     path: str = ""
@@ -88,7 +88,7 @@ class FoundFilter:
         description: description of the filter.
         prefix: prefix of its topics.
         topics: topics of the log, by the names in the description.
-        prior: topic of the prior; "" if it starts without one.
+        prior: topic of the prior; "" if the filter starts without a prior.
         parameters: all of its parameters.
     """
 
@@ -138,7 +138,8 @@ class FoundFilter:
     ) -> tuple[FilterEvents, Integers]:
         """Convert a block to events, including additional estimates at multiples of `every_s`.
 
-        Returns the events, and the multiple of `every_s` at the next additional estimate (runs,).
+        Returns the events, and for each run (runs,) the multiple of `every_s` at which the next
+        additional estimate is due.
         """
         events = events_of(self.description, self.topics, block)
         every_s = self.parameters.every_s
@@ -245,7 +246,7 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
 
 
 def _first_ns(block: Block) -> Integers:
-    """Return the stamp of every run's first message (runs,); 0 if it has none."""
+    """Return the stamp of every run's first message (runs,); 0 for a run without messages."""
     offsets, times_ns = block.events.offsets, np.append(block.events.time_ns, 0)
     return np.where(np.diff(offsets) > 0, times_ns[offsets[:-1]], 0)
 
@@ -481,7 +482,7 @@ def static_of_run(static: Static, run: int) -> Static:
 
 
 def events_of(description: Description, found: Mapping[str, Topic], block: Block) -> FilterEvents:
-    """Convert the messages of a block to events with indices of the topics in the description."""
+    """Convert a block's messages to events, which refer to topics by index in the description."""
     numbers = {
         found[each.topic].name: number
         for number, each in enumerate(description.topics)

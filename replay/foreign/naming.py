@@ -1,7 +1,7 @@
 """Names of foreign programs, `lib:PATH` and `exec:COMMAND`, and rules on which of them may run.
 
 A program runs only if a person names it: in a command, in a Python call, or in the experiment file of a
-command. The text is then marked as `Allowed`. A name that was read from goldens, results, settings files
+command. The name is then marked as `Allowed`. A name that was read from goldens, results, settings files
 or logs is plain text, and the program does not run; the mark is never saved in a file.
 """
 
@@ -64,7 +64,7 @@ def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any
 
 
 def _label(kind: str, rest: str) -> str:
-    """Return the stem of a library or program, or of a script that follows an interpreter."""
+    """Return the stem of the file name of a library, a program, or an interpreter's script."""
     words = [rest]
     if kind == "exec":
         words = split_command(rest)
@@ -126,7 +126,7 @@ def of_file(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove a program from settings, such as those of `fuselog tune`, if it was also named directly."""
+    """Remove a program from settings, for example from `fuselog tune`, if it was also named directly."""
     return {
         name: value
         for name, value in settings.items()
@@ -135,7 +135,7 @@ def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict
 
 
 def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
-    """Raise BadInput if settings from a file, by label, name a program."""
+    """Raise BadInput if settings (by label) from a file name a program that is not allowed to run."""
     for label, own in tables.items():
         for entry in KINDS.values() if isinstance(own, Mapping) else ():
             if entry in own and not isinstance(own[entry], Allowed):

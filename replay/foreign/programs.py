@@ -68,7 +68,7 @@ class _OfPrograms(Estimator[Any]):
     """Placeholder for estimators of programs; the settings name the command."""
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
-        """Return the estimator for the command in `settings`; a command with {out} reads a log."""
+        """Return the estimator of the command in `settings`; a command with {out} in it reads a log."""
         words = tuple(split_command(what_runs(label, "exec", settings)))
         if any("{" + OUT + "}" in word for word in words):
             return _of_files(label, words)
@@ -270,12 +270,12 @@ def _first_ns(streams: Sequence[Stream]) -> int:
 
 
 def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
-    """Read the estimates in a file by topic, under a label; raise BadInput if there are none.
+    """Read the estimates in a file, by topic, and set their label; raise BadInput if the file has none.
 
     Args:
         path: the file.
         label: label of the estimator.
-        truth: topic of the estimated quantities; None if the log has none.
+        truth: topic of the true values of the estimated quantities; None if the log has no such topic.
     """
     with path.open("rb") as file:
         start = file.read(4096)
@@ -371,7 +371,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
 
 
 def _components(names: list[str], truth: Topic | None) -> Components:
-    """Return components with their kinds in the truth, or all linear without a truth."""
+    """Return components with the kinds that the truth states; without a truth, all are linear."""
     if truth is None:
         return dict.fromkeys(names, "linear")
     stated = stated_components(truth.metadata, {}, f"topic {truth.name}")

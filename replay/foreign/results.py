@@ -31,7 +31,7 @@ class Results(NamedTuple):
         progress: (runs,) index of the current message, visible to another process.
         issued_ns: for every estimate, the arrival time of the message that triggered it, or its stamp if
             messages are processed in order of their stamps.
-        estimates, innovations: the rows of run r begin at the r-th offset.
+        estimates, innovations: the rows of run r begin at the offset of this run.
     """
 
     progress: Integers
@@ -43,7 +43,7 @@ class Results(NamedTuple):
 def results(
     due: Integers, recorded: Integers, sizes: Sizes, memory: Callable[[int], np.ndarray] = np.zeros
 ) -> Results:
-    """Allocate results; the rows of run r begin at due[r] and recorded[r].
+    """Allocate results; in run r, estimates begin at row due[r], innovations at row recorded[r].
 
     Args:
         due: (runs + 1,) offsets of the estimates.
@@ -100,8 +100,8 @@ def in_file(path: Path) -> Callable[[int], np.ndarray]:
 def fill_squares(innovations: InnovationRows) -> int:
     """Fill NIS and log-likelihood of one run's innovations, up to the first invalid covariance.
 
-    If a covariance is not positive definite, the innovations end before it, and its row is returned;
-    otherwise, -1 is returned.
+    If a covariance is not positive definite, the innovations end before its row, and this row is
+    returned; otherwise, -1 is returned.
     """
     end = int(innovations.end[0])
     present = ~np.isnan(innovations.difference[:end])

@@ -1,4 +1,4 @@
-"""All methods by name, and functions that make estimators from them, for one model or any model.
+"""All methods by name, and functions that make estimators from them, for a single or any model.
 
 A method is registered by its entry in METHODS, and by an entry point that names this module and the
 method, as `fuselog.replay.inference.all_methods:ekf`.

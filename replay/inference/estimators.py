@@ -190,7 +190,7 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """Make the parameter type that has a method's parameters, those of all models (unset), and `model`.
+    """Make the parameter type with a method's parameters, all models' parameters (unset), and `model`.
 
     The values are checked against a model's requirements once the model that fits the log is known.
     """

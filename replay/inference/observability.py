@@ -1,11 +1,11 @@
 """Observability of the state at the start of a window, from the measurements of the window.
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, propagated back by
-the derivatives Phi of the motion along the smoothed trajectory. W is scaled to D W D with the standard
-deviations D of the prior, so that an eigenvalue of 1 means as much information as in the prior. Along an
-estimated trajectory, unobservable directions collect a little spurious information; therefore,
-eigenvalues below 10 are reported as weaker than the prior. F and H are those of the extended Kalman
-filter.
+the derivatives Phi of the motion along the smoothed trajectory. W is scaled to D W D with the prior's
+standard deviations D, so an eigenvalue of 1 means that the measurements contain the same information as
+the prior. Along an estimated trajectory, unobservable directions collect a little spurious information;
+therefore, eigenvalues below 10 are reported as weaker than the prior. F and H are the Jacobians of the
+extended Kalman filter.
 
 Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
 """
@@ -78,7 +78,7 @@ class ObservabilityParameters(MethodParameters):  # type: ignore[explicit-any]
 
     Attributes:
         window_s: length of a window; by default, the whole run.
-        scales: standard deviations to use instead of those of the prior, by component, in its unit.
+        scales: standard deviations to use instead of the prior's, by component, in the component's unit.
     """
 
     window_s: PositiveFloat | None = None
@@ -102,12 +102,12 @@ class LinearizationTrajectory(NamedTuple):
 
 
 def gramian_steps(bound_model: BoundModel) -> Steps:
-    """Make the steps that sum the Gramian along the trajectory, which `memory` gets as its only set."""
+    """Make the steps that sum the Gramian along a trajectory, the only set that `memory` receives."""
     motion = _carried_by_motion(bound_model)
     sensors = tuple(_added_by_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
 
     def estimate(run: int, belief: Gramian, found: EstimateRows, row: int, _: Workspace) -> None:
-        """Store the Gramian (with the number of its messages as the mean), and reset it."""
+        """Store the Gramian as the covariance and its number of messages as the mean; reset both."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]
         belief.messages[run] = 0
@@ -241,7 +241,7 @@ class Observability(IteratedSmoother):
         return scales
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
-        """Return the window of every node; the last window includes the rest of the run."""
+        """Return the number of each node's window; the last window includes the rest of the run."""
         run = run_of_rows(way.offsets)
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:
@@ -300,8 +300,9 @@ class Spectrum(NamedTuple):
 def spectrum(information: Floats, scales: Floats) -> Spectrum:
     """Compute the rank, the eigenvalues and the weakest direction of D W D.
 
-    The direction is D e for the eigenvector e of the smallest eigenvalue, in state units, of length one.
-    A component with a scale of zero is known exactly; it is left out, and its eigenvalue is infinite.
+    The direction is D e for the eigenvector e of the smallest eigenvalue, in state units, normalised to
+    length one. A component with a scale of zero is known exactly; it is left out, and its eigenvalue is
+    infinite.
 
     Args:
         information: W (t, t), of the state at the start of a window.

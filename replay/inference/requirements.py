@@ -18,7 +18,7 @@ OWN_MODEL = (
 
 
 def requirements_of(model: Model) -> str:
-    """Describe the topics that a model requires, or may use if it can start without a prior."""
+    """Describe the topics that a model requires or, if it can start without a prior, may use."""
     words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
     if model.start is None or model.control is None or not model.needs_sensor:
         return "; ".join(words)
@@ -28,7 +28,7 @@ def requirements_of(model: Model) -> str:
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
-    """Describe the model that is closest to fitting a log, and the topics that the log lacks."""
+    """Describe the model that a log most nearly fits, and the topics that the log lacks for it."""
     tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
@@ -41,7 +41,7 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
-    """Explain that the prior matches a model whose control has another name in this log; "" otherwise.
+    """Explain that the prior matches a model whose control has another name in this log, or return "".
 
     An example is a log with several inertial units, from which the user must choose one.
     """
@@ -67,7 +67,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
 
 
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Requirement"]:
-    """Return the requirements of a model under the prefix of the log that satisfies most of them."""
+    """Return the requirements of a model under the prefix at which the log satisfies most of them."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
     return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
 
@@ -118,6 +118,6 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Requirement]:
 
 
 def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
-    """Test whether a prior names all components of a model's state, and no others with `exactly`."""
+    """Test whether a prior names all components of a model's state and, if `exactly`, no others."""
     named = set(prior.metadata.get("components", "").split(","))
     return named == set(model.state) if exactly else named >= set(model.state)

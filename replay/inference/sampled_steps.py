@@ -31,15 +31,15 @@ SETTLING = (3,)  # index of the argument of `SampledFunction.recentre` that diff
 
 
 class SampledFunction(NamedTuple):
-    """Function of a state, noise and other arguments at weighted samples, with v values.
+    """Function with v values of a state, noise and other arguments, evaluated at weighted samples.
 
     The arguments of each graph are those of the step, (mean, covariance, ...), and those listed below.
 
     Attributes:
         points, weights: samples (L, t + noises) of N(0, I), and their weights (L,).
-        axes: (L,) indices of the axes of the points, if the moments are computed from points on axes;
-            otherwise empty.
-        kept: tangent components of the values that are components of the state.
+        axes: (L,) index of each point's axis, if the moments are computed from points on axes; otherwise
+            empty.
+        kept: tangent components of the values that are unchanged components of the state.
         variances: returns `variance` (noises), the variances of the noise.
         centre: returns `centre`, the values of the function at the mean without noise.
         value: has the arguments (..., away, centre) and returns `value` (v), the tangent vector from the
@@ -101,7 +101,7 @@ class Sampled(NamedTuple):
         what: name of the function, for errors.
         function: function of (state, noise, arguments).
         variances: returns the variances of the noise for the state and the arguments of the step.
-        arguments: returns the arguments of the function for those of the step.
+        arguments: returns the arguments of the function, given the arguments of the step.
         kinds, outputs: kinds of the components of the state, and of the function's values.
         kept: tangent components of the state that the function returns unchanged, in the same place.
     """
@@ -203,7 +203,7 @@ def _difference(kind: str) -> TracedFunction:
 
 @lru_cache(maxsize=8)
 def _recentred(kind: str) -> TracedFunction:
-    """Trace the change of a tangent vector with its centre; the first output is whether to repeat it."""
+    """Trace how a tangent vector changes with its centre; the first output is whether to repeat this."""
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 

@@ -50,7 +50,8 @@ class WholeSteps(NamedTuple):
             transforms the covariance by F.
         gap: has the arguments of `predict` and returns N, the noise added over a gap of the control;
             None if the estimate ends at a gap.
-        sampled: the sampled function for the motion and for every sensor; None if it is linearised.
+        sampled: the sampled function for the motion and for every sensor; None for a motion or sensor
+            that is linearised.
         is_iterated: whether updates are iterated.
     """
 

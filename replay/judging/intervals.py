@@ -28,7 +28,7 @@ class Interval(NamedTuple):
     Attributes:
         value: the number.
         low, high: the ends; NaN if there is no interval, and equal to the number if it is exact.
-        unit: unit of all three; may be empty.
+        unit: unit of the number and both ends; may be empty.
         name: name of the number, if it is not clear from its context.
     """
 

@@ -1,4 +1,4 @@
-"""Judge of the outputs of a replay, which processes them block by block.
+"""Judge that processes the outputs of a replay block by block.
 
 It stores only sums: of every metric, of errors by step over the runs, and of errors by time for each
 run. Memory therefore does not grow with the length of a log, except for two numbers per step for the
@@ -248,7 +248,7 @@ class Judge:
 
         Errors of the steps of a run are correlated, so the NEES has the interval of the mean of a single
         step over the runs; innovations are uncorrelated, so the NIS has the interval of the mean of all
-        innovations. The intervals contain the metrics with `probability`.
+        innovations. Each interval contains its metric with the given `probability`.
         """
         sizes = self._sizes()
         return {key: _interval(*sizes[key], probability) for key in self.metrics if key in sizes}
@@ -270,7 +270,7 @@ class Judge:
         return found
 
     def squares(self, estimator: str, quantity: str, case: str) -> Squares:
-        """Return the NEES or NIS by which an `estimator` and `case` is judged as overconfident or not.
+        """Return the NEES or NIS that decides whether an `estimator` is overconfident in a `case`.
 
         `quantity` is the name of the metric.
         """
@@ -338,7 +338,7 @@ class Judge:
 
     @property
     def failures(self) -> list[str]:
-        """Return a sentence for every run that an estimator did not process, or not to the end."""
+        """Return a sentence for every run that an estimator did not process completely."""
         return [f"{self._names[run]}: {sentence}" for run, sentence in self.failed_runs]
 
     @property
@@ -358,7 +358,7 @@ class Judge:
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
-        """Return tables by topic of estimates with truth, one row per step; see `tables.step_table`."""
+        """Return tables of estimates with truth by topic, one row per step; see `tables.step_table`."""
         from fuselog.replay.judging.tables import step_table
 
         return {
@@ -403,7 +403,7 @@ class Judge:
 
     @property
     def judged(self) -> dict[str, Errors]:
-        """Return, by topic, the last errors of estimates, for the names and kinds of components."""
+        """Return, by topic, the latest errors, which state the names and kinds of the components."""
         return {topic: each.errors for topic, each in self._quantities.items()}
 
 

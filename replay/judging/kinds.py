@@ -1,7 +1,7 @@
-"""Interface for families that judge other outputs than estimates, such as tracks.
+"""Interface for families that judge outputs other than estimates, such as tracks.
 
-A judge is registered as an entry point `fuselog.judges`. The metrics that are registered for the type of
-its results compute numbers from the results.
+A judge is registered as an entry point `fuselog.judges`. Metrics that are registered for the type of the
+judge's results compute numbers from these results.
 """
 
 from abc import ABC, abstractmethod
@@ -34,7 +34,7 @@ class KindJudge(ABC):
 
     Attributes:
         runs: the judged runs.
-        unjudged: by topic, the reason why it cannot be judged; empty if it can.
+        unjudged: by topic, the reason why the output cannot be judged; empty if it can be judged.
         notes: sentences about the truths.
     """
 

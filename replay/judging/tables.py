@@ -1,6 +1,7 @@
 """Tables of judged results, with rows per step, per run and time span, or per estimate.
 
-They are made from the sums of the judge on request, so that printing metrics does not import pandas.
+The tables are made from the sums of the judge on request, so that printing metrics does not import
+pandas.
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,8 +24,8 @@ def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
     """Make a row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
-    If there are more than `judge.STEPS` steps, a row covers several, and `step` is the first of them.
-    If `bounds` has a bound over the ensemble, its values are used instead of those along the
+    If there are more than `judge.STEPS` steps, a row covers several, and `step` is the first of them. If
+    `bounds` has a bound over the ensemble, its values are used instead of the bounds along the
     trajectories.
     """
     errors, by_step = quantities.errors, quantities.by_step

@@ -73,7 +73,7 @@ class Squares:
 
     Attributes:
         name: NEES or NIS.
-        found: the mean, with its interval over the runs if there are enough.
+        found: the mean, with its interval over the runs if there are enough runs.
         aim: the expected value.
         usual: the 95 % interval of a consistent estimator.
     """
@@ -85,7 +85,7 @@ class Squares:
 
     @property
     def verdict(self) -> Consistency:
-        """Return the verdict, from the interval of a consistent estimator and that over the runs."""
+        """Return the verdict from the intervals over the runs and of a consistent estimator."""
         low, high = self.usual
         if math.isnan(self.found.value):
             return Consistency.UNDECIDED

@@ -1,8 +1,8 @@
 """Datasets of recordings, served by Rerun's catalog server on the loopback interface only.
 
-A dataset has segments, one for each run. A segment consists of layers, each of which is a file: one with
-its properties, which are columns of the dataset's table, one with the recording, and one for each
-estimator.
+A dataset has segments, one for each run. A segment consists of layers, each of which is a file. One
+layer has the properties, which are columns of the dataset's table; one has the recording; and there is
+one layer for each estimator.
 """
 
 import errno
@@ -66,7 +66,7 @@ class Dataset:
             raise BadInput(f"{layers[0][0].parent}: cannot be served ({error}); remove it") from error
 
     def lay_out(self, blueprint: Path, *, table: bool = False) -> None:
-        """Set the layout of all segments, or that of the table of segments, from an .rbl file."""
+        """Set the layout of all segments, or of the table of segments, from an .rbl file."""
         self._entry.register_blueprint(blueprint.resolve().as_uri(), segment_table=table)
 
     @property
@@ -85,7 +85,7 @@ def serve_dataset(name: str, port: int | None = None) -> Iterator[Dataset]:
 
     Args:
         name: its name.
-        port: by default any free one.
+        port: port of the server; by default, any free port.
 
     Raises BadInput if the extra is missing or the port is in use.
     """
@@ -153,12 +153,12 @@ def write_chunks(path: Path, name: str, chunks: Sequence[rc.Chunk]) -> None:
 
 
 def read_chunks(path: Path) -> list[rc.Chunk]:
-    """Read the chunks of an .rrd file without Rerun's own properties."""
+    """Read the chunks of an .rrd file, except Rerun's own properties."""
     return [each for each in rc.RrdReader(str(path)).stream() if each.entity_path != "/__properties"]
 
 
 def write_table_layout(path: Path, properties: Sequence[tuple[str, str]]) -> None:
-    """Write the layout of a table of segments that shows `properties` first, sorted by the first."""
+    """Write the layout of a table of segments that shows `properties` first, sorted by the first one."""
     columns = [column_of(*each) for each in properties]
     shown = [rrt.Column("rerun_segment_id", name="run"), *map(rrt.Column, columns)]
     hidden = [rrt.Column(name, visible=False) for name in _HIDDEN]

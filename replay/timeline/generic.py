@@ -1,8 +1,9 @@
 """Scene of a log that belongs to no family: all topics, by schema.
 
 Positions are drawn in a plane for each frame of the log and on a map of the earth: truths, estimates,
-fixes, poses, and landmarks with their measurements. The measurements of a sensor are drawn around it,
-and each quantity is plotted. If there are estimates, errors, NEES and NIS are shown next to these views.
+fixes, poses, and landmarks with their measurements. The measurements of a sensor are drawn around the
+sensor, and each quantity is plotted. If there are estimates, their errors, NEES and NIS are shown next
+to these views.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -140,7 +141,7 @@ def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
 
 
 def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:
-    """Draw all positions, with one view per frame side by side; return no panel without positions."""
+    """Draw all positions in views side by side, one per frame; return no panel without positions."""
     by_frame: dict[str, list[Stream]] = {"": []}
     for stream in sensed:
         if stream.schema.full_name in {*FIXES, LANDMARK} and stream["position_m"].shape[1] >= 2:

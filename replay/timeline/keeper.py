@@ -1,7 +1,7 @@
 """Launcher of `rerun ARGUMENTS` that ends when the other end of its standard input is closed.
 
-The operating system closes the pipe when its owner ends in any way, so no viewer outlives the process of
-fuselog that started it.
+The operating system closes the pipe when its owner ends for any reason, so no viewer outlives the
+fuselog process that started it.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Scene of robots: for each, a map with landmarks, errors, NEES, NIS and events."""
+"""Scene of robots: for each robot, a map with landmarks, and its errors, NEES, NIS and events."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -203,7 +203,7 @@ def _draw_view(canvas: Canvas, scene: Scene, robot: str, tracks: list[Track]) ->
 
 
 def _pairs(streams: Iterable[tuple[Stream, str]]) -> pd.MultiIndex:
-    """Return the sorted distinct (time, target) pairs of streams, each with its field of targets."""
+    """Return sorted, distinct (time, target) pairs of streams, each given with its field of targets."""
     times, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for stream, field in streams:
         times.append(stream.publish_time_ns)

@@ -1,7 +1,7 @@
 """Scene of a body that moves and rotates in space: its path, its axes, and their uncertainty.
 
-It is drawn for every estimate of a 3D position with an orientation, in any log. In long gaps between
-fixes, the path is marked and the plots are shaded.
+The scene is drawn for every estimate of a 3D position with an orientation, in any log. In long gaps
+between fixes, the path is marked and the plots are shaded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -198,7 +198,7 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
     """Draw ellipsoids of two standard deviations along the path, if they are wider than its line.
 
-    They are wireframes, because the camera may be inside an ellipsoid.
+    The ellipsoids are wireframes, because the camera may be inside one.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 

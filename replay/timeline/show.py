@@ -78,8 +78,8 @@ class Drawing:
     """Timeline of one run, drawn while the run is replayed.
 
     A receiver gets every block immediately. A file is drawn at the end from the messages that were kept:
-    all messages of a short run, otherwise a selection evenly spaced in time. Use the drawing as a
-    context manager, which finishes it at the end unless an exception was raised.
+    all messages of a short run, or a selection from a longer run, evenly spaced in time. Use the drawing
+    as a context manager, which finishes it at the end unless an exception was raised.
 
     Args:
         source: the run.
@@ -90,8 +90,8 @@ class Drawing:
         at: `worst` or `worst:ESTIMATOR`; without a focus, the case of this moment is shown first.
         sides: estimators whose scenes are shown side by side, with the differences of their errors.
         fans: distances of copies from their estimates.
-        layout: file to write the layout of a dataset's segments to; it also shows a text about the
-            segment.
+        layout: file to which the layout of a dataset's segments is written; the layout also shows a text
+            about the segment.
 
     Raises BadInput if neither `save` nor `connect` is given, if a sink fails (see `open_recording`), or
     if the focus does not exist.
@@ -233,7 +233,7 @@ def show(
         source: the run.
         outputs: output streams of the ensemble, by topic; without outputs, only the log is shown.
         errors: the errors of the ensemble's estimates.
-        run: index in the ensemble of the run `source`.
+        run: index of the run `source` in the ensemble.
         focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
         connect: URL of a receiver, rerun+http://HOST:PORT/proxy.

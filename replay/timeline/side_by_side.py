@@ -1,7 +1,7 @@
 """Scenes of a family side by side, one per estimator, and the differences of their errors.
 
-The family has drawn all entities once; each scene shows them except those of the other estimators.
-Colours, cursor and all other properties are therefore the same in all scenes.
+The family has drawn all entities once. Each scene shows all of them except the entities of other
+estimators. Colours, cursor and all other properties are therefore the same in all scenes.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.Vie
 def _draw_differences(
     canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
 ) -> list[rrb.TimeSeriesView]:
-    """Plot the errors of the other estimators minus those of the first, at common stamps."""
+    """Plot the errors of the other estimators minus the errors of the first, at common stamps."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
     plot, unit, drawn = entity_path("plots", case, "difference"), "-", False

@@ -1,7 +1,7 @@
 """Sinks of a timeline and of its layout: a file or a live viewer.
 
-A file appears under its name only when it is complete. Rerun encodes it in memory, and fuselog writes
-it, because Rerun's own writer does not report a full disk at the end and may wait forever. A live
+A file appears under its name only when it is complete. Rerun encodes the file in memory, and fuselog
+writes it, because Rerun's own writer does not report a full disk at the end and may wait forever. A live
 receiver is contacted before data is sent, because Rerun itself waits many seconds for a missing
 receiver, and forever for a receiver that does not answer.
 """

@@ -1,7 +1,7 @@
 """Viewer of Rerun, which is part of rerun-sdk: a window, a picture, or a page for a browser.
 
-It listens only on the loopback interface, does not report usage, does not use the network, and ends with
-the process that started it, even if that process is killed.
+The viewer listens only on the loopback interface, does not report usage, does not use the network, and
+ends with the process that started it, even if that process is killed.
 """
 
 import os

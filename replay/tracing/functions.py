@@ -1,9 +1,9 @@
 """Tracing of the functions of models for compiled kernels; plain Python calls the functions themselves.
 
-The arguments of a model's function are tuples of numbers, numbers, parameters (a NamedTuple of numbers),
-and sometimes arrays that it changes; the result is a tuple of numbers or one number. `Argument`
-describes the arguments. To trace a function, it is called once for every path through its conditions,
-and selections join the results.
+The arguments of a model's function are numbers, tuples of numbers, parameters (a NamedTuple of numbers),
+and sometimes arrays that it changes; the result is one number or a tuple of numbers. `Argument`
+describes the arguments. To trace a function, fuselog calls it once for every path through its
+conditions, and joins the results by selections.
 """
 
 import re
@@ -68,7 +68,7 @@ class TracedFunction:
         self.__name__ = getattr(function, "__name__", "function")
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the function; if arguments are traced numbers, copy its graph into their graph."""
+        """Call the function; for traced numbers, copy the graph of the function into their graph."""
         found = trace_of(arguments)
         if found is None or self.result.written:
             return self.function(*arguments)
@@ -77,7 +77,7 @@ class TracedFunction:
 
     @cached_property
     def graph(self) -> Graph:
-        """The graph, including that of requested derivatives."""
+        """The graph, including the graph of requested derivatives."""
         return Graph()
 
     @cached_property
@@ -118,8 +118,8 @@ class Derivative:
     Args:
         function: the function.
         seeds: (trace) -> derivatives of every input by the variables.
-        combine: (trace, returned nodes, their slopes) -> requested derivatives by index; missing ones
-            are zero.
+        combine: (trace, returned nodes, their slopes) -> requested derivatives by index; missing
+            derivatives are zero.
     """
 
     def __init__(
@@ -366,7 +366,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """Return a function's name, with its file and line, or those of an error inside its code."""
+    """Return a function's name, file and line, or the file and line of an error inside its code."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())

@@ -248,7 +248,7 @@ def choices(
 
 
 def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:
-    """Find nodes to compute before a loop: they are constant in it and contain a function call.
+    """Find nodes to compute before a loop: constant in the loop, and with a function call.
 
     Args:
         outputs: outputs of the loop.

@@ -29,7 +29,7 @@ _AT_WORK: list[Trace] = []
 
 @contextmanager
 def tracing(trace: Trace) -> Iterator[None]:
-    """Register a trace while functions may be called with its numbers."""
+    """Register a trace for as long as functions may be called with its numbers."""
     _AT_WORK.append(trace)
     try:
         yield

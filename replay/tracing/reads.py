@@ -132,9 +132,9 @@ def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
 
 @lru_cache(maxsize=1024)
 def _chains(code: CodeType) -> tuple[tuple[str, ...], ...] | None:
-    """Return the globals that code names, with their attributes; None if it uses names in other ways.
+    """Return the globals that code names, with attributes; None if it uses names in other ways.
 
-    Other ways are imports, classes, assignments to globals or attributes, and `__attributes__`.
+    Such other ways are imports, classes, assignments to globals or attributes, and `__attributes__`.
     """
     instructions = [each for each in dis.get_instructions(code) if each.opname != "EXTENDED_ARG"]
     chains: list[list[str]] = []

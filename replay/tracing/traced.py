@@ -1,8 +1,8 @@
 """Traced numbers, with which a model's function is called to record its graph.
 
-They support Python's operators and NumPy's functions of numbers, even inside arrays of objects.
-Conditions that depend on them are followed on both paths (see `functions`). Uses that need a known
-value, such as float() or an index, raise an error with advice.
+Traced numbers support Python's operators and NumPy's functions of numbers, even inside arrays of
+objects. Conditions that depend on traced numbers are followed on both paths (see `functions`). Uses that
+need a known value, such as float() or an index, raise an error with advice.
 """
 
 import linecache
@@ -108,7 +108,7 @@ class Trace:
         self.more: list[Node] = []  # newly reached conditions
 
     def decided(self, number: Traced) -> bool:
-        """Return the path to take at a condition; a new one is true now, and false in a later call."""
+        """Return the path at a condition; a new condition is true now and false in a later call."""
         node = (
             number.node
             if number.node.is_truth

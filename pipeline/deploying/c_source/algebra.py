@@ -1,6 +1,6 @@
 """The Kalman update in C, with the same operations as `fuselog.replay.inference.kalman.update`.
 
-`UPDATE` is the update of all filters except iterated ones, which use `ITERATE`. Both call `ALGEBRA`.
+`UPDATE` is the update of all filters except iterated filters, which use `ITERATE`. Both call `ALGEBRA`.
 Square-root forms have their own update and use only `COMMON`.
 
 NAME, T and M are placeholders for the filter's name, the size of its tangent space, and the largest

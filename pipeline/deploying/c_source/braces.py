@@ -10,7 +10,7 @@ def braced(text: str) -> str:
     """Put braces around every body of an `if`, `else`, `for` and `while`.
 
     Args:
-        text: C code with bodies on separate lines, indented more than their heads.
+        text: C code in which bodies are on separate lines, indented more than their heads.
     """
     found: list[str] = []
     opened: list[int] = []  # indents of the heads whose bodies have an open brace

@@ -32,7 +32,7 @@ class CFilter(NamedTuple):
         filtering: the filter, bound to a log.
         steps: its steps.
         precision: the precision of its numbers.
-        origin: description of what it was made from.
+        origin: description of the filter's source.
     """
 
     name: str
@@ -107,7 +107,7 @@ class CFilter(NamedTuple):
 
     @property
     def values(self) -> dict[str, dict[str, float]]:
-        """Return by name of the motion or sensor the parameters that it reads, with their values."""
+        """Return the parameters that the motion and each sensor read, with their values, by name."""
         names = number_fields(self.filtering.bound_model.model.parameters)
         return {
             part: {
@@ -119,7 +119,7 @@ class CFilter(NamedTuple):
         }
 
     def robustness(self, row: int) -> dict[str, float]:
-        """Return the options of the gate and of robust updates, NaN if they are off."""
+        """Return the options of the gate and of robust updates, which are NaN if they are off."""
         names = number_fields(self.filtering.bound_model.model.parameters)
         options = ("gate_reopens_s", "inflate_nis", "student_freedom", "switch_nis")
         return {

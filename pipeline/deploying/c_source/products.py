@@ -1,7 +1,8 @@
 """Products of covariances with Jacobians in C, as loops over entries that are not known to be zero.
 
 Sums have the same order as in `fuselog.replay.inference.linear_algebra.sparse`. Placeholders are those
-of `algebra`. `columns` lists, for each row of a matrix, the columns of these entries, followed by -1.
+of `algebra`. `columns` lists, for each row of a matrix, the columns of entries that are not known to be
+zero, followed by -1.
 """
 
 from collections.abc import Mapping
@@ -117,7 +118,7 @@ def slope_text(*, is_root: bool) -> str:
 
 
 def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
-    """Write the functions that add noise with at most `gains` components to matrices of these sizes."""
+    """Write the functions that add noise with at most `gains` components to matrices of `sizes`."""
     if not sizes:
         return []
     texts = [ADD_THROUGH.replace("WHAT", what).replace("SIZE", size) for what, size in sizes.items()]
@@ -131,6 +132,6 @@ def columns_text(name: str, columns: list[list[int]], size: str) -> str:
 
 
 def turn_text(factors: str, *, is_root: bool) -> str:
-    """Write the rotation of a covariance with an orientation; for a factor, it is one-sided."""
+    """Write the rotation of a covariance with an orientation; a factor is rotated on one side only."""
     what, sides = ("A factor P = J P", "1") if is_root else ("P = J P J'", "2")
     return TURN.replace("WHAT", what).replace("SIDES", sides).replace("FACTORS\n", factors)

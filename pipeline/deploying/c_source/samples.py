@@ -1,7 +1,8 @@
-"""Functions at weighted samples in C, as in `fuselog.replay.inference.kalman.regression`.
+"""Functions in C evaluated at weighted samples, as in `fuselog.replay.inference.kalman.regression`.
 
-Placeholders are those of `algebra`. SAMPLES is the largest number of samples, and DRAWN of entries in a
-sample. VALUES is the largest size of a function's value in tangent components, PLACES in components.
+Placeholders are those of `algebra`. SAMPLES is the largest number of samples, and DRAWN the largest
+number of entries in a sample. VALUES is the largest size of a function's value in tangent components,
+and PLACES its largest size in components.
 """
 
 import re
@@ -229,7 +230,7 @@ def samples_text(made: CFilter) -> list[str]:
 
 
 def _narrowing(made: CFilter, sampled: SampledFunction) -> list[str]:
-    """Write the functions that keep angles of samples within half a turn; [] without angles."""
+    """Write the functions that keep angles of samples within half a turn; [] if there are no angles."""
     if not sampled.turns:
         return []
     first, width, times = zip(*sampled.turns, strict=True)
@@ -281,7 +282,7 @@ def weighed(sampled: SampledFunction) -> str:
 
 
 def moments_call(sampled: SampledFunction, filled_in: str) -> str:
-    """Write the call that computes covariances, of which `filled_in` states the arrays."""
+    """Write the call that computes covariances; `filled_in` names the arrays that receive them."""
     if not len(sampled.axes):
         return f"find_moments(&samples, {weighed(sampled)}, {sampled.size}, {filled_in});"
     size = sampled.points.shape[1]

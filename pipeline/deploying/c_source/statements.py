@@ -1,4 +1,4 @@
-"""The names, declarations and loops of which the functions of a filter in C consist."""
+"""The names, declarations and loops that make up the functions of a filter in C."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -79,10 +79,11 @@ class Loops(NamedTuple):
 
 
 def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: str, what: str) -> Loops:
-    """Write the products with a step's Jacobian, and the sum with its noise.
+    """Write the products with a step's Jacobian, and the addition of the step's noise.
 
     Args:
-        step: a step that returns the Jacobian and its noise: gains G of variances u, or a covariance N.
+        step: a step that returns the Jacobian and the noise, which is either gains G of variances u, or
+            a covariance N.
         jacobian: the name of the Jacobian, F or H.
         rows: its number of rows.
         multiply: the call that forms the product.
@@ -121,7 +122,7 @@ def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
 
 
 def entries(step: Step, array: str) -> dict[str, Node]:
-    """Name the entries of an array that a step returns, as they are named in C."""
+    """Return the C names of the entries of an array that a step returns."""
     return {
         array + "".join(f"[{each}]" for each in place): node
         for (name, place), node in step.outputs.items()

@@ -108,7 +108,7 @@ class Cell(NamedTuple):
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """Yield a cell with a compass for every fault, and one without if the compass is not at fault."""
+    """Yield a cell with a compass for every fault, and one without it unless the compass is at fault."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):

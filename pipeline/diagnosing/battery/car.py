@@ -1,6 +1,6 @@
 """Faults in logs of a car that drives after 10 s at rest, with or without a prior.
 
-Faults of the car and of its inertial unit are selected by name. They change the columns directly,
+Faults of the car and of its inertial unit are selected by name. The faults change the columns directly,
 without the alterations that a diagnosis uses for corrections.
 """
 
@@ -36,12 +36,12 @@ def drive(seed: int, **changed: float) -> Car:
 
 
 def late(by_s: float) -> Callable[[Car], Car]:
-    """Make a fault by which fixes report the position of the antenna `by_s` earlier."""
+    """Make a fault in which fixes report the antenna's position from `by_s` earlier."""
     return lambda car: _seen(car._replace(fix_late_s=by_s), car)
 
 
 def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
-    """Make a fault by which fixes report an antenna away from the car's reference point."""
+    """Make a fault in which fixes refer to an antenna away from the car's reference point."""
     return lambda car: _seen(car._replace(lever_m=(forward_m, left_m)), car)
 
 

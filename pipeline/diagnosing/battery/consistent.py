@@ -1,7 +1,8 @@
 """A count of the causes that are named in logs of the car without faults, for many noise ratios.
 
-The wheels have the noise of `car`. Their error between two fixes is a multiple of the error of a fix,
-and between two headings a multiple of the error of a heading. The options list these ratios.
+The wheels have the noise of `car`. The wheels' error between two fixes is a multiple of a fix's error,
+and their error between two headings is a multiple of a heading's error. The options list the noise
+ratios.
 """
 
 from itertools import product
@@ -64,7 +65,7 @@ def log_of(ratios: Ratios, seed: int) -> MemorySource:
 
 
 def tried(ratios: Ratios, seed: int) -> dict[str, Any]:
-    """Search for a cause in a log without faults; its name is empty if none is found."""
+    """Search for a cause in a log without faults; the name is empty if no cause is found."""
     found = seek(log_of(ratios, seed), "ekf", {"kind": "ekf", "gate_probability": 1.0}, 1)
     named = [cause.hypothesis.name for cause in found.causes]
     return {**ratios._asdict(), "seed": seed, "cause": named[0] if named else ""}

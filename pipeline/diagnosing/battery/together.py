@@ -68,7 +68,7 @@ def pairs() -> list[tuple[str, ...]]:
 
 
 def triples() -> list[tuple[str, ...]]:
-    """Draw triples by a fixed seed, in which a log can distinguish each fault from the others."""
+    """Draw triples with a fixed seed, in which a log can distinguish each fault from the others."""
     every = [each for each in combinations(_in_order(), 3) if _is_told(each)]
     chosen = philox(63).choice(len(every), TRIPLES, replace=False)
     return [every[place] for place in sorted(chosen.tolist())]
@@ -110,7 +110,7 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def _estimate(causes: Sequence[Cause], right: Right) -> Interval | None:
-    """Return the value that causes give for a planted fault, under any name; a logarithm for noise."""
+    """Return the value that causes give for a planted fault under any name, for noise its logarithm."""
     for cause in causes:
         for each in (cause, *cause.others):
             for number in each.numbers:
@@ -138,7 +138,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _seeds(experiment: Experiment, case: int) -> range:
-    """Return the seeds of a case; no other case has them, so no logs share noise and errors."""
+    """Return the seeds of a case; no two cases share seeds, so no logs share noise and errors."""
     first = experiment.seed + case * experiment.runs
     return range(first, first + experiment.runs)
 

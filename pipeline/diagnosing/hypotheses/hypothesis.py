@@ -37,13 +37,14 @@ class Hypothesis:
     Attributes:
         kind: the common name of faults that cannot be distinguished.
         topic: the topic, or the parameter, that is wrong.
-        part: the component of the topic, if only one is wrong.
+        part: the component of the topic, if only one component is wrong.
         tried: values at which the search begins, the first two nearest to zero; empty for a fault
-            without a value. For a fault with several values, one tuple with the step of each.
+            without a value. For a fault with several values, this is one tuple that contains the step of
+            each value.
         limit: the largest magnitude of the value.
         without: function that returns the trial without a fault of this value.
         words: function that describes the fault, from the value and the ends of its 95 % interval.
-        remedy: function that returns advice for this value, or None if it is already followed.
+        remedy: function that returns advice for this value, or None if the advice is already followed.
         specials: values that are tried exactly, such as the factor of a unit.
         size: number of values of the fault.
         floor: the magnitude below which the value is no fault.
@@ -119,7 +120,7 @@ def has(parameters: Parameters | None, name: str) -> bool:
 
 
 def value_of(parameters: Parameters | None, name: str, stream: Stream) -> float:
-    """Return a parameter of a topic: the set value, or that of the channel, or zero."""
+    """Return a parameter of a topic: the set value, otherwise the channel's value, otherwise zero."""
     if not has(parameters, field_of(name)):
         return 0.0
     value = getattr(parameters, field_of(name))
@@ -169,8 +170,8 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
 def is_spike(likelihood: Likelihood, now: Trial, of: Hypothesis, value: float, gain: float) -> bool:
     """Test whether the gain of a noise falls faster next to its peak than measurements can explain.
 
-    Each of n measurements with m components has at most 2 m of the (Fisher) information on the
-    logarithm of a standard deviation, so the gain falls by about 1/2 within (2 m n)^-1/2. If it falls
+    Each of n measurements with m components has at most 2 m of the (Fisher) information on the logarithm
+    of a standard deviation, so the gain falls by about 1/2 within (2 m n)^-1/2. If the gain falls
     faster, the filter diverges for most values, the likelihood is jagged, and the peak has no meaning.
     """
     if of.kind not in NOISES:
@@ -184,9 +185,9 @@ def noise_gain_over(
 ) -> Callable[[Hypothesis, Number], tuple[float, float]]:
     """Make a function that computes the gain of a fault's correction under control noise.
 
-    It returns the mean and the standard deviation of the gain over logs; see
-    `fuselog.pipeline.tuning.control_noise`. For noises and outliers both are zero, because their
-    likelihood is meant to contain this noise.
+    The function returns the mean and the standard deviation of the gain over logs; see
+    `fuselog.pipeline.tuning.control_noise`. For noises and outliers, both the mean and the standard
+    deviation are zero, because their likelihood is meant to contain control noise.
     """
     # half of the NIS, if all of it were caused by this noise
     most = 0.5 * COMPONENTS * sum(likelihood.count.values())
@@ -215,7 +216,7 @@ def noise_gain_over(
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute the loss of log-likelihood, (pairs,), by each pair of opposite noises in later trials."""
+    """Compute how much log-likelihood (pairs,) each pair of opposite noises in later trials costs."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)
@@ -225,10 +226,11 @@ def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, 
     """Make a function that computes the inflation of a fault's gain.
 
     The gain is inflated if parts of the log disagree about the value more than their likelihoods imply.
-    The log is divided into PARTS parts. The inflation is PARTS times the variance of the slopes of their
-    log-likelihoods at the maximum, divided by the curvature of the whole; for a correct model, this
-    ratio is about 1. Kent, Robust properties of likelihood ratio tests, Biometrika 69, 1982, pages 19
-    to 27. The inflation is set to 1 for faults without a value, and if chance can explain it.
+    The log is divided into PARTS parts. The inflation is PARTS times the variance of the slopes of the
+    parts' log-likelihoods at the maximum, divided by the curvature of the whole log-likelihood; for a
+    correct model, this ratio is about 1. Kent, Robust properties of likelihood ratio tests, Biometrika
+    69, 1982, pages 19 to 27. The inflation is set to 1 for faults without a value, and if chance can
+    explain the inflation.
     """
 
     def inflation(of: Hypothesis, value: Number, gain: float) -> float:

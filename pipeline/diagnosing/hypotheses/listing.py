@@ -227,7 +227,7 @@ def of_stamps(
     Args:
         stream: the topic's messages.
         reading: function that reads the measured numbers of the estimated object.
-        parameters: the estimator's parameters, one of which may be this delay.
+        parameters: the estimator's parameters, one of which may be the topic's delay.
         first_ns: the first stamp of the run.
         hold_s: half of the time for which a control applies; a smaller delay is no fault.
         lags_s: further delays to try.
@@ -312,7 +312,7 @@ def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
 
 
 def _correlations(rows: Floats, column: Floats, is_in: NDArray[np.bool_]) -> Floats:
-    """Correlate each row (k, n) with a column (n,) over common values; -1 if unknown."""
+    """Correlate each row (k, n) with a column (n,) over common values; return -1 if unknown."""
     count = np.maximum(is_in.sum(axis=1, keepdims=True), 1)
     rows, columns = (
         np.where(is_in, each - np.where(is_in, each, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
@@ -364,7 +364,7 @@ def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Choose the parts with the largest mean NIS, or none if no mean is too large."""
+    """Choose the parts with the largest mean NIS; choose no parts if no mean is too large."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

@@ -60,10 +60,11 @@ def of_noises(
 
 
 def of_declared(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
-    """Yield hypotheses that numbers which an estimator declares are wrong, if its reading is unknown.
+    """Yield hypotheses that an estimator's declared numbers are wrong, if what it reads is unknown.
 
-    Noises and numbers that cannot be negative are multiplied by factors. So are positive numbers in the
-    command of a program that reads a log, because nothing else is known about them.
+    Noises and numbers that cannot be negative are multiplied by factors. Positive numbers in the command
+    of a program that reads a log are also multiplied by factors, because nothing else is known about
+    them.
     """
     parameters = bound[0].parameters
     if parameters is None:
@@ -100,7 +101,7 @@ def _scaled(of: Parameter, value: float, kind: Kind) -> Hypothesis:
 
 
 def _value_of(bound: Sequence[Bound], source: MemorySource, name: str) -> float:
-    """Return the value of a number: the set value, or that of a channel, or the default; else NaN."""
+    """Return a number's set value, otherwise its channel's value, its default, or NaN, in this order."""
     for each in bound:
         with suppress(BadInput):
             value, _ = value_at_start(name, source, each)

@@ -67,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
-    """Tabulate the error of each estimator at every shot of every run, NaN if it has no estimate.
+    """Tabulate the error of each estimator at every shot of every run, NaN without an estimate.
 
     `nees` is per component, for all components that the estimate and the truth have in common.
     """

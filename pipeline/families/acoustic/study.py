@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Tabulate the ratios of ellipse areas, bearings only to another mode, figures 22 and 23."""
+    """Tabulate ellipse areas of bearings only relative to those of another mode, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)
@@ -152,7 +152,7 @@ def _table_of_maps(maps: Maps) -> pd.DataFrame:
 
 
 def _metrics(cases: list[Case]) -> dict[str, Any]:
-    """Compute a scenario's metrics at the paper's noise, and lists of some over all noise levels."""
+    """Compute a scenario's metrics at the paper's noise, and list some metrics over all noise levels."""
     values: dict[str, Any] = {}
     name = f"scenario-{cases[0].number}"
     for case in _nominal(cases):

@@ -3,7 +3,7 @@
 Log-likelihood ratios are calibrated on users other than those to whom they are applied. A matcher's
 ratios are resampled by users as clusters: a replicate draws users with replacement, and all intervals
 are quantiles over the replicates. The data contain one genuine score per user and matcher, so further
-probes of a person are simulated by scores of other persons. These simulated probes are independent, or
+probes of a person are simulated with scores of other persons. These simulated probes are independent, or
 their normal scores have an assumed correlation. Only two kinds of sequences are entirely real: one
 person with one matcher after another, and many impostors against one identity.
 """
@@ -62,12 +62,12 @@ class Options(Parameters):
         sequences: number of sequences of probes to draw.
         replicates: number of times that users are resampled.
         most_probes: number of probes after which an undecided sequence ends.
-        label_ratio: absolute sum of the other matchers' log-likelihood ratios from which on a probe is
-            labelled and used to monitor a matcher.
+        label_ratio: smallest absolute sum of the other matchers' log-likelihood ratios for which a probe
+            is labelled and used to monitor a matcher.
         run_length: specified mean number of labelled probes until a false alarm.
         watched: number of series of probes in which a matcher is monitored.
-        watched_probes: probes in a series without a fault.
-        fault_probes: probes in a series with a fault.
+        watched_probes: number of probes in a series without a fault.
+        fault_probes: number of probes in a series with a fault.
     """
 
     rates: list[tuple[Share, Share]] = [(0.01, 0.01), (0.001, 0.01)]
@@ -146,7 +146,7 @@ def _matrix(fused: Fused) -> Floats:
 def wald_tests(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate errors and numbers of probes of Wald's test by kind of sequence, matcher and rates."""
+    """Evaluate Wald's test: errors and numbers of probes by kind of sequence, matcher and rates."""
     count, most = options.sequences, options.most_probes
     for stated in options.rates:
         rates = Rates(*stated)
@@ -238,7 +238,7 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
 def watched(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Count the probes until the alarm, by fault and matcher; fault "none" is a faultless matcher.
+    """Count the probes until the alarm, by fault and matcher; "none" means a matcher without a fault.
 
     Half of the users are the reference; the other half is monitored.
     """
@@ -276,7 +276,7 @@ def watched(
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
-    """Draw probes and label them with the other matchers; drop probes that these leave undecided.
+    """Draw probes and label them with the other matchers; drop probes that those leave undecided.
 
     Args:
         drawn: the matcher's ratios, and the users.

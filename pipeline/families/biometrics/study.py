@@ -169,7 +169,7 @@ def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
 
 
 def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
-    """Compute 95 % intervals of GAR at FAR and EER of the first run from resampled users."""
+    """Compute 95 % intervals of the first run's GAR at FAR, and of its EER, from resampled users."""
     names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
     rows = []
     for topic, fused in _complete(replayed).items():

@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 
 class BinghamOptions(Parameters):
-    """The estimator to compare with the others, and the grid of the reference.
+    """The estimator to compare with the others, and the grid of the reference filter.
 
     Attributes:
         estimator: label of the estimator to compare with the others.

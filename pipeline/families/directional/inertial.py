@@ -1,4 +1,4 @@
-"""Study of orientation from inertial samples, by the total error over each trial's movement.
+"""Study of orientation from inertial samples: the total error over the movement of each trial.
 
 BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. Only the samples that its authors marked as
 movement are evaluated. An error is the total angle from the true to the estimated orientation.

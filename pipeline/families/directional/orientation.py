@@ -200,7 +200,7 @@ def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
 def disturbed_spans(
     replayed: Replayed, trial: str, case: str, options: OrientationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Yield the spans that estimators with a model of the local field consider disturbed."""
+    """Yield the spans in which estimators that model the local field consider it disturbed."""
     [source] = replayed.sources
     for label, states in states_of(replayed, trial):
         if not set(COMPONENTS) <= set(states.components):

@@ -66,7 +66,7 @@ def propagation_errors(
 ) -> dict[str, MomentErrors]:
     """Propagate samples and truth once, fit both by mixed maximum likelihood, and compare their moments.
 
-    Keys of the result: `five-wW` for every central weight, W in percent, `ukf`, `random`.
+    The keys of the result are `five-wW` for every central weight (W in percent), `ukf` and `random`.
     """
     rho, sigma = np.array(options.correlations), np.array(options.sigma_rad)
     unit = np.stack([np.ones_like(rho), rho, rho, np.ones_like(rho)], axis=-1).reshape(-1, 2, 2)
@@ -118,7 +118,7 @@ def _moved(samples: Samples, coupling_rad: float) -> Samples:
 
 
 def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
-    """Study propagation, figure 3, in random `runs`; see `fuselog.pipeline.runs.experiment.Study`."""
+    """Study propagation with random samples, figure 3; see `fuselog.pipeline.runs.experiment.Study`."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation uses no data; leave out record, import and estimators")
@@ -195,7 +195,7 @@ class FilterOptions(Parameters):
 
 
 def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
-    """Compare the toroidal filter with unscented ones; see `fuselog.pipeline.runs.experiment.Study`."""
+    """Compare toroidal and unscented filters; see `fuselog.pipeline.runs.experiment.Study`."""
     options: FilterOptions = setting.options
     outcome = Outcome()
     sources: list[MemorySource] = []

@@ -1,8 +1,8 @@
 """Study of real angles on the torus: densities of a protein's dihedrals, and wind predictions.
 
-Fits are evaluated on angles that were not used: dihedrals in other parts of the chain, and winds in the
-second half with the noise and coupling that are most likely in the first half. Neighbours are
-correlated, so intervals are Student's intervals of block means.
+Fits are evaluated on angles that were not used for them: dihedrals in other parts of the chain, and
+winds in the second half. For the winds, the noise and the coupling are those that are most likely in the
+first half. Neighbours are correlated, so intervals are Student's intervals of block means.
 """
 
 from collections.abc import Callable, Mapping
@@ -252,7 +252,7 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Return every hour except the first as a measurement of the direction, without its turn."""
+    """Return a measurement of the direction for every hour except the first, without the turn."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
@@ -325,7 +325,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
     Args:
         wind: (hours,), directions in rad.
-        half: number of hours from the start to which the width is fitted.
+        half: number of first hours that are used to fit the width.
 
     Returns:
         Two predictions by name, with wrapped normal noise only, and with occasional arbitrary jumps.

@@ -37,7 +37,8 @@ class Condition(Parameters):
     """Biases and noise of a condition.
 
     Attributes:
-        bias_deg: magnitude of the biases; it scales those of the scenario files, which are 1 deg.
+        bias_deg: magnitude of the biases, by which the biases of 1 deg in the scenario files are
+            multiplied.
         sigma_rad: standard deviation of azimuth and elevation.
     """
 
@@ -159,7 +160,7 @@ class Case:
         return dilution_of_precision(error_m, np.linalg.norm(offset, axis=2), self.scene.sigma_rad)
 
     def observability(self, scene: Scene | None = None, targets: Floats | None = None) -> Observability:
-        """Analyse the observability of scheme 3, or of another scene or other targets (n, 3)."""
+        """Analyse the observability of scheme 3; `scene` and `targets` (n, 3) replace the case's own."""
         scene = scene or self.scene
         places = np.array(self.parameters.target_position_m) if targets is None else targets
         bias = self.parameters.bias_rad.ravel()[scene.wanted]

@@ -1,10 +1,9 @@
 """Study of moving lines of sight: which biases are observable, why, and how accurately.
 
-If sensors fly straight side by side, one direction of the state is unobservable: if the whole scene and
-the attitudes of the sensors are rotated about the line between the sensors, no measurement changes;
-targets with constant velocities then have different, but still constant, velocities. A manoeuvre, a
-sensor off the line, or a known target should make this direction observable; each is a case of the
-study.
+If sensors fly straight side by side, one direction of the state is unobservable: rotating the whole
+scene and the attitudes of the sensors about the line between the sensors changes no measurement. Targets
+with constant velocities then have different, but still constant, velocities. A manoeuvre, a sensor off
+the line, or a known target should make this direction observable; each is a case of the study.
 """
 
 from collections.abc import Mapping
@@ -104,8 +103,8 @@ def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -
     """Find the least observable direction of each run, and its eigenvalue relative to the prior.
 
     Due to rounding, the zero eigenvalue of a singular information matrix becomes positive or negative,
-    with a magnitude of up to the largest eigenvalue times the machine precision. Therefore this product
-    is the lower limit of the smallest eigenvalue.
+    with a magnitude of up to the largest eigenvalue times the machine precision. Therefore, the largest
+    eigenvalue times the machine precision is the lower limit of the smallest eigenvalue.
     """
     settings = {"kind": OBSERVABILITY, "model": MODEL, **shared}
     found = replay_in_memory(sources, {"observability": settings})

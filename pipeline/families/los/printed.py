@@ -86,7 +86,7 @@ def steepest_deg(case: Case) -> float:
 
 
 def _share_from_print(case: Case, runs: int = 200) -> float:
-    """Compute the share of noisy runs that reach the estimate from the printed starting point."""
+    """Compute the share of noisy runs whose estimate is also reached from the printed starting point."""
     clean = optical.predict(case.scene, case.truth[None])
     noise = np.random.default_rng(case.number).normal(size=(runs, *clean.shape[1:]))
     measured = clean + case.scene.sigma_rad * noise

@@ -1,10 +1,10 @@
 """Study of robots that share estimates under stress, on recorded logs.
 
-When a robot observes another, both receive a message. The study removes some of these sightings from the
-log: all except one per interval, a random half, or those of a robot that leaves. In another case, a
-robot has a wrong and overconfident prior. The estimators fuse immediately, so `network-stress` tests
-out-of-sequence messages. Intervals are over the robots; for the wrong prior, they exclude the robot that
-has it.
+When a robot observes another, both receive a message. The study removes some of the robots' sightings of
+each other from the log: all except one per interval, a random half, or those of a robot that leaves. In
+another case, a robot has a wrong and overconfident prior. The estimators fuse immediately, so
+`network-stress` tests out-of-sequence messages. Intervals are over the robots; for the wrong prior, they
+exclude the robot that has it.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ class CooperativeStressOptions(Parameters):
             for each.
         leaving: number of the robot that is absent in the middle third.
         liar: number of the robot whose prior is wrong.
-        lie_m: error of this prior along x, in m.
+        lie_m: error of the wrong prior along x, in m.
     """
 
     intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)
@@ -93,7 +93,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int]:
-    """List a log's robots; raise BadInput if the robot to leave or to lie is missing."""
+    """List a log's robots; raise BadInput if the robot that leaves or the one that lies is missing."""
     topics = [topic.removeprefix("/robot").partition("/") for topic in source.streams]
     numbers = sorted(int(number) for number, _, leaf in topics if leaf == "range_bearing")
     for name in ("leaving", "liar"):
@@ -132,7 +132,7 @@ def _half(generator: np.random.Generator, stream: Stream, _: int, __: Booleans) 
 
 
 def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Booleans:
-    """Select all sightings except those with the leaving robot in the middle third of the log."""
+    """Select all sightings except those of or by the leaving robot in the middle third of the log."""
     times = stream.publish_time_ns
     first, second = times[0] + (times[-1] - times[0]) * np.array([1, 2]) // 3
     is_away = (times >= first) & (times < second)

@@ -1,8 +1,9 @@
 """Study of several inertial units with clock offsets on one body, to find the benefit of more units.
 
 Each recording is replayed with one unit, with the mean of all units, and with one filter per unit. The
-estimates of these filters are fused by covariance intersection, because they all use the same fixes. The
-stamps of the units are corrected with a known offset, with the most likely offset, or not at all.
+estimates of the filters of single units are fused by covariance intersection, because all these filters
+use the same fixes. The stamps of the units are corrected with a known offset, with the most likely
+offset, or not at all.
 """
 
 import re
@@ -234,7 +235,7 @@ def _offset(
     estimator: Mapping[str, Mapping[str, Any]],
     search_s: tuple[float, float, float],
 ) -> float:
-    """Find the first unit's most likely clock offset; extend the search range if it is at an end."""
+    """Find the first unit's most likely clock offset; extend the range if the offset is at its end."""
     (low, high, step), [label] = search_s, estimator
     tried = np.arange(low, high + 0.5 * step, step)
     # use the same fixes for all offsets: likelihoods of different data are not comparable
@@ -355,7 +356,7 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
 
 
 def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
-    """Draw position and heading errors by recording, for the smoother's units and offsets."""
+    """Draw the smoother's position and heading errors by recording, per choice of units and offset."""
     rows = table[table["estimator"] == options.smoother]
     panels = []
     for name, label in (

@@ -74,7 +74,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _after(errors: Errors, settle_s: float) -> Errors:
-    """Select the errors from `settle_s` after the epoch on; raise BadInput if there are none."""
+    """Select the errors from `settle_s` after the epoch on; raise BadInput if there are no errors."""
     kept = errors.elapsed_s > settle_s + 1e-9
     if not kept.any():
         raise BadInput(

@@ -22,7 +22,7 @@ from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """A delay of the ranges that the recordings do not state.
+    """A delay of the ranges, which the recordings do not state.
 
     Attributes:
         range_delay_s: age of a range at its stamp, in s; added to an estimator's own `range_delay_s`.

@@ -2,7 +2,8 @@
 
 Published errors are for a part of each path, which begins and ends when the path enters given regions.
 The truth is interpolated linearly, after samples with a wrong height are removed (see `level_m`).
-Published tracks are evaluated at their stamps, our estimates at the stamps of the truth.
+Published tracks are evaluated at their own stamps, and our estimates are evaluated at the stamps of the
+truth.
 """
 
 import re
@@ -165,7 +166,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """Read the errors that are published with a recording, by name; empty if there is no such file."""
+    """Read the errors that are published with a recording, by name; return {} if the file is missing."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

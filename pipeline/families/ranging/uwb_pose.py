@@ -2,7 +2,7 @@
 
 Estimates are evaluated at their stamps from `skip_s` on, and the truth is interpolated linearly. The
 body of the motion capture differs slightly from that of the tags, so errors have a constant part that no
-filter can estimate. Therefore results are also computed without the mean.
+filter can estimate. Therefore, results are also computed after the mean error is subtracted.
 """
 
 from typing import Any

@@ -53,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict[str, Any]]:
-    """Return the S2KF with 25 and 50 samples and rotated sets, under their own labels."""
+    """Return S2KF estimators with rotated sets of 25 and 50 samples, under their own labels."""
     return {
         f"{label}{TURNED}{turn}": values | {"kind": f"{values['kind']}:rotation={turn}"}
         for label, values in experiment.estimators.items()

@@ -100,10 +100,10 @@ def draw(name: str, seed: int) -> Samples:
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """Compare 2N+1 LCD samples, raw and moment-corrected, with the UKF's samples, except for rotation.
+    """Compare 2N+1 LCD samples, raw and moment-corrected, with the UKF's samples, up to a rotation.
 
-    In each set, the distances between samples and those from the origin are sorted; a rotation does not
-    change them. Returns the largest difference from the UKF's distances, for both sets.
+    In each set, the distances between samples and the distances from the origin are sorted; a rotation
+    does not change them. Returns the largest difference from the UKF's distances, for both sets.
     """
     points = lcd_samples(dimension, 2 * dimension + 1, np.random.default_rng(seed), starts=starts)
     wanted = _invariants(unscented(dimension).points)

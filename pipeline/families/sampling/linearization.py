@@ -94,7 +94,7 @@ def ensembles(
 
 
 def track(estimates: Ragged, steps: int) -> Track:
-    """Arrange the estimates of all runs in arrays, NaN after a run failed."""
+    """Arrange the estimates of all runs in arrays, which are NaN after a run failed."""
     counts = np.diff(estimates.offsets)
     there = np.arange(steps) < counts[:, None]
     size = estimates["mean"].shape[1]
@@ -106,7 +106,7 @@ def track(estimates: Ragged, steps: int) -> Track:
 
 
 def rmse(difference: Floats) -> Floats:
-    """Compute the RMS by step of differences (runs, steps, ...), ignoring NaN."""
+    """Compute the RMS of differences (runs, steps, ...) at each step, ignoring NaN."""
     squared = np.sum(difference**2, axis=tuple(range(2, difference.ndim)))
     return np.sqrt(np.nanmean(squared, axis=0))
 

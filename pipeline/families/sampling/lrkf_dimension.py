@@ -202,7 +202,7 @@ def driven(
 
 
 def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure errors with intervals over the functions, and log error ratios of `RATED` to others."""
+    """Measure errors with intervals over functions, and log ratios of errors of `RATED` to others."""
     for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
         case = f"n{dimension}-{direction}"
         for quantity in ("mean_error", "covariance_error", "cross_error"):
@@ -216,7 +216,7 @@ def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
-    """Measure errors by drive, and the change of the position error in % with other samples."""
+    """Measure errors by drive, and by how many % other samples change the position error."""
     found = outcome.metrics
     for drive, of_drive in runs.groupby("drive", sort=False):
         quantities = ["position_rmse_m", "nees_per_component", "samples"]
@@ -253,7 +253,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """Draw a line for each family of samplings, and a horizontal one for the EKF, without samples."""
+    """Draw a line for each family of samplings, and a horizontal line for the EKF, which uses none."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

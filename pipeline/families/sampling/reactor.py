@@ -91,7 +91,7 @@ def step_errors(ensemble: Ensemble) -> pd.DataFrame:
 
 
 def metrics(steps: pd.DataFrame, case: str) -> dict[str, MetricValue]:
-    """Average errors over steps and seeds; for compared errors, also return the values of every seed.
+    """Average errors over steps and seeds; for errors of mean and covariance, add each seed's value.
 
     For the mean, also return the errors of the first and the last steps, and the share of steps in which
     the error exceeds the UKF's.

@@ -34,8 +34,8 @@ class BoundOptions(Parameters):
 
     Attributes:
         margin: ratio of the odometry bound to the largest odometry error.
-        bearing_quantile: quantile of bearing errors that is the bound, because a misidentified landmark
-            may cause any error.
+        bearing_quantile: quantile of bearing errors that is used as the bound, because a misidentified
+            landmark may cause any error.
     """
 
     margin: PositiveFloat = 1.2

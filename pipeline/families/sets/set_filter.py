@@ -116,7 +116,7 @@ def summarise(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Measure assumptions, their violations and detected faults, by filter and robot."""
+    """Measure violations of assumptions, and detected faults, by filter and robot."""
     metrics: dict[str, MetricValue] = {}
     for each in found:
         known = each.sets.known
@@ -154,7 +154,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Count how often a filter rightly, wrongly or never decides if a frame or its past is faulty."""
+    """Count right, wrong and missing decisions of a filter on whether a frame or its past is faulty."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())

@@ -94,7 +94,7 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
 
 
 def _without_errors(runner: Runner) -> dict[str, MetricValue]:
-    """Compute the ratios of areas in the same scenes without errors; exact sets are largest there."""
+    """Compute the ratios of areas in the same scenes without errors, where exact sets are largest."""
     replayed = runner.replay(runner.obtain({"error_share": 0.0}))
     gap_limit_s = runner.experiment.gap_limit_s
     return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)
@@ -160,7 +160,7 @@ def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
 
 
 def _value(metrics: Mapping[str, MetricValue], key: str) -> float:
-    """Return a metric that is a number; NaN otherwise."""
+    """Return a metric if it is a number, otherwise NaN."""
     found = metrics.get(key)
     return float(found) if isinstance(found, int | float) else float("nan")
 

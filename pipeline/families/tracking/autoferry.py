@@ -1,8 +1,8 @@
 """Study of Autoferry scenarios: the benefit of each sensor and of data association for vessel tracks.
 
 Quays, marks and other craft have no reference, so GOSPA ignores everything more than 50 m from both
-vessels. Trackers are replayed in stamp order. Some are also replayed in order of arrival, with each
-policy for late scans.
+vessels. Trackers are replayed in stamp order. Some trackers are also replayed in order of arrival, with
+each policy for late scans.
 """
 
 from collections.abc import Mapping, Sequence
@@ -80,7 +80,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _scenarios(experiment: Experiment, setting: Setting) -> tuple[list[str], list[MemorySource]]:
-    """Find the scenario folders in the data folder by number; if none, return the data folder."""
+    """Find the scenario folders in the data folder by number; if there are none, return that folder."""
     assert setting.data is not None
     assert experiment.import_ is not None
     found = sorted(setting.data.glob("*/*_detections.json")) if setting.data.is_dir() else []
@@ -99,10 +99,10 @@ def _late_table(
     in_order: Mapping[str, Ragged],
     runs: Mapping[str, Judged],
 ) -> pd.DataFrame:
-    """Tabulate by estimator, policy for late scans, and scenario.
+    """Tabulate the results by estimator, policy for late scans, and scenario.
 
     `from_in_order_m` is the largest distance from the tracks in stamp order, after the last late scan;
-    infinite if there are different tracks.
+    it is infinite if the tracks have different numbers.
     """
     tables = []
     known = experiment.estimators
@@ -123,7 +123,7 @@ def _late_table(
 
 
 def _last_late_ns(source: MemorySource) -> int:
-    """Return when the last late scan of a run arrived; 0 if there are no late scans."""
+    """Return when the last late scan of a run arrived, or 0 if there are no late scans."""
     arrivals = [
         stream.log_time_ns[stream.log_time_ns > stream.publish_time_ns]
         for topic, stream in source.streams.items()

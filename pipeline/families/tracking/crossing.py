@@ -1,7 +1,7 @@
-"""Study of simulated crossing targets: the benefit of data association in clutter.
+"""Study of the benefit of data association in clutter, with simulated crossing targets.
 
-Every case has a clutter rate and a detection probability; the targets of a run and their true
-trajectories are the same in all cases.
+Every case combines a clutter rate with a detection probability. A run has the same targets, with the
+same true trajectories, in all cases.
 """
 
 from itertools import product
@@ -26,7 +26,7 @@ class CrossingOptions(Parameters):
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.
         detection_probability: probabilities of detection.
-        compared: pairs of estimators to compare, the first with the second.
+        compared: pairs of estimators; the first of each pair is compared with the second.
     """
 
     clutter_per_scan: tuple[float, ...] = (10.0, 50.0, 100.0)
@@ -82,7 +82,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
-    """Measure how much differences in GOSPA grow from the least to the most clutter."""
+    """Measure how much differences in GOSPA between estimators grow from least to most clutter."""
     for probability, rows in every.groupby("detection_probability", sort=False):
         by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
         for label, other in pairs:

@@ -1,9 +1,9 @@
 """Export of tracks and truths in the format of the MOT Challenge, which TrackEval reads.
 
-Frames are every half second from the run's epoch on; the first has number 1. Tracks are predicted to the
-frames, and truths are interpolated. A target has no extent: its box begins at its position, in metres,
-and has zero width and height. In TrackEval, use similarity by Euclidean distance of points, not by
-overlap.
+There is a frame every half second from the run's epoch on; the first frame has number 1. Tracks are
+predicted to the frames, and truths are interpolated. A target has no extent: its box begins at its
+position, in metres, and has zero width and height. In TrackEval, choose the similarity that uses the
+Euclidean distance of points, not the overlap of boxes.
 
     frame,id,x,y,0,0,1,-1,-1,-1      a track
     frame,id,x,y,0,0,1,1,1           a truth; the last three mean counted, class 1, fully visible
@@ -27,10 +27,10 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """Return topics and lines by file name, with a file of tracks per tracker and one of all truths.
+    """Return each file's topics and lines by its name: a file of tracks per tracker, and one of truths.
 
-    `topics` contains the wanted topics, or is empty for all. Raises BadInput if a topic does not exist
-    or has neither tracks nor truths in the plane, or if no topic has them.
+    `topics` contains the wanted topics, or is empty for all. Raises BadInput if a requested topic does
+    not exist or has neither tracks nor truths in the plane, or if the log has no such topic.
     """
     unknown = [topic for topic in topics if topic not in log.topics]
     if unknown:

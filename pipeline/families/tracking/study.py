@@ -1,7 +1,7 @@
 """Common parts of studies of trackers: evaluation of tracks by run, and comparison of trackers.
 
-Tracks are evaluated as in `fuselog.replay.families.tracking.judging.errors`, at instants that are the
-same for all trackers.
+Tracks are evaluated as in `fuselog.replay.families.tracking.judging.errors`, at the same instants for
+all trackers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ SWITCH_PENALTY_M = 10.0
 
 
 def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream, Stream]:
-    """Return the number of an estimator's tracks in every scan of a run, and these tracks.
+    """Return an estimator's number of tracks in every scan of a run, and the tracks themselves.
 
     Raises BadInput if the estimator is not a tracker.
     """
@@ -57,9 +57,10 @@ def figures_of(
 ) -> dict[str, float]:
     """Compute performance measures of the tracks of a run.
 
-    If only some targets have a truth, measures of whole tracks ignore tracks that are never within the
-    cutoff of such a target. A track's length is the time from its first to its last instant. Trajectory
-    GOSPA is divided by the square root of the number of instants, to be comparable with GOSPA.
+    If only some targets have a truth, measures of whole tracks ignore each track that never comes within
+    the cutoff of a target with a truth. A track's length is the time from its first to its last instant.
+    Trajectory GOSPA is divided by the square root of the number of instants, so that it can be compared
+    with GOSPA.
 
     Args:
         tracked: the tracks at k instants.
@@ -89,7 +90,7 @@ def table_of(
     runs: Mapping[str, Judged],
     delay_s: float = 0.0,
 ) -> pd.DataFrame:
-    """Tabulate by estimator and run; ignore outputs that arrived more than `delay_s` late."""
+    """Tabulate measures by estimator and run; ignore outputs that arrived more than `delay_s` late."""
     rows = []
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
@@ -105,7 +106,7 @@ def means_of(table: pd.DataFrame) -> dict[str, dict[str, float]]:
 
 
 def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
-    """Compute mean NIS per component of tracks' likeliest detections, by estimator and sensor."""
+    """Compute the mean NIS per component by estimator and sensor, from tracks' likeliest detections."""
     return {
         f"{each.estimator}.nis_per_component.{each.case}": float(each.squared.sum() / each.degrees.sum())
         for each in innovations

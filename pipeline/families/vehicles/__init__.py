@@ -1,1 +1,1 @@
-"""Studies of cooperative vehicles: Zhang et al. 2016; begin with `study`."""
+"""Studies of cooperative vehicles after Zhang et al. 2016; begin with `study`."""

@@ -37,7 +37,7 @@ class VehiclesOptions(Parameters):
         cases: changes to the scenario's parameters, by the name of a case.
         reference: label of the Kalman filter.
         few: parameters of estimators that are too slow to replay all runs, by label.
-        few_runs: number of runs of the first case that these estimators replay.
+        few_runs: number of runs of the first case that the slow estimators replay.
     """
 
     cases: dict[str, dict[str, Any]] = {"deterministic": {}}
@@ -49,8 +49,9 @@ class VehiclesOptions(Parameters):
 class Scores(NamedTuple):
     """Total errors, eq (20), of every run (runs,), with fixed labels and with the best labels.
 
-    The arrays by step (runs, steps) are squared errors, and GOSPA in m (cutoff 10 m). `failed` counts
-    runs that did not reach the end. Sets have no labels, so their errors with fixed labels are NaN.
+    The arrays by step, (runs, steps), contain squared errors, and GOSPA in m (cutoff 10 m). `failed`
+    counts runs that did not reach the end. Set estimates have no labels, so their errors with fixed
+    labels are NaN.
     """
 
     fixed: Floats
@@ -129,7 +130,7 @@ def score(estimates: Floats, truths: Floats) -> Scores:
 
 
 def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
-    """Sum squared errors and GOSPA by run and step."""
+    """Make scores from squared errors and GOSPA by run and step, and count the failed runs."""
     failed = int(np.isnan(assigned).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
 
@@ -141,7 +142,7 @@ def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -
 
     Args:
         outputs: outputs by topic.
-        found: the evaluated set estimate, which has GOSPA.
+        found: the evaluated set estimate, including its GOSPA.
         truths: (runs, steps, vehicles, 2), in m.
     """
     topic = f"/estimates/{found.estimator}/{found.case}"
@@ -165,7 +166,7 @@ def scores_of(
     labels: Iterable[str],
     others: Sequence[Any] = (),
 ) -> dict[str, Scores]:
-    """Compute the scores of all estimators; those of set estimators are for the case `network`."""
+    """Compute the scores of all estimators. Scores of set estimators have the case `network`."""
     times_ns, truths = truths_of(sources)
     sets = [each for each in others if isinstance(each, SetErrors)]
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
@@ -182,8 +183,9 @@ def bytes_per_step(
 ) -> dict[str, float]:
     """Compute the mean number of bytes sent per scan of the network, by estimator.
 
-    Fixes contain an identity only if the association must be known. The infrastructure sensor sends
-    nothing, a single number, or its detections, depending on the estimator.
+    Fixes are sent with an identity only to estimators that must know which vehicle each fix belongs to.
+    The infrastructure sensor sends nothing, a single number, or its detections, depending on the
+    estimator.
     """
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]

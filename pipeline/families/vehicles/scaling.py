@@ -2,7 +2,7 @@
 
 Vehicles start at random in a square. Either the square's area grows with the number of vehicles, so that
 the density is constant, or the square is so small that any fix may belong to any vehicle. Growth is
-described by a factor per vehicle for exponential methods, and by a power otherwise.
+stated as a factor per vehicle for exponential methods, and as a power for all others.
 """
 
 import time
@@ -46,8 +46,8 @@ class ScalingOptions(Parameters):
 
     Attributes:
         vehicles: numbers of vehicles.
-        area_per_vehicle_m2: area per vehicle if they start apart.
-        together_m: side of the square if they start together.
+        area_per_vehicle_m2: area per vehicle if the vehicles start apart.
+        together_m: side of the square if the vehicles start together.
         methods: largest number of vehicles and expected growth of each method, by label.
     """
 
@@ -58,7 +58,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """Growth of computing time over the larger half of the numbers N of vehicles."""
+    """Growth of computing time with the number N of vehicles, over the larger half of the numbers."""
 
     power: float
     factor: float
@@ -110,7 +110,7 @@ def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> 
 def _timed(
     sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
 ) -> tuple[float, float, int]:
-    """Measure CPU time per step in ms, assigned RMSE of a vehicle in m, and number of failed runs."""
+    """Measure CPU time per step (ms), RMSE per vehicle with the best labels (m), and failed runs."""
     chosen = {label: estimators[label]}
     replay_in_memory(sources[:1], chosen)  # compile first
     begin = time.process_time()
@@ -126,7 +126,7 @@ def _timed(
 
 
 def growth_of(table: pd.DataFrame) -> Growth:
-    """Fit the growth to the larger half of the numbers of vehicles, for which constant costs are small.
+    """Fit the growth to the larger half of the vehicle numbers, where constant costs are small.
 
     Steps that are too short for the clock, with a measured time of 0, are ignored.
     """
@@ -145,7 +145,7 @@ def _table(growth: Mapping[Any, Growth], options: ScalingOptions) -> pd.DataFram
 
 
 def _chart(table: pd.DataFrame) -> Chart:
-    """Draw time of a step and error of a vehicle over the number of vehicles."""
+    """Draw the time per step and the error per vehicle over the number of vehicles."""
     ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
     x = Axis(label="vehicles", log=True, ticks=ticks)
     axes = {

@@ -1,4 +1,4 @@
-"""Study of cooperative vehicles, by total error, error bounds and bandwidth of each method.
+"""Study that compares methods for cooperative vehicles by total error, error bounds and bandwidth.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016.
@@ -64,7 +64,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """Compute scores of slow and of other estimators in the first `few_runs` runs of a case."""
+    """Compute the scores of all estimators, also slow ones, in the first `few_runs` runs of a case."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]
@@ -74,7 +74,7 @@ def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Sc
 
 
 def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
-    """Tabulate means and medians over the runs of the total error."""
+    """Tabulate the mean and the median of the total error over the runs."""
     rows = [
         (
             case,
@@ -95,7 +95,7 @@ def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
 
 
 def _known(average: Callable[[Floats], Any], values: Floats) -> float:
-    """Average the finite values; NaN if there are none."""
+    """Average the finite values; return NaN if no value is finite."""
     known = values[np.isfinite(values)]
     return float(average(known)) if len(known) else np.nan
 
@@ -146,7 +146,7 @@ def _vehicles(case: Case) -> int:
 
 
 def _steps(case: Case) -> pd.DataFrame:
-    """Tabulate the joint error of all vehicles by estimator and step, RMS over the runs."""
+    """Tabulate the joint error of all vehicles, as RMS over the runs, by estimator and step."""
     columns = [
         "case",
         "estimator",

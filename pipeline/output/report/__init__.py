@@ -1,10 +1,10 @@
 """The report, which shows results as one HTML page that loads nothing and runs only our scripts.
 
-Begin here. `kinds` writes the opening of a section, `story` the first sentences and the cards, and
-`scene` the pictures of a run.
+Begin here. `kinds` writes the opening of a section, `story` writes the advice and the cards, and `scene`
+draws the pictures of a run.
 
-Plotly draws the charts. Its bundle of basic traces, small enough to be part of every page, is in this
-folder as published (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
+Plotly draws the charts. Plotly's bundle of basic traces, small enough to be part of every page, is in
+this folder as published (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
 """
 
 import base64
@@ -63,7 +63,7 @@ READABLE = 4.6  # WCAG 2.2, 1.4.3 asks for 4.5 to 1
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
-    """Name each result after its experiment and the settings that differ from its other results.
+    """Name results by experiment and by the settings that differ between results of the experiment.
 
     Results with the same experiment and settings are distinguished by their folders.
     """
@@ -190,7 +190,7 @@ class _Timings(Parameters):
 
 @dataclass(frozen=True)
 class Shown:
-    """A figure of the page, a chart or a picture, with a description for screen readers."""
+    """A figure on the page (a chart or a picture), with a description for screen readers."""
 
     name: str
     caption: str
@@ -229,10 +229,10 @@ def write_report(
 ) -> None:
     """Render result folders, in the given order, as one HTML page.
 
-    The page of the same folders always has the same bytes, except for screenshots (`viewer`).
-    With `diagnose`, results without a diagnosis are diagnosed first.
+    Pages of the same folders are identical byte for byte, except for screenshots (`viewer`). With
+    `diagnose`, results without a diagnosis are diagnosed first.
 
-    Raises BadInput if a folder has no result or a damaged one, the page cannot be written, or the
+    Raises BadInput if a folder's result is missing or damaged, if the page cannot be written, or if the
     viewer has no graphics driver.
     """
     results = [read_result(folder) for folder in folders]
@@ -386,7 +386,7 @@ def _legend(begun: Opening) -> str:
 
 
 def _timings(folder: Path, result: Result) -> Timings:
-    """Read the timings of estimators; empty if the result has none."""
+    """Read the timings of estimators; return {} if the result has no timings."""
     path = folder / TIMINGS
     if TIMINGS not in result.files or not path.is_file():
         return {}
@@ -397,7 +397,7 @@ def _timings(folder: Path, result: Result) -> Timings:
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:
-    """Return a sort key for figures: errors first, then intervals, then the most curves."""
+    """Return a sort key for figures: errors first, then intervals, then figures with the most curves."""
     chart = shown.chart or Chart(panels=[])
     has_bands = any(panel.bands for panel in chart.panels)
     return (

@@ -44,14 +44,15 @@ class Evidence:
 
     Attributes:
         estimator: the estimator's label.
-        error: value of the quantity by which estimators are compared; None if the estimator has none.
+        error: the estimator's value of the quantity by which estimators are compared; None if it has no
+            such value.
         squares: NEES, or NEES of the position, and NIS, if available.
         failed: the number of failed runs; None if unknown.
         runs: the number of runs, over all cases.
-        share: the share of the time for which there are estimates.
+        share: the share of the time that estimates cover.
         outside: the number of cases in which the estimator is inconsistent, and the number of all cases.
-        age_s: the mean age of estimates at the time they become available, in the case with the oldest
-            estimates.
+        age_s: the mean age of estimates when they become available, in the case where this age is
+            largest.
     """
 
     estimator: str
@@ -70,7 +71,7 @@ class Evidence:
 
     @property
     def decisive(self) -> Squares | None:
-        """Return the squares that decide: NEES, or NIS if only NIS is outside its limits."""
+        """Return what decides the verdict: NEES, or NIS if only NIS is outside its limits."""
         return decisive(self.squares)
 
     @property
@@ -86,7 +87,7 @@ class Evidence:
 
     @property
     def has_diverged(self) -> bool:
-        """Test whether its errors are too large to be explained by wrong covariances."""
+        """Test whether the estimator's errors are too large to be explained by wrong covariances."""
         return self.decisive is not None and self.decisive.has_diverged
 
 
@@ -109,7 +110,7 @@ class Findings:
         rows: a row per estimator, case and run, with quantities; may be empty.
         runs: the number of runs.
         labels: the estimators in order, without bounds.
-        bounds: labels of bounds, which cannot be chosen.
+        bounds: labels of bounds, which cannot be chosen as estimators.
         stress: the effect of changes that should not matter, by estimator; empty if not tested.
         pairs: quantities that a study measured for pairs of estimators.
     """
@@ -124,7 +125,7 @@ class Findings:
 
     @cached_property
     def main(self) -> str:
-        """Return the quantity by which estimators are compared; empty if there is none."""
+        """Return the quantity by which estimators are compared, or "" if the result has no errors."""
         there = [key for table in self.tables for key in table.quantities if is_error(key)]
         return next((key for key in (*PREFERRED, *there) if key in there), "")
 
@@ -159,7 +160,7 @@ class Findings:
         return [label for label in self.labels if self.of[label].error is not None]
 
     def least_in(self) -> Counter[str]:
-        """Count the cases in which each of the compared estimators has the smallest error."""
+        """Count, for each compared estimator, the cases in which it has the smallest error."""
         found: Counter[str] = Counter()
         for case in self.cases:
             of = {label: case[label].value for label in self.compared}
@@ -227,7 +228,7 @@ class Findings:
         )
 
     def _error(self, label: str) -> Interval | None:
-        """Combine the error over all cases; None if the estimator lacks one of them."""
+        """Combine the errors of all cases; None if the estimator lacks the error of a case."""
         values = self.values(label, self.main)
         if not values or len(values) < len(self.cases):
             return None
@@ -237,7 +238,7 @@ class Findings:
         return (rms_interval if squared else mean_interval)(each_run)._replace(value=value)
 
     def _squares(self, label: str, key: str, name: str) -> Squares | None:
-        """Average NEES or NIS over the cases, with the widest of their intervals; None without cases."""
+        """Average NEES or NIS over the cases, with the widest interval; return None without cases."""
         measured = [
             each
             for table in self.tables
@@ -264,7 +265,7 @@ class Findings:
 
 
 def relation(found: Findings, first: str, second: str) -> Comparison | None:
-    """Compare the second estimator's error with the first's, run by run; None if there are too few runs.
+    """Compare the second estimator's error with the first's by run; return None if runs are too few.
 
     With few runs, two errors within the margin count as a tie.
     """
@@ -282,12 +283,12 @@ def relation(found: Findings, first: str, second: str) -> Comparison | None:
 
 
 def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:
-    """Test whether irrelevant changes move one of two errors by more than their difference."""
+    """Test whether irrelevant changes move either error by more than the two errors differ."""
     return abs(difference) < found.stressed(first, second)
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
-    """Collect the findings about a result's estimators; `tables` are those of its folder, by name."""
+    """Collect the findings about a result's estimators; `tables` are its folder's tables by name."""
     rows = tables.get("runs", pd.DataFrame())
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()
@@ -305,7 +306,7 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
 
 
 def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
-    """Collect metrics of pairs of estimators: the case begins with the label of the second estimator."""
+    """Collect metrics of pairs of estimators, whose case begins with the second estimator's label."""
     labels = {split_metric(key)[0] for key in metrics}
     found: dict[str, list[Pair | None]] = {}
     for key, value in metrics.items():

@@ -30,7 +30,7 @@ class Followed:
 
     Attributes:
         time_s: (n,) time since the first estimate.
-        truth, error: (n, 2) in the plane; the estimate is their sum.
+        truth, error: (n, 2) in the plane; the estimate is the sum of truth and error.
         covariance: (n, 2, 2) as claimed by the estimator.
     """
 
@@ -65,7 +65,7 @@ class FirstRun:
 
 
 def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None:
-    """Find the first run whose log has a truth and estimates in the plane; None if there is no such run.
+    """Find the first run whose log has a truth and estimates in the plane; return None if no log does.
 
     If the log has several objects, such as robots, the first is used. Raises BadInput if a log is
     damaged.
@@ -80,7 +80,7 @@ def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None
 
 
 def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> FirstRun | None:
-    """Read a run from its log and estimates; None if one of them has no positions in the plane."""
+    """Read a run from its log and estimates; return None if either has no positions in the plane."""
     found = _followed(source, output, gap_limit_s)
     if not found:
         return None

@@ -1,6 +1,6 @@
 """Openings of report pages, by kind of result: experiment, comparison, sweep, tuning, diagnosis.
 
-Begin with `opening`. It writes the first sentences; `story` writes the cards and differences.
+Begin with `opening`. This module writes the first sentences; `story` writes the cards and differences.
 """
 
 import math
@@ -66,7 +66,7 @@ class Opening:
         found: the findings about the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture specific to this kind of result.
-        numbers_of: sentence on what the table of metrics covers, if not all runs.
+        numbers_of: sentence on the runs that the table of metrics covers, if these are not all runs.
     """
 
     tried: str
@@ -102,7 +102,7 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
 
 
 def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
-    """Describe for the terminal what was run and the outcome; `folder` is the result's folder."""
+    """Describe the runs and their outcome for the terminal; `folder` is the result's folder."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(
@@ -147,7 +147,7 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
 
 
 def _with_claims(base: Story, result: Result) -> Story:
-    """Add to a story how many claims are confirmed, and a card with the others."""
+    """Add to a story the number of confirmed claims, and a card with all other claims."""
     counts = Counter(claim.verdict for claim in result.claims)
     refuted = [claim.claim for claim in result.claims if claim.verdict == Claimed.REFUTED]
     notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
@@ -255,7 +255,7 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
 
 
 def how_many_differ(rows: pd.DataFrame) -> str:
-    """Summarise in how many metrics each pair differs, or all pairs together if they are many."""
+    """Summarise in how many metrics each pair differs; many pairs are summarised together."""
     pairs = rows.groupby(["first", "second"], sort=False)
     if len(pairs) > MOST_PAIRS:
         number_of = int(rows["verdict"].isin(DIFFER).sum())

@@ -39,7 +39,7 @@ MOST_FIXES = 600
 
 
 def plan(run: FirstRun) -> Chart:
-    """Draw truth, estimates, landmarks, fixes, particles, and ellipses that are large enough."""
+    """Draw truth, estimates, landmarks, fixes, particles, and ellipses that are large enough to see."""
     longest = max(run.followed.values(), key=lambda each: len(each.time_s))
     series: list[Series] = []
     clouds = _clouds(run)
@@ -65,9 +65,9 @@ def plan(run: FirstRun) -> Chart:
 def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
     """Draw one second of the run for the estimators whose ellipses are too small for the scene.
 
-    The typical second is the one in which the share of true positions outside the ellipses, over all
-    estimators shown, is closest to the share in the whole run; among several such seconds, the one
-    closest to the middle of the run. Returns None if all ellipses are large enough for the scene.
+    In the typical second, the shares of true positions outside the estimators' ellipses are closest to
+    the shares in the whole run. Among several such seconds, the one closest to the middle of the run is
+    used. Returns None if all ellipses are large enough for the scene.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
@@ -118,7 +118,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
-    """Find the start and length of the typical second, longer if estimates are rare; else (0, 0)."""
+    """Find start and length of the typical second (longer for rare estimates), or (0, 0) for too few."""
     if not followed or min(len(each.time_s) for each in followed) < DOTS:
         return 0.0, 0.0
     step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)
@@ -184,7 +184,8 @@ def _fixes(run: FirstRun) -> list[Series]:
 def _clouds(run: FirstRun) -> list[Series]:
     """Draw particles of densities at a few times spread over the run.
 
-    The particles are sampled systematically: the chance that a particle is drawn is its weight.
+    The particles are sampled systematically: the chance that a particle is drawn is proportional to its
+    weight.
     """
     found = []
     for topic in topics_of(run.output.topics, schemas.DENSITY_ESTIMATE):
@@ -258,7 +259,7 @@ def tracked(
 
 
 def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
-    """Find the first log with estimates of each case, and begin with the case of the median error."""
+    """Find each case's first log with estimates; put the case with the median error first."""
     logs = {
         "/".join(log.parent.parent.relative_to(folder).parts): log
         for log in sorted(folder.rglob("logs/run-0000.mcap"))
@@ -312,7 +313,7 @@ def _tracks(output: LogSource, label: str) -> list[Floats]:
 
 
 def _parted(ways: Iterable[Floats]) -> Floats:
-    """Join paths to one curve, with NaN between them."""
+    """Join paths into one curve, with NaN between them."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for way in ways for part in (way, gap)])
 

@@ -1,4 +1,4 @@
-"""The table of metrics, with estimators as columns, a dozen rows, and the other rows folded below."""
+"""The table of metrics: a column per estimator, a dozen visible rows, and further rows folded below."""
 
 import math
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """Make the table of a result, then one for each case if there are several; None without numbers.
+    """Make the table of a result, and one per case if there are several; (None, []) without numbers.
 
     The recommended estimator is in the first column, which is visible even if the table is wider
     than the page.

@@ -117,7 +117,8 @@ class Story:
     Attributes:
         verdict: advice on which estimator to use, the most important sentence first.
         cards: cards of estimators: the recommended one, then those that cannot be trusted.
-        draws: sentences on pairs that cannot be distinguished; `differences` on those that can.
+        draws: sentences on pairs of estimators that cannot be distinguished; `differences` has those on
+            pairs that can.
         left_out: estimators without a card.
         doubts: reasons to doubt the result, in a few words each, the worst first.
     """
@@ -138,7 +139,7 @@ def story(
     *,
     at_best: bool = False,
 ) -> Story:
-    """Write the story of judged estimators; `at_best`: each is at the point with its smallest error.
+    """Write the story of judged estimators; with `at_best`, each is at the point of its smallest error.
 
     Causes, run times and warnings are included if they are given.
     """
@@ -395,7 +396,7 @@ def _of_tracks(found: Findings, label: str) -> list[str]:
 
 
 def _in_how_many(found: Findings, take: str) -> list[str]:
-    """Count the cases, or the runs of the only case, in which the best estimator is the best."""
+    """Count the cases, or the runs of a single case, in which `take` has the smallest error."""
     import pandas as pd
 
     if len(found.cases) > 1:
@@ -481,9 +482,9 @@ def broken_of(found: Findings) -> list[Evidence]:
 
 
 def choice_of(found: Findings) -> tuple[str, list[str]]:
-    """Choose the trusted estimator to use (empty if there is none), and list those that tie with it.
+    """Choose the trusted estimator to use ("" if no estimator is trusted), and list those tied with it.
 
-    Of those that tie, conservative estimators come last.
+    Conservative estimators come last among those that tie.
     """
     sound = [each for each in found.of.values() if each.error is not None and not each.is_broken]
     if not sound:
@@ -496,7 +497,7 @@ def choice_of(found: Findings) -> tuple[str, list[str]]:
 
 
 def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """Order estimators: the recommended ones, the untrusted ones (worst first), the others by error."""
+    """Order estimators: recommended ones, untrusted ones (worst first), then all others by error."""
     rest = sorted(
         found.labels,
         key=lambda label: error.value if (error := found.of[label].error) else math.inf,
@@ -523,7 +524,7 @@ def of_the_tied(found: Findings, tied: list[str]) -> tuple[str, list[str]]:
 
 
 def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequence[str]) -> list[str]:
-    """List the doubts about a result; `take` is the recommended estimator, `equal` ties with it."""
+    """List the doubts about a result; `take` is the recommended estimator, `equal` are tied with it."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),
@@ -536,14 +537,14 @@ def doubts_of(found: Findings, alarms: Sequence[Finding], take: str, equal: Sequ
 
 
 def named(labels: Sequence[str], among: int = 0) -> str:
-    """Name estimators, or count them if they are many; `among` is the total number of estimators."""
+    """Name estimators, or count them if there are many; `among` is the total number of estimators."""
     if len(labels) == among > 1:
         return "both" if among == 2 else f"all {among}"
     return some_of(labels, MOST_NAMED) if len(labels) > MOST_NAMED else listed(list(labels))
 
 
 def _of_covariances(found: Findings, alarms: Sequence[Finding]) -> list[str]:
-    """List the estimators whose covariances are wrong, and how."""
+    """List the estimators with wrong covariances, and what is wrong with them."""
     verdicts = {label: each.verdict for label, each in found.of.items()}
     sentences = []
     diverged = [label for label in found.labels if found.of[label].has_diverged]

@@ -54,7 +54,7 @@ class Sweep:
 
     @cached_property
     def main(self) -> str:
-        """Return the error by which points are compared; empty if there is none."""
+        """Return the error by which points are compared; return "" if the sweep has no errors."""
         return next((key for key in self.table["quantity"].unique() if is_error(key)), "")
 
     def errors(self, label: str) -> "pd.Series[float]":
@@ -126,7 +126,7 @@ class Sweep:
         return self._findings(found, {"runs": self.rows})
 
     def where(self, point: int, *, brief: bool = False) -> str:
-        """Describe a point by its values, with their names or, if `brief`, without."""
+        """Describe a point by its values, with the parameters' names unless `brief`."""
         parts = []
         for key, value in self.points[point].items():
             text = f"{_value(value)} {written(unit_of(key)) if _is_number(value) else ''}".rstrip()
@@ -134,7 +134,7 @@ class Sweep:
         return f"({', '.join(parts)})" if brief and len(parts) > 1 else ", ".join(parts)
 
     def name(self, key: str, *, with_key: bool = False) -> str:
-        """Return the name of a parameter: its meaning, if known."""
+        """Return a parameter's name for readers, which is its meaning if known."""
         meaning = str(self.result.settings.get("meanings", {}).get(key, ""))
         name = meaning or quantity(key.rpartition(".")[2]).name
         return f"{name} ({key})" if with_key else name
@@ -228,7 +228,7 @@ def _with_points(
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
-    """Find the points whose error equals the smallest, within chance or the margin."""
+    """Find points whose error differs from the smallest by no more than chance or the margin."""
     found = sweep.at({str(point): (label, int(point)) for point in own.index})
     return [
         int(point)

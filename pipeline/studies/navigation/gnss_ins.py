@@ -1,8 +1,8 @@
 """A study of how well a GNSS receiver with an inertial unit bridges outages in a recording.
 
 Fixes with errors of centimetres are withheld in many windows of a recording. The estimates of a filter
-and a smoother are compared with the withheld fixes, and with two methods without an inertial unit:
-extrapolation with the last velocity, and a cubic between both ends.
+and a smoother are compared with the withheld fixes, and with two methods that use no inertial unit:
+extrapolation with the last velocity, and a cubic between the ends of the outage.
 """
 
 from collections.abc import Mapping
@@ -180,7 +180,7 @@ def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experimen
 def _recording(
     experiment: Experiment, folder: Path, options: GnssInsOptions
 ) -> tuple[MemorySource, Rows]:
-    """Import the recording; return it without fixes before `settle_s`, and with the receiver's rows."""
+    """Import the recording; return it without fixes before `settle_s`, and the receiver's rows."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
     recording = memory_source(*import_run(experiment.import_.source, folder, values))

@@ -125,9 +125,9 @@ def coasted(rows: Rows, window: Window) -> Floats:
 
 
 def hermite(rows: Rows, window: Window) -> Floats:
-    """Compute the errors (m, 2) of the cubic through the positions and velocities at both ends.
+    """Compute the errors (m, 2) of the cubic through positions and velocities at both ends of a window.
 
-    This is the smoother for white-noise acceleration.
+    This cubic is the estimate of the smoother for white-noise acceleration.
     """
     ends = [window.rows[0] - 1, window.rows[-1] + 1]
     between = CubicHermiteSpline(rows.since_s[ends], rows.place[ends], rows.velocity[ends])

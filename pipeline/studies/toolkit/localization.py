@@ -1,7 +1,8 @@
 """A study of estimators that track a moving object: errors, consistency, innovations.
 
-Most experiments use it to record or import, replay, judge and draw. Families that reproduce the claims
-of a paper have studies with additional tables, figures and metrics.
+Most experiments use this study, which records or imports runs, replays and judges them, and draws
+charts. Families that reproduce the claims of a paper have studies with additional tables, figures and
+metrics.
 """
 
 from fuselog.pipeline.output.results import Outcome

@@ -1,6 +1,7 @@
-"""Arguments of a kernel: their description in its key, packing as words, and loading in the kernel.
+"""Kernel arguments: how they are described in a kernel's key, packed into words, and loaded.
 
-The word of an array is the address of its NumPy structure, which has the addresses of data and sizes.
+An array is passed as one word: the address of its NumPy structure, which contains the addresses of the
+data and of the sizes.
 """
 
 import operator
@@ -36,10 +37,10 @@ _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 2
 
 
 def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
-    """Append the kinds of an argument, for the kernel's key, and its words, for the call.
+    """Append an argument's kinds, for the kernel's key, and its words, for the call.
 
-    The sizes of the first `varies` axes of an array are not part of the kinds; the attribute `varies` of
-    a NamedTuple replaces this number for each of its fields.
+    The sizes of the first `varies` axes of an array are not part of the kinds. If a NamedTuple has an
+    attribute `varies`, it states this number for each of the fields.
     """
     if isinstance(value, np.ndarray):
         shape = value.shape
@@ -121,7 +122,7 @@ def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
 
 
 def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
-    """Load a NumPy array: the address of its numbers, and the unknown sizes."""
+    """Load a NumPy array: the address of its data, and the sizes that the kernel does not know."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
     shape: list[Value] = [

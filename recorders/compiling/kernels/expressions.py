@@ -78,7 +78,7 @@ class Expressions(Scope, ABC):
         return tuple(self.listed(node.elts))
 
     def listed(self, nodes: list[ast.expr]) -> Iterator[Value]:
-        """Yield entries or arguments, including those of `*others`."""
+        """Yield entries or arguments, expanding starred ones such as `*others`."""
         for node in nodes:
             if isinstance(node, ast.Starred):
                 yield from self.iterated(node.value)
@@ -164,7 +164,7 @@ class Expressions(Scope, ABC):
         return bool(value)
 
     def of_BoolOp(self, node: ast.BoolOp) -> Value:  # noqa: N802
-        """Lower `a and b`; the second operand is evaluated only if the first does not decide."""
+        """Lower `a and b`; the second operand is evaluated only if the first does not settle it."""
         is_and = isinstance(node.op, ast.And)
         first = self.truth(self.value(node.values[0]))
         rest = node.values[1] if len(node.values) == 2 else ast.BoolOp(node.op, node.values[1:])

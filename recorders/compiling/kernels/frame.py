@@ -22,7 +22,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """A signal that a variable needs a wider numeric type than that of its first assignment."""
+    """A signal that a variable needs a wider numeric type than its first assignment has."""
 
 
 class Frame(Expressions):
@@ -97,14 +97,14 @@ class Frame(Expressions):
         self.write(self.places[name], value)
 
     def fitting(self, name: str, value: Value) -> Value:
-        """Convert a value to the kinds of its memory; raise `Wider` if the memory has to change."""
+        """Convert a value to the kinds of its memory; raise `Wider` if the memory cannot hold it."""
         value = self.widened(name, unsure(at_run_time(value)))
         if name in self.places:
             value = self.converted(name, value, self.places[name])
         return value
 
     def widened(self, name: str, value: Value) -> Value:
-        """Convert the numbers of a value to the kinds that its memory was found to need."""
+        """Convert the numbers in a value to the kinds that their memory is known to need."""
         if isinstance(value, Number):
             kind = self.kinds.get(name, value.kind)
             return self.emitter.as_kind(value, common_kind(value, Number(kind, "")))
@@ -148,12 +148,12 @@ class Frame(Expressions):
 
 
 def unsure(value: Value) -> Value:
-    """Return a number without the assumption that it is not negative."""
+    """Return a number, no longer assumed to be non-negative."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
 def common_value(one: Value, other: Value) -> Value:
-    """Return the first value, with its numbers in kinds that can represent those of both values."""
+    """Return the first value, with its numbers in kinds that can represent those of both."""
     if isinstance(one, Number) and isinstance(other, Number):
         return one._replace(kind=common_kind(one, other))
     parts, others = entries(one), entries(other)

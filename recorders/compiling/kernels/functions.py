@@ -1,4 +1,4 @@
-"""`FUNCTIONS`: how functions of numbers from NumPy, Python and libm, and `high_word`, are lowered."""
+"""`FUNCTIONS`: how kernels lower `high_word` and the numeric functions of NumPy, Python and libm."""
 
 import math
 import operator

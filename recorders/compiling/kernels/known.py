@@ -1,4 +1,4 @@
-"""Evaluation of values that are known while a kernel is lowered, as in Python."""
+"""Evaluation, as in Python, of values that are known while a kernel is lowered."""
 
 import ast
 import operator

@@ -1,9 +1,9 @@
 """Lowering of a function: its source is traversed once and written as LLVM IR.
 
-Statements are lowered here, expressions in `expressions`. A name with a single assignment before all of
-its uses is replaced by the value; other names are variables in memory, which LLVM turns into registers.
-Known values are evaluated: an `if` with a known condition has one branch, and a loop over a tuple is
-unrolled.
+Statements are lowered here, expressions in `expressions`. A name that is assigned only once, before all
+of its uses, is replaced by its value; other names are variables in memory, which LLVM turns into
+registers. Known values are evaluated: an `if` with a known condition has one branch, and a loop over a
+tuple is unrolled.
 """
 
 import ast
@@ -126,7 +126,7 @@ class _Lowering(Frame):
             self.give(statement.target, self.value(statement.value))
 
     def do_AugAssign(self, statement: ast.AugAssign) -> None:  # noqa: N802
-        """Lower `a += value`, for a name or an element of an array, which is located once."""
+        """Lower `a += value` for a name or an array element; the element is located only once."""
         target = statement.target
         if isinstance(target, ast.Subscript):
             place = self.element(target)
@@ -182,7 +182,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Lower `return`; outside of branches the value may remain known, otherwise it is in memory."""
+        """Lower `return`; outside of branches the value may stay known; inside, it is kept in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it created; pass an array that it fills")
@@ -303,7 +303,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Value:
-        """Lower `yes if condition else no`, of which only one is evaluated."""
+        """Lower `yes if condition else no`, so that only one of the two is evaluated."""
         labels, after, before = (
             (self.label("then"), self.label("else")),
             self.label("after"),

@@ -1,8 +1,8 @@
 """Machine code of kernels: made by LLVM, cached, loaded, and called with NumPy arrays.
 
 A kernel is compiled for the kinds and sizes of its arguments. The sizes of working memory are constants,
-and so are those of other arrays after the first axis, up to `arguments.KNOWN`. The key of cached code
-covers all functions in it (`identity`), this package, LLVM and the processor.
+and so are the sizes of other arrays after the first axis, up to `arguments.KNOWN`. The key of cached
+code covers all functions in it (`identity`), this package, LLVM and the processor.
 """
 
 import ctypes
@@ -57,7 +57,7 @@ _layout_of = cache(_Layout)
 
 
 def _described(memory: Value) -> tuple[_Layout, list[Value]]:
-    """Describe working memory by its kinds, with all sizes known, and the words to pass."""
+    """Describe working memory: its kinds, with all sizes known, and the words to pass."""
     kinds: list[Value] = []
     words: list[Value] = []
     describe(memory, 0, kinds, words)
@@ -82,8 +82,8 @@ class Kernel:
     ) -> Callable[[int, int], None]:
         """Return a function that processes the runs from `first` up to `end` with these arguments.
 
-        It keeps the arguments alive. The first `varies` axes of arrays have unknown sizes, except in the
-        memory; see `describe`.
+        The function keeps the arguments alive. The kernel does not rely on the sizes of the first
+        `varies` axes of arrays, except in the working memory; see `describe`.
         """
         kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Value] = []
@@ -115,7 +115,7 @@ class Kernel:
     def _layout_and_entry(
         self, arguments: Sequence[Value], kinds: Iterator[Value]
     ) -> tuple[Struct, KernelFunction]:
-        """Make the structure that packs such arguments, and the entry that takes them."""
+        """Make the structure that packs arguments of these kinds, and the entry that takes them."""
         is_checked = next(kinds)
         described = tuple(with_types(each, kinds) for each in arguments)
         key = is_checked, described
@@ -234,7 +234,7 @@ def _kept_entry(function: FunctionType, kinds: tuple[Value, ...], title: str) ->
 
 
 def _kept(path: Path, key: str) -> bytes | None:
-    """Read the object code in a file; None if it is damaged or belongs to another kernel."""
+    """Read the object code in a file; return None if it is damaged or belongs to another kernel."""
     found = read_checked(path)
     own = key.encode()
     return found.removeprefix(own) if found is not None and found.startswith(own) else None

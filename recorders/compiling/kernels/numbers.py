@@ -96,7 +96,7 @@ class Emitter:
         return self.number(REAL, f"call double @{name}({given})")
 
     def stop_if(self, condition: Number, fault: Number) -> None:
-        """Leave the function and all of its callers with a fault if a condition is true.
+        """If a condition is true, leave the function and all of its callers with a fault.
 
         See `Program.define`.
         """
@@ -290,7 +290,7 @@ def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
 
 
 def compare(emitter: Emitter, operation: Value, left: Scalar, right: Scalar) -> Number:
-    """Lower a comparison; it is false with NaN, except for `!=`."""
+    """Lower a comparison; comparisons with NaN are false, except for `!=`."""
     kind = common_kind(left, right)
     kind = WHOLE if kind == TRUTH else REAL if is_row(kind) else kind
     x, y = (emitter.as_kind(each, kind) for each in (left, right))

@@ -34,7 +34,7 @@ class DoesNotCompile(BadInput):
 class Instance(NamedTuple):
     """A function lowered for some arguments: its name, and the type and value of its result.
 
-    If `can_fail` is set, it also returns the number of a fault, or 0.
+    If `can_fail` is set, the function also returns the number of a fault, or 0.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Program:
         returned: Value,
         few: int = FEW,
     ) -> Instance:
-        """Add a function with this body and result; below `few` lines, it is always inlined."""
+        """Add a function with this body and result, always inlined if it has fewer than `few` lines."""
         found = list(leaves(returned))
         results = [*found, ("i64", "0")] if body.can_fail else found
         kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"
@@ -140,14 +140,14 @@ class Program:
         return Instance(name, kind, returned, body.can_fail)
 
     def _parameter(self, index: int, value: Value) -> tuple[Value, list[tuple[str, str]]]:
-        """Return an argument as the called function uses it, and the leaves of the parameter."""
+        """Return the value that the called function has for an argument, and the parameter's leaves."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
         known = placed(_unsure(value), is_local=False)
         return rebuilt(known, iter([code for _, code in found])), found
 
 
 def _unsure(value: Value) -> Value:
-    """Return a number without the assumption that it is not negative, which other calls may violate."""
+    """Return a number, not assumed to be non-negative, since other calls may pass negative numbers."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 

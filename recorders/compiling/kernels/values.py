@@ -281,20 +281,20 @@ def packed(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def made(emitter: Emitter, shape: tuple[int, ...], dtype: str) -> Array:
-    """Allocate memory for an array of known sizes, until the function returns."""
+    """Allocate memory, until the function returns, for an array of known sizes."""
     memory = emitter.memory(STORED[dtype][0], max(1, prod(shape)))
     return Array(dtype, memory, shape, packed(shape), is_local=True)
 
 
 def is_local(value: Value) -> bool:
-    """Test whether a value contains an array whose memory ends when its function returns."""
+    """Test whether a value contains an array whose memory is released when its function returns."""
     if isinstance(value, Array):
         return value.is_local
     return any(map(is_local, entries(value) or ()))
 
 
 def placed(value: Value, *, is_local: bool) -> Value:
-    """Mark the arrays of a value as local to the current function, or not.
+    """Mark the arrays of a value as local to the current function, or as not local.
 
     The arguments of a function outlive it, and may be part of its result.
     """

@@ -1,4 +1,4 @@
-"""Search for the names in a function that need memory, since their value differs between uses."""
+"""Search for the names in a function that need memory because their values differ between uses."""
 
 import ast
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ class _Names(ast.NodeVisitor):
 
 @cache
 def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
-    """Find the names that need memory: assigned twice, or used where they may be unassigned."""
+    """Find the names that need memory: those assigned twice, or used where they may be unassigned."""
     names = _Names()
     for argument in ast.walk(definition.args):
         if isinstance(argument, ast.arg):
@@ -79,7 +79,7 @@ def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
 def _is_placed(
     given: list[tuple[tuple[Value, ...], int]], used: list[tuple[tuple[Value, ...], int]]
 ) -> bool:
-    """Test whether a use may see another value than that of the assignment directly before it."""
+    """Test whether a use may see a value other than the one assigned directly before it."""
     for region, order in used:
         before = [each for each in given if each[1] < order]
         if not before or before[-1][0] != region[: len(before[-1][0])]:

@@ -1,4 +1,4 @@
-"""Arithmetic of 64-bit words for which neither Python nor NumPy has a single operation."""
+"""Operations on 64-bit words that neither Python nor NumPy provides as a single operation."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
 
 
 def emit_high_word(emitter: Emitter, a: Number, b: Number) -> Number:
-    """Lower `high_word(a, b)`, for which a processor has one instruction."""
+    """Lower `high_word(a, b)`, which is a single instruction of the processor."""
     wide = []
     for each in (a, b):
         wide.append(emitter.fresh())

@@ -37,14 +37,15 @@ def difference_stream(
     speed_of_sound_mps: float,
     weighting: Weighting = "phat",
 ) -> Stream:
-    """Measure the arrivals of one sound at several microphones and return them as a stream.
+    """Measure the differences of one sound's arrival times at several microphones; return a stream.
 
     Args:
         prefix: prefix of the topic, which ends with `/differences`.
         heard: recordings of the microphones.
         band_hz: lowest and highest frequency to use.
         weighting: see `fuselog.recorders.families.acoustic.arrivals`.
-        speed_of_sound_mps: limits the delays, and is written to the channel's metadata.
+        speed_of_sound_mps: speed of sound, which bounds the delays and is written to the channel's
+            metadata.
     """
     time_ns, recordings, rate_hz, places_m, microphone_id = heard
     away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)

@@ -3,8 +3,8 @@
 Knapp and Carter, "The Generalized Correlation Method for Estimation of Time Delay", IEEE Transactions on
 Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is the sum of a
 part due to the delay and a part due to noise and echoes. The estimated delay maximizes the sum of the
-cosines of the phases that remain without its part. With the phase transform, all frequencies have the
-same weight.
+cosines of the phases that remain after the delay's part is subtracted. With the phase transform, all
+frequencies have the same weight.
 """
 
 from itertools import combinations
@@ -39,8 +39,8 @@ class Arrivals(NamedTuple):
     Attributes:
         reference: index of that reference microphone.
         delay_s: (n,), delays relative to the reference; zero for the reference.
-        variance_s2: (n,), variance of each microphone's own arrival time; a difference has the sum of
-            two.
+        variance_s2: (n,), variance of each microphone's own arrival time; the variance of a difference
+            is the sum of two of these.
         likeness: (n,), similarity of the signals, see `Delay`.
     """
 
@@ -62,8 +62,9 @@ def delay_between(
 
     The delay is the root of the equation sum w omega sin(remaining phase) = 0. Its variance is estimated
     from the remaining phases (the sandwich estimator of Huber, "The behavior of maximum likelihood
-    estimates under nonstandard conditions", 1967). It holds for noise that is independent between
-    frequencies, with any spectrum. It does not include the risk of a wrong peak.
+    estimates under nonstandard conditions", 1967). The estimated variance is valid for noise that is
+    independent between frequencies, with any spectrum. The variance does not include the risk of a wrong
+    peak.
 
     Args:
         late: (samples,), the signal of the microphone that the sound reaches later.
@@ -117,11 +118,12 @@ def arrivals(
 ) -> Arrivals:
     """Measure arrival times of a sound at n microphones from simultaneous recordings (n, samples).
 
-    Delays of all pairs are at most `longest_s` (n, n). A microphone's variance has three parts: a part
-    due to noise, fitted so that the parts of two microphones add up to the variance of their delay;
-    a part due to echoes and neighbouring peaks, from the median closure error of the delays of three
-    microphones; and a part due to a clock offset of up to half a sample. The reference is the microphone
-    whose delays to all others have the smallest total variance.
+    The delay of each pair is at most its entry in `longest_s` (n, n). A microphone's variance has three
+    parts. The first is due to noise; it is fitted so that the parts of two microphones add up to the
+    variance of their delay. The second is due to echoes and neighbouring peaks; it follows from the
+    median closure error of the delays of three microphones. The third is due to a clock offset of up to
+    half a sample. The reference is the microphone whose delays to all others have the smallest total
+    variance.
 
     Args:
         recordings: (n, samples), simultaneous recordings.

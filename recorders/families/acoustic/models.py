@@ -29,7 +29,7 @@ class Medium(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard deviations of a sensor's measurements; `position_m` is that of its GPS, per axis."""
+    """Standard deviations of a sensor's measurements; `position_m` is for its GPS position, per axis."""
 
     muzzle_blast_rad: float
     shockwave_rad: float
@@ -60,7 +60,7 @@ def fired_from(
 
 
 def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
-    """Find the side of the line of fire on which a sensor hears the shockwave: +1 or -1; 0 if none.
+    """Find the side of the line of fire on which a sensor hears the shockwave: +1 or -1; 0 if unheard.
 
     A sensor hears the shockwave at angles to the line of fire between 0 and 90 deg minus the Mach angle,
     both excluded (figure 2). Eq (7) agrees, except for angles that need wrapping.
@@ -75,7 +75,7 @@ def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) ->
 
 
 def measured_side(azimuth: Component, shockwave: Component) -> Component:
-    """Return the side of the line of fire that follows from the two directions of arrival only."""
+    """Infer the side of the line of fire from the two directions of arrival only."""
     return -np.sign(wrap_angle(azimuth - shockwave))
 
 
@@ -98,7 +98,7 @@ def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Compon
 def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:
     """Compute the time in s from shockwave to muzzle blast.
 
-    `separation` is the direction of the muzzle blast minus that of the shockwave.
+    `separation` is the direction of the muzzle blast minus the direction of the shockwave.
     """
     return distance * (1.0 - np.cos(separation)) / medium.speed_of_sound_mps
 
@@ -106,7 +106,7 @@ def time_difference(distance: Component, separation: Component, medium: Medium) 
 def time_difference_gradient(
     distance: Component, separation: Component, medium: Medium
 ) -> tuple[Component, Component]:
-    """Compute the derivatives of `time_difference` by distance and separation."""
+    """Compute the derivatives of `time_difference` with respect to distance and separation."""
     speed = medium.speed_of_sound_mps
     return (1.0 - np.cos(separation)) / speed, distance * np.sin(separation) / speed
 
@@ -148,7 +148,7 @@ def local_estimate_covariances(
 def local_estimate_covariance_gradients(
     distance: Component, separation: Component, noise: Noise, medium: Medium
 ) -> tuple[tuple[Component, Component], ...]:
-    """Compute the derivatives of `local_estimate_covariances` by distance and separation.
+    """Compute the derivatives of `local_estimate_covariances` with respect to distance and separation.
 
     With the chain rule these are eqs (63)-(77).
     """

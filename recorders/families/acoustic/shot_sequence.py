@@ -4,7 +4,7 @@ The velocity changes by white acceleration, and the direction of the shots by a 
 heard from the position at which it was fired, when its sound arrives. A sensor may miss a shot; it may
 mistake an echo, which comes later and from any direction, for the muzzle blast; or it may combine the
 muzzle blast with the shockwave of another shot. `/shooter/reports` contains the reports of all sensors
-to a fusion centre, `/sensors` the positions of the sensors.
+to a fusion centre; `/sensors` contains the positions of the sensors.
 """
 
 from typing import Annotated, NamedTuple
@@ -49,9 +49,10 @@ class ShotSequenceParameters(AcousticParameters):
         trajectory_density: random walk of the direction of shots, in rad/sqrt(s).
         echo_probability: probability that a sensor mistakes an echo for the muzzle blast.
         echo_delay_s: mean delay of an echo (exponential).
-        wrong_association_probability: probability that a sensor combines the muzzle blast with another
-            shockwave.
-        wrong_delay_s: longest time between such a shockwave and the muzzle blast.
+        wrong_association_probability: probability that a sensor combines the muzzle blast with the
+            shockwave of another shot.
+        wrong_delay_s: longest time between the muzzle blast and the shockwave with which it is wrongly
+            combined.
     """
 
     shots: PositiveInt = 20
@@ -81,14 +82,14 @@ class Heard(NamedTuple):
 
 
 def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raise BadInput if a shot is fired before all sensors heard the last one."""
+    """Record one run; raise BadInput if a shot is fired before all sensors heard the previous one."""
     path_rng, noise_rng, fault_rng = rng.spawn(3)
     shots_s = parameters.interval_s * np.arange(float(parameters.shots))
     path_s = PATH_S * np.arange(round((shots_s[-1] + parameters.interval_s) / PATH_S) + 1)
     path, aims = _path(parameters, len(path_s), path_rng), _aims(parameters, path_rng)
 
     def state_at(times_s: Floats) -> Floats:
-        """Compute the states (n, 5); the aim is that of the last shot."""
+        """Compute the states (n, 5); the aim is the aim of the last shot."""
         shot = np.searchsorted(shots_s, times_s, side="right") - 1
         x, y, vx, vy = (np.interp(times_s, path_s, column) for column in path.T)
         return np.stack([x, y, wrap_angle(aims[shot]), vx, vy], axis=1)

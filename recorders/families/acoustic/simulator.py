@@ -1,7 +1,8 @@
 """Shots heard by acoustic sensors with position fixes: detections, fixes, truth.
 
 Osborne, Bar-Shalom, George and Kaplan, JAIF 2014. Each sensor detects each shot when its muzzle blast
-arrives. The shockwave and its lead over the muzzle blast are measured only if the geometry allows it.
+arrives. The shockwave, and the time by which it precedes the muzzle blast, are measured only if the
+geometry allows it.
 """
 
 from typing import Annotated
@@ -83,7 +84,7 @@ class AcousticParameters(Parameters):
 
 
 def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; raise BadInput if a shot is fired before all sensors heard the last one."""
+    """Record one run; raise BadInput if a shot is fired before all sensors heard the previous one."""
     shooter = np.array(parameters.shooter_position_m)
     sensors = np.array(parameters.sensor_position_m)
     travel_s = np.linalg.norm(sensors - shooter, axis=1) / parameters.speed_of_sound_mps

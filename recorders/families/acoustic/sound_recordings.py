@@ -1,12 +1,12 @@
-"""Importer of sounds in synchronized recordings of microphones, as differences of arrival times.
+"""Importer of synchronized microphone recordings of sounds, as differences of arrival times.
 
-The input is a folder as for opensoundscape: WAV files, a table of the microphones' positions (CSV with
-the file first, then x, y and optionally z, in m), and tables of detections (CSV with the file first,
-start_time and end_time in s from the start of the file, and a column for each kind of sound, 1 if
-present). Tables are recognized by these columns. Each time span of each kind in a table of detections is
-one sound. Without such a table, the whole recordings of an array are one sound. A file's comment may
-state when it began (`recording_start_time`, as written by opensoundscape); without such comments, all
-recordings begin at the same time.
+The input is a folder in the layout of opensoundscape. It contains WAV files, a table of the microphones'
+positions (CSV with the file first, then x, y and optionally z, in m), and tables of detections (CSV with
+the file first, start_time and end_time in s from the start of the file, and a column for each kind of
+sound, 1 if present). Tables are recognized by these columns. Each time span of each kind in a table of
+detections is one sound. Without such a table, the whole recordings of an array are one sound. A file's
+comment may state when it began (`recording_start_time`, as written by opensoundscape); without such
+comments, all recordings begin at the same time.
 """
 
 import re
@@ -50,7 +50,8 @@ class SoundRecordingsParameters(Parameters):
             sampling rate.
         weighting: weights of frequencies in the correlation of two recordings: equal (phat), or by
             strength (none).
-        clipped_share: share of samples at the greatest value above which a file is reported as clipped.
+        clipped_share: share of samples at the greatest value; a file with a larger share is reported as
+            clipped.
         truth_m: true positions of sounds (x, y or x, y, z), by name.
     """
 
@@ -62,7 +63,7 @@ class SoundRecordingsParameters(Parameters):
 
 
 class Recorded(NamedTuple):
-    """Samples of a file, its sampling rate, and when it began, ns since 1970, or None."""
+    """Samples of a file, its sampling rate, and when it began (ns since 1970; None if unknown)."""
 
     samples: Floats
     rate_hz: int
@@ -70,7 +71,7 @@ class Recorded(NamedTuple):
 
 
 class Sound(NamedTuple):
-    """One sound: the files that may contain it, its start and end, ns since 1970."""
+    """One sound: the files that may contain it, and its start and end in ns since 1970."""
 
     name: str
     files: list[str]
@@ -224,7 +225,7 @@ def _read(path: Path) -> Recorded:
 
 
 def _begin_ns(path: Path) -> int | None:
-    """Read when a recording began from its comment; None if it has none."""
+    """Return the start time that a recording's comment states, or None if it states no time."""
     stated = re.search(rb'"recording_start_time": "([^"]+)"', path.read_bytes())
     if stated is None:
         return None
@@ -242,7 +243,7 @@ def _begin_ns(path: Path) -> int | None:
 
 
 def _span_ns(recorded: Recorded, epoch_ns: int) -> tuple[int, int]:
-    """Return start and end of a recording; it starts at the epoch if the file does not state a time."""
+    """Return a recording's start and end; without a stated time, it starts at the epoch."""
     begin_ns = epoch_ns if recorded.begin_ns is None else recorded.begin_ns
     return begin_ns, begin_ns + round(len(recorded.samples) / recorded.rate_hz * 1e9)
 
@@ -290,9 +291,9 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """Yield the differences of one sound, and the truth if known; nothing if too few hear it.
+    """Yield one sound's differences, and the truth if known; nothing if too few microphones hear it.
 
-    The search window is longer than the sound on both sides by the sound's travel time between the
+    The search window extends beyond the sound on both sides by the sound's travel time between the
     microphones. Files that do not cover the sound, or are silent during it, are skipped.
     """
     name = sound.name

@@ -1,7 +1,7 @@
-"""A sound in noise at microphones: simulated recordings, and differences of arrival times from them.
+"""Simulator of a sound in noise at microphones: recordings, and arrival-time differences from them.
 
-The sound is band-limited Gaussian noise that swells and fades. It gets weaker with distance and is
-delayed by the speed of sound, with sub-sample resolution. Clocks are off by up to half a sample.
+The sound is band-limited Gaussian noise that swells and fades. The sound gets weaker with distance; its
+delay follows from the speed of sound, with sub-sample resolution. Clocks are off by up to half a sample.
 """
 
 from typing import Annotated
@@ -30,8 +30,8 @@ class SoundSourceParameters(Parameters):
 
     Attributes:
         microphones_m: positions of the microphones (x, y, z).
-        reach_m: half side of the box about the microphones' mean position that contains the source; if
-            all microphones have the same height, the source has it too.
+        reach_m: half the side of the box that contains the source, centred on the microphones' mean
+            position; if all microphones have the same height, the source has it too.
         sound_s: length of the sound.
         rate_hz: sampling rate.
         band_hz: lowest and highest frequency of the sound, in Hz.

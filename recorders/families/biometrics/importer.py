@@ -63,8 +63,8 @@ class Matrix(NamedTuple):
 def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     """Read one matrix per matcher; users are numbered in the order of the files.
 
-    Raises BadInput with the name of the file if it is missing or malformed, has other users than the
-    first file, or if its scores are not similarities or distances as declared.
+    Raises BadInput, with the name of the file, if a file is missing or malformed, if its users differ
+    from those of the first file, or if its scores are not similarities or distances as declared.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: not a folder; give the folder with one CSV per matcher")

@@ -1,4 +1,4 @@
-"""Biometric matchers and their scores of each probe with each gallery entry, as columns.
+"""Biometric matchers, and their scores for each probe and gallery entry, as columns.
 
 Probe i and gallery entry i are of the same user. Scores are stored as the matcher gave them; the
 stream's metadata state which matchers give distances, and the score that marks a failure to enrol.

@@ -73,7 +73,7 @@ LOWEST = 0.1
 
 
 class BiometricScoresParameters(Parameters):
-    """Numbers of users and of special users among them; the defaults are those of the 517 real users.
+    """Numbers of users, and of special users among them; the 517 real users define the defaults.
 
     Attributes:
         users: number of users.
@@ -125,7 +125,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Draw users' effects; a few have poor fingers, the others better ones to keep the marginals."""
+    """Draw users' effects: a few have poor fingers, all others better ones, to keep the marginals."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
@@ -181,7 +181,7 @@ def _user_correlation() -> Floats:
 
 
 def _rest_correlation() -> Floats:
-    """Find the correlation (4, 4) of both parts of the remainder, given that of their sum."""
+    """Find the correlation (4, 4) that both parts of the remainder share, given that of their sum."""
     correlation = np.full((4, 4), OTHER_REST_CORRELATION)
     for pair, value in REST_CORRELATION.items():
         row, column = ("CGLR".index(name) for name in pair)

@@ -29,7 +29,8 @@ class BroadParameters(Parameters):
 
     Attributes:
         unit_tolerance: largest deviation of a true quaternion's length from 1.
-        gap_s: gaps of inertial samples and of truth longer than this are counted in the notes.
+        gap_s: gaps in the inertial samples or in the truth that are longer than this are counted in the
+            notes.
     """
 
     unit_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3

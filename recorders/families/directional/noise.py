@@ -42,7 +42,7 @@ def sample_bingham(
 
     Args:
         axes: (..., d, d), the principal axes as columns.
-        concentrations: (..., d), finite, along these axes.
+        concentrations: (..., d), finite concentrations along these axes.
         generator: random numbers for the proposals.
 
     Returns:

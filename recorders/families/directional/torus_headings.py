@@ -26,8 +26,8 @@ class HeadingsParameters(Parameters):
     Attributes:
         steps: number of time steps.
         step_s: length of a time step.
-        coupling_rad: in each step, the first heading turns by this times the cosine of the second, and
-            the second by this times the sine of the first.
+        coupling_rad: in each step, the first heading turns by this angle times the cosine of the second,
+            and the second by this angle times the sine of the first.
         drift1_rad: additional turn of the first heading per step.
         drift2_rad: additional turn of the second heading per step.
         system_sigma_rad: standard deviation of a heading's noise per step.

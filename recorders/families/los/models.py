@@ -20,7 +20,7 @@ def azimuth_elevation(x: Components) -> tuple[Component, Component]:
 
 
 def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
-    """Compute gradients (rad/m) of azimuth and elevation by `x`; eqs (71)-(76), with (74) corrected."""
+    """Compute azimuth and elevation gradients in `x` (rad/m); eqs (71)-(76), with (74) corrected."""
     ground = np.hypot(x[0], x[2])
     squared = ground**2 + x[1] ** 2
     azimuth = (x[2] / ground**2, 0.0 * x[1], -x[0] / ground**2)
@@ -48,7 +48,7 @@ def line_of_sight(
 def line_of_sight_gradients(
     target: Components, sensor: Components, attitude: Components
 ) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
-    """Compute gradients of azimuth and elevation by target (rad/m) and yaw, pitch, roll (rad/rad).
+    """Compute azimuth and elevation gradients for the target (rad/m) and yaw, pitch, roll (rad/rad).
 
     The chain rule is applied backwards through the three rotations. The result equals eqs (45)-(103) of
     the appendix with the misprints in (67), (74), (89), (92) and (102) corrected.
@@ -73,7 +73,7 @@ def line_of_sight_gradients(
 
 
 def direction(azimuth: Component, elevation: Component, attitude: Components) -> Triple:
-    """Compute the unit vector in the common frame along which a sensor sees these angles."""
+    """Compute the unit vector, in the common frame, for which a sensor measures these angles."""
     yaw, pitch, roll = attitude
     level = np.cos(elevation)
     seen = (level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth))
@@ -83,8 +83,8 @@ def direction(azimuth: Component, elevation: Component, attitude: Components) ->
 def turning_vector(attitude: Components, change: Components) -> Triple:
     """Compute the small rotation of the scene, in the common frame, that cancels a change of attitude.
 
-    If the scene rotates by it about the sensor while the attitude changes by `change` (yaw, pitch,
-    roll), the sensor's measurements stay the same.
+    If this rotation is applied to the scene about the sensor while the attitude changes by `change`
+    (yaw, pitch, roll), the sensor's measurements stay the same.
     """
     _, pitch, roll = attitude
     yawed, pitched, rolled = change

@@ -52,10 +52,10 @@ class MovingOpticalParameters(Parameters):
         prior_sigma_m: standard deviation of a target's position in the prior, per axis.
         prior_sigma_mps: standard deviation of a target's velocity in the prior, per axis.
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
-        sightings_hz: sightings per second of each sensor, of one target after the other.
+        sightings_hz: sightings per second of each sensor, which looks at one target after the other.
         sigma_rad: standard deviation of azimuth and elevation.
         bias_sigma_rad: standard deviation of the true attitude biases, per axis.
-        bias_drift: random walk of these biases, in rad/sqrt(s).
+        bias_drift: random walk of the attitude biases, in rad/sqrt(s).
         clock_sigma_s: standard deviation of the true clock offset of every sensor except the first.
         known_sigma_m: standard deviation per axis of the position that the first target reports once a
             second; if not set, it does not report.
@@ -87,7 +87,7 @@ class Course(NamedTuple):
     bias_rad: Floats
 
     def rows(self, times_s: Floats) -> NDArray[np.int64]:
-        """Return the rows that belong to given times."""
+        """Return the indices of the rows at the given times."""
         return np.searchsorted(self.times_s, times_s)
 
 

@@ -155,7 +155,7 @@ def _sightings(
 
 
 def _in_view(parameters: OpticalParameters, place: Array, targets: Array) -> NDArray[np.bool_]:
-    """Find the targets (n,) that a sensor can see; a target at its own position is never visible."""
+    """Find the targets (n,) that a sensor can see; a target at the sensor is never visible."""
     offset = targets - place
     distance = np.linalg.norm(offset, axis=1)
     away = distance > 0.0

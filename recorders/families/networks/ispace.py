@@ -1,8 +1,8 @@
 """A room of networked sensor nodes that track one moving target: DIND nodes.
 
 Jin, Lee, Hashimoto, DIND networks, sections 3 to 5. The paper gives no values for the room, so the
-defaults are our own. Every node observes the target with its own sensor and rate, and sends its
-estimate over directed links, on which messages may be lost. The content of a message depends on the
+defaults were chosen for fuselog. Every node observes the target with its own sensor and rate, and sends
+its estimate over directed links, on which messages may be lost. The content of a message depends on the
 estimator, so the log contains only the link events.
 """
 
@@ -64,7 +64,7 @@ class NodeOutage(Parameters):
 
 
 class IspaceParameters(Parameters):
-    """Sensor nodes in a room with links between them, and the target that they track.
+    """Linked sensor nodes in a room, and the target that the nodes track.
 
     Attributes:
         steps: number of time steps.
@@ -143,7 +143,7 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
 def _network(
     parameters: IspaceParameters, rng: np.random.Generator
 ) -> tuple[list[Node], NDArray[np.int64]]:
-    """Return the nodes, and the directed links (m, 2) by number; draw them if the graph is random."""
+    """Return the nodes, and the directed links (m, 2) as node numbers; draw them if they are random."""
     count = parameters.random_nodes
     if count == 0:
         nodes = list(parameters.nodes)

@@ -1,8 +1,8 @@
 """A trolley in a warehouse whose tags measure ranges to anchors on the walls.
 
-It moves as in the model `ranging-pose`, with white accelerations. Ranges have white noise, a common
-bias, a slowly varying error per anchor (a first-order Gauss-Markov process, the same for all tags), and
-an excess if the line of sight is blocked.
+The trolley moves as in the model `ranging-pose`, with white accelerations. Ranges have white noise, a
+common bias, a slowly varying error per anchor (a first-order Gauss-Markov process, the same for all
+tags), and an excess if the line of sight is blocked.
 """
 
 from typing import Annotated
@@ -32,7 +32,8 @@ class Blocked(Parameters):
         times_per_minute: mean number of times per minute that an anchor is blocked.
         duration_s: mean duration of a blockage.
         least_m: smallest excess of a blocked range.
-        most_m: largest excess of a blocked range; excesses are uniform from `least_m` to this.
+        most_m: largest excess of a blocked range; excesses are uniformly distributed from `least_m` to
+            this value.
     """
 
     times_per_minute: NonNegativeFloat = 0.0
@@ -58,7 +59,7 @@ class RangingParameters(Parameters):
         sigma_range_m: standard deviation of a range's white noise.
         bias_range_m: bias of all ranges, measured minus true.
         error_sigma_m: standard deviation of the slowly varying error of every anchor.
-        error_time_s: correlation time of such an error.
+        error_time_s: correlation time of the slowly varying error.
         blocked: blocked lines of sight.
         start_sigma_m: standard deviation of the initial position, per axis.
         start_sigma_rad: standard deviation of the initial heading.
@@ -159,7 +160,7 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
 
 
 def _path(parameters: RangingParameters, steps: int, start: Floats, rng: np.random.Generator) -> Floats:
-    """Draw the states (steps, 6) under white accelerations, exactly at every step."""
+    """Draw the states (steps, 6) under white accelerations; they are exact at every step."""
     step_s = 1.0 / parameters.rate_hz
     place, mixed, speed = noise_moments(1.0, step_s)
     root = np.linalg.cholesky([[place, mixed], [mixed, speed]])

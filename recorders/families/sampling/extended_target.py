@@ -1,4 +1,4 @@
-"""Models of an axis-aligned rectangle of which a sensor sees one noisy point at a time.
+"""Models of an axis-aligned rectangle; a sensor sees one noisy point of it at a time.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION
@@ -11,7 +11,7 @@ SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 
 
 def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
-    """Compute the rectangle's point at `scale` (-1 to 1 each) times the half sides from the centre."""
+    """Compute a point of the rectangle; `scale` (-1 to 1 each) is in half sides from the centre."""
     return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
 
 

@@ -1,4 +1,4 @@
-"""A static rectangle of which a sensor sees one noisy surface point per time step.
+"""A static rectangle; a sensor sees one noisy point of its surface per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B: points are uniform over the surface with Gaussian noise.

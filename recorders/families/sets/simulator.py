@@ -1,7 +1,7 @@
 """A robot at rest that measures relative bearings whose errors have a known bound.
 
-The scene is that of Briechle and Hanebeck (2004), section V, or random. Every look measures all pairs of
-landmarks, or the given pairs.
+The scene is taken from Briechle and Hanebeck (2004), section V, or random. Every look measures all pairs
+of landmarks, or the given pairs.
 """
 
 from typing import Annotated, Literal
@@ -26,17 +26,17 @@ class RelativeBearingsParameters(Parameters):
 
     Attributes:
         scene: the paper's scene or random scenes.
-        paper_pairs: number of the paper's pairs of landmarks to measure in its scene.
+        paper_pairs: number of the paper's landmark pairs to measure in the paper's scene.
         bound_deg: bound of the error of a relative bearing; the channel states it.
-        error_share: share of the bound within which errors are uniform.
+        error_share: errors are uniformly distributed within this share of the bound.
         landmarks: number of landmarks of a random scene.
         arena_m: side of the square arena that the log states, centred on the origin.
         spread_m: largest distance of a random scene's landmarks from the centre in x and in y.
         robot_spread_m: largest distance of a random scene's robot from the centre in x and in y.
         looks: number of times that all pairs are measured.
         rate_hz: looks per second.
-        misidentified_probability: probability that a pair has another landmark in place of its first
-            one.
+        misidentified_probability: probability that a pair is measured with another landmark in place of
+            its first one.
         start_s: time of the first look, since the run's epoch.
     """
 

@@ -6,9 +6,9 @@ NAME_detections.json, and a list of the targets' positions, NAME_groundTruth.jso
 
 In the log's plane, x points east and y north. Detections are positions relative to the ownship
 (/ownship/fix, one message per scan), or bearings anticlockwise from east. Both are in the plane's axes,
-since the files state no heading. The arrival time of a scan is the latest stamp so far, so a scan that
-follows one with a later stamp is out of sequence by the difference. All scans are recorded, including
-empty ones.
+since the files state no heading. The arrival time of a scan is the latest stamp so far. A scan that
+follows one with a later stamp is therefore out of sequence by the difference between the two stamps. All
+scans are recorded, including empty ones.
 """
 
 from collections.abc import Callable, Iterator
@@ -41,14 +41,15 @@ PLANE = ("x_m", "y_m")
 
 
 class PlaceSensor(Parameters):
-    """Assumed properties of a sensor of positions, which its channels state for trackers.
+    """Assumed properties of a position sensor, which its channels state for trackers.
 
     Attributes:
         sigma_m: standard deviation of a position along the line of sight.
         sigma_across_rad: additional standard deviation across the line of sight, per m of range.
-        lag_s: age of the positions in a scan at its stamp.
+        lag_s: age of a scan's positions at the time of its stamp.
         detection_probability: probability that a near target is detected.
-        near_range_m: range up to which a target is near; beyond it the probability falls linearly.
+        near_range_m: range up to which a target is near; beyond it, the detection probability falls
+            linearly.
         far_range_m: range beyond which the probability is constant.
         far_detection_probability: probability that a target beyond `far_range_m` is detected.
         clutter_per_m2: mean number of false detections in a scan, per area.
@@ -78,7 +79,8 @@ class Camera(Parameters):
         detection_probability: probability that a target is detected.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         gate_probability: probability that a target's detection is inside its gate.
-        interval_s: time between bearings that a track uses, since errors last for seconds.
+        interval_s: time between the bearings that a track uses, since errors of bearings last for
+            seconds.
     """
 
     sigma_rad: PositiveFloat = 0.04
@@ -90,7 +92,7 @@ class Camera(Parameters):
 
 
 class AutoferryParameters(Parameters):
-    """Properties of the sensors, which the files do not state, the same in all scenarios.
+    """Properties of the sensors, which the files do not state; they are the same in all scenarios.
 
     Attributes:
         lidar, radar: assumed properties of this sensor's detections.
@@ -135,9 +137,9 @@ class Scans(NamedTuple):
 
 
 def read(folder: Path, parameters: AutoferryParameters) -> Recording:
-    """Read a scenario; the notes count its scans, and the empty and late ones.
+    """Read a scenario; the notes count the scans, the empty scans and the late scans.
 
-    Raises BadInput with the file and the entry if one of them is missing, or not in the published form.
+    Raises BadInput, with the file and the entry, if either is missing or not in the published form.
     """
     scans = _scans(_file(folder, "detections"))
     truths = _truths(_file(folder, "groundTruth"))

@@ -1,7 +1,7 @@
 """A vehicle that drives, turns, brakes, stands and starts again, and its position fixes.
 
-It drives at a constant speed between manoeuvres. A turn is an arc at that speed; the vehicle stops only
-on straight parts. The durations of driving and standing are random.
+The vehicle drives at a constant speed between manoeuvres. A turn is an arc at that speed; the vehicle
+stops only on straight parts. The durations of driving and standing are random.
 """
 
 from typing import NamedTuple

@@ -12,7 +12,7 @@ from fuselog.recorders.models.planar import Component, Components
 def turn(
     state: Components, turn_rate_radps: Component, duration_s: Component
 ) -> tuple[Component, Component, Component, Component]:
-    """Compute the state after a coordinated turn (14), or by constant velocity (12) if the rate is 0."""
+    """Compute the state after a coordinated turn (14), or at constant velocity (12) if the rate is 0."""
     angle = turn_rate_radps * duration_s
     along = duration_s * np.sinc(angle / np.pi)
     across = duration_s * 0.5 * angle * np.sinc(0.5 * angle / np.pi) ** 2
@@ -32,7 +32,7 @@ def noise_moments(
     """Compute the position's variance, its covariance with the velocity, and the velocity's variance.
 
     The acceleration is random and constant over the duration. This is (13) with T^4/4, T^3/2 and T^2;
-    the paper prints T^2/4, T^2/2 and T, which is equal for its T = 1.
+    the paper prints T^2/4, T^2/2 and T, which is the same for the paper's T = 1.
     """
     velocity = (acceleration_sigma_mps2 * duration_s) ** 2
     return 0.25 * velocity * duration_s**2, 0.5 * velocity * duration_s, velocity

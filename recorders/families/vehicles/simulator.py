@@ -1,8 +1,8 @@
 """Vehicles that send their positions to a network, and a roadside sensor of unknown pose.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
-symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on /vehicleN/fix;
-/network has the same fixes as they arrive, without identity and unordered; /infrastructure has unordered
+symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on /vehicleN/fix.
+/network has the same fixes as they arrive, without identity and unordered. /infrastructure has unordered
 detections in the sensor's own frame.
 """
 
@@ -98,8 +98,8 @@ class VehiclesParameters(Parameters):
     Attributes:
         duration_s: length of the run.
         step_s: length of a time step with constant acceleration.
-        stochastic: whether initial states are drawn from the prior and vehicles accelerate. Filters
-            assume both in any case; if it is False, as in the paper, the filters are conservative.
+        stochastic: whether the initial states are drawn from the prior, and the vehicles accelerate.
+            Filters always assume both; if this is False, as in the paper, they are conservative.
         start: initial states (x, vx, y, vy) of the vehicles, in m and m/s.
         vehicles: number of vehicles with random initial positions in the field; 0 to use `start`.
         speed_mps: speed of vehicles with random initial positions.

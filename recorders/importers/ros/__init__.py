@@ -1,4 +1,4 @@
-"""Importer of logs of ROS 1 and ROS 2: .bag, .db3 and MCAP files, and folders of them, without ROS.
+"""Importer of ROS 1 and ROS 2 logs, without ROS: .bag, .db3 and MCAP files, and folders of them.
 
 Begin with `importer`.
 """

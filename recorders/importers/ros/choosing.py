@@ -1,9 +1,9 @@
 """Choice of the topics to import from a bag, how to read them, and how to name their streams.
 
-A stream is named by the namespace of its topic and by its kind: /odom gives /odometry, /robot1/imu gives
-/robot1/inertial. If two topics would give the same name, both include the topic: /odom/odometry,
-/wheels/odometry. Names of poses without a covariance always include the topic, since these may be
-goals: /goal_pose/pose.
+A stream is named after the namespace of its topic and after its own kind: /odom gives /odometry,
+/robot1/imu gives /robot1/inertial. If two topics would give the same name, both include the topic:
+/odom/odometry, /wheels/odometry. Names of poses without a covariance always include the topic, since
+such poses may be goals: /goal_pose/pose.
 """
 
 import re
@@ -48,14 +48,14 @@ class RosParameters(Parameters):
         names: replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic under
             /robot1.
         truth: topic whose poses become the stream `truth`, with which estimates are compared.
-        estimates: topics with the poses of another filter, such as /odometry/filtered: they become
-            estimates, which `fuselog evaluate` judges, and not measurements.
-        mapping: a TOML file for messages of your own.
+        estimates: topics with the poses of another filter, such as /odometry/filtered. These poses
+            become estimates, which `fuselog evaluate` judges, not measurements.
+        mapping: TOML file with mappings of user-defined messages.
         distribution: distribution whose definitions are used for messages that the bag does not define.
         clock_tolerance_s: largest difference between topics in the offset of the header's clock from the
-            bag's; above it, their clocks are unrelated, and the import stops.
+            bag's clock; if it is exceeded, the topics' clocks are unrelated, and the import stops.
         origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
-            plane of poses and positions, whatever their frames are called; it does not apply to
+            plane of poses and positions, regardless of the names of their frames. It does not apply to
             transforms, nor to poses that odometry integrates.
         quaternions: what to do with messages whose quaternions are not of unit length: "refuse" stops
             the import, "normalise" scales them, "skip" leaves such messages out.
@@ -85,7 +85,7 @@ class Reader(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The readers of the chosen connections, and by topic the reason why others are not read."""
+    """The readers of the chosen connections and, by topic, why other connections are not read."""
 
     readers: dict[Connection, Reader]
     not_taken: dict[str, str]

@@ -136,7 +136,7 @@ class _Import:
         return transforms_of(messages, log_time_ns, where, quaternions, tell)
 
     def _named_chains(self) -> list[Chain]:
-        """Make the chains of the named pairs; this reads all transforms of the bag once."""
+        """Make the chains of the requested pairs of frames; this reads all transforms once."""
         pairs = []
         for text in self._parameters.transforms:
             parent, colon, child = text.partition(":")
@@ -310,7 +310,7 @@ class Clocks:
     def note(
         self, topic: str, stamp_ns: NDArray[np.int64] | None, log_time_ns: NDArray[np.int64]
     ) -> None:
-        """Add the stamps of some messages (n,); if they have no header, only those of the bag."""
+        """Add the stamps of some messages (n,); without headers, only the bag's stamps."""
         if stamp_ns is not None:  # zero means no stamp
             stamp_ns, log_time_ns = stamp_ns[stamp_ns != 0], log_time_ns[stamp_ns != 0]
         if not len(log_time_ns):
@@ -337,7 +337,7 @@ class Clocks:
             )
 
     def notes(self) -> dict[str, str]:
-        """Describe both clocks and their offset."""
+        """Describe the header's clock and the bag's clock, and the offset between them."""
         found = {}
         for name, spans in (("header", self.header), ("bag", self.bag)):
             if spans:

@@ -1,9 +1,10 @@
 """Decoding of ROS messages into columns, for any message type.
 
-A message without strings and sequences has one byte layout. Otherwise the layout depends only on their
-lengths, and messages of one topic rarely differ in these. So the layout is determined once, by walking
-along one message and its definition, and all messages with the same lengths are read with it together.
-Sources: wiki.ros.org/msg (ROS 1); OMG DDS-XTypes 1.3, section 7.4.1, plain CDR of version 1 (ROS 2).
+A message without strings and sequences has one byte layout. Otherwise, the layout depends only on the
+lengths of strings and sequences, in which messages of one topic rarely differ. So the layout is
+determined once, by walking along one message and its definition; all messages with the same lengths are
+then read together. Sources: wiki.ros.org/msg (ROS 1); OMG DDS-XTypes 1.3, section 7.4.1, plain CDR of
+version 1 (ROS 2).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,7 +81,7 @@ class Layout:
     """The position of each field of a message, valid for equal lengths of texts and sequences.
 
     Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` has
-    the bytes of all lengths, by position, which are the same in every message of the layout.
+    the bytes of all lengths, by position; they are the same in every message of the layout.
     """
 
     numbers: dict[str, _Number] = field(default_factory=dict)
@@ -105,7 +106,7 @@ class Messages:
         return len(self.rows)
 
     def numbers(self, path: str) -> NDArray:
-        """Read a field (n,), or an array (n, count); raise KeyError if there is none."""
+        """Read a field (n,), or an array (n, count); raise KeyError if there is no such field."""
         offset, dtype, count = self.layout.numbers[path]
         part = self.raw[:, offset : offset + dtype.itemsize * (1 if count is None else count)]
         if count == 0:
@@ -114,7 +115,7 @@ class Messages:
         return column[:, 0] if count is None else column
 
     def text(self, path: str) -> NDArray[np.bytes_]:
-        """Read a text (n,) as bytes; raise KeyError if there is none."""
+        """Read a text (n,) as bytes; raise KeyError if there is no such field."""
         offset, length = self.layout.texts[path]
         if not length:
             return np.zeros(len(self), "S1")
@@ -158,7 +159,7 @@ class MessageType:
         return dict(self._flat("", (Nodetype.NAME, self.name)))
 
     def read(self, raw: NDArray[np.uint8], rows: NDArray[np.int64]) -> Iterator[Messages | Undecodable]:
-        """Yield messages of one size (n, size) with rows (n,), by layout; an error for each bad one."""
+        """Yield messages of one size (n, size), with rows (n,), by layout; yield errors for bad ones."""
         while len(rows):
             try:
                 layout, same = self._next(raw)

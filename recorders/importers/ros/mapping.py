@@ -27,7 +27,8 @@ class MessageMapping(StreamMapping):
 
     Attributes:
         name: last part of the stream's name.
-        stamp: path of a time, or of a whole number of ns, at which the message was measured.
+        stamp: path of the field that states when the message was measured: a time, or a whole number of
+            ns.
         frame: path of the field with the name of the frame.
     """
 

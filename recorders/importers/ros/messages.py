@@ -41,11 +41,12 @@ class Part:
         columns: fields (k,) or (k, width) of the stream's schema.
         metadata: metadata of the channel.
         constants: columns (k, width) whose first row becomes metadata, by the name of the metadata.
-        noise: variances (k,) of readings, by the noise density that the channel states for them.
-        rows: message of each row; None if there is one row for each message.
+        noise: variances (k,) of readings, by the name of the noise density that the channel states for
+            them.
+        rows: index of each row's message; None if there is one row for each message.
         dropped: rows (k,) to leave out, by reason.
         doubtful: rows (k,) that are kept but counted, by reason.
-        lacking: rows (k,) that state that they have no such data, by field; their columns are NaN there.
+        lacking: rows (k,) that state that a field has no data, by field; the field is NaN in these rows.
     """
 
     kind: str
@@ -66,8 +67,8 @@ class Taken(NamedTuple):
     Attributes:
         kinds: kinds of the streams made from them.
         parts: function that reads the messages.
-        is_doubtful: whether they may be a measurement, a goal or the truth according to the type; then
-            streams are named after the whole topic, and no model uses them by default.
+        is_doubtful: whether, according to the type, the messages may be a measurement, a goal or the
+            truth. If so, streams are named after the whole topic, and no model uses them by default.
     """
 
     kinds: tuple[str, ...]
@@ -76,7 +77,7 @@ class Taken(NamedTuple):
 
 
 def stamps_ns(messages: Messages, path: str = STAMP, where: str = "") -> NDArray[np.int64] | None:
-    """Read stamps (n,) in ns from a field, a time or a whole number of ns; None if it is missing."""
+    """Read stamps (n,) in ns from a field with times or whole ns; return None if it is missing."""
     numbers = messages.layout.numbers
     if path in numbers:
         return to_ns(messages.numbers(path), 1, where=where + path)
@@ -259,7 +260,7 @@ def as_truth(part: Part) -> Part:
 def as_estimate(part: Part, truth: str) -> Part:
     """Convert poses to the estimates of another filter, which are compared with the topic `truth`.
 
-    The covariance of a pose is that of x, y, z and rotations about the fixed axes. An unknown covariance
+    The covariance of a pose is of x, y, z and the rotations about the fixed axes. An unknown covariance
     becomes zero, so that the estimates have no NEES.
     """
     components = {name: kind for name, kind in TRUTH.items() if kind != "angle"}

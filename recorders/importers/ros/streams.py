@@ -28,7 +28,7 @@ Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
 
 
 class Sent(NamedTuple):
-    """Messages (n,) of a topic: their rows in it, and their stamps; None without a header."""
+    """Messages (n,) of a topic: their rows in it, and stamps; `stamp_ns` is None without a header."""
 
     topic: str
     rows: NDArray[np.int64]
@@ -103,7 +103,7 @@ class StreamMaker:
             self.counts[subject, fact] += count
 
     def add(self, sent: Sent, part: Part, frames: Frames, name: str = "") -> None:
-        """Add a part of messages (n,) to the stream `name`, or to that of their topic and frames."""
+        """Add a part of messages (n,) to the stream `name`, or to the one of their topic and frames."""
         keep = self._kept(sent, part)
         for frame, which in frames:
             rows = np.flatnonzero(keep & (which if part.rows is None else which[part.rows]))
@@ -117,7 +117,7 @@ class StreamMaker:
         ]
 
     def _kept(self, sent: Sent, part: Part) -> NDArray[np.bool_]:
-        """Test which messages (k,) of a part are kept; count the others by reason."""
+        """Test which messages (k,) of a part are kept; count those left out by reason."""
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
@@ -197,7 +197,7 @@ class StreamMaker:
         self.came_of[sent.topic][name] = None
 
     def _state_noise(self, topic: str, written: _Written, steps_ns: NDArray[np.int64]) -> None:
-        """State the noise densities of a stream from the first of its variances that is known."""
+        """State the noise densities of a stream, computed from the first known variance of each."""
         step_s = 1e-9 * float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else 0.0
         for name, variances in written.noise.items():
             known = variances[variances > 0.0]  # not zero, NaN or negative

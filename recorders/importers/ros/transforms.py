@@ -1,9 +1,9 @@
-"""Transforms between frames (TF): those sent, as poses, and named pairs that are composed from them.
+"""Transforms between frames (TF): sent transforms as poses, and named pairs composed from them.
 
 A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
-the part of its chain that is sent most often. The other parts are interpolated between the two nearest
-stamps, linearly and along the shortest rotation, as in tf2, and never extrapolated. Transforms are kept
-only until they are no longer needed, so that memory stays bounded.
+the transform in its chain that is sent most often. The other transforms are interpolated between the two
+nearest stamps, linearly and along the shortest rotation, as in tf2, and never extrapolated. Transforms
+are kept only until they are no longer needed, so that memory stays bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -197,7 +197,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
     Args:
         given: transforms in the order of their stamps.
-        stamp_ns: (n,), stamps within those of `given`.
+        stamp_ns: (n,), stamps within the span of `given`.
 
     Returns:
         n transforms at these stamps; their `log_time_ns` and `rows` are meaningless.
@@ -219,7 +219,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
 
 def path_between(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
-    """Find the links from one frame to the other, and whether each is followed in its direction."""
+    """Find the links from one frame to the other, and whether each is followed from parent to child."""
     above = {child: parent for parent, child in links}
     parent, child = pair
     for frame in pair:
@@ -269,7 +269,7 @@ class Mountings:
         """Yield notes on fixes and inertial samples whose frames are not the body's, by subject.
 
         Args:
-            streams: names of messages and metadata, by topic.
+            streams: the name of the messages, and the metadata, by topic.
         """
         odometry = schemas.ODOMETRY.full_name
         bodies = [each.get("child_frame_id") for name, each in streams.values() if name == odometry]
@@ -303,7 +303,7 @@ class Mountings:
                 yield f"{topic}, mounting", f"{what}; used by {', or '.join(uses)}"
 
     def _note_of_moving(self, bases: list[str], stated: Mapping[str, str]) -> str:
-        """Write that a frame moves on the body; empty if it is not connected to a base frame."""
+        """Return a note if a frame moves relative to the body; empty if no base frame leads to it."""
         frame = stated.get("frame_id", "").lstrip("/")
         for base in bases:
             try:

@@ -1,4 +1,4 @@
-"""Readers of texts in blocks of whole lines with a limited length, to limit memory.
+"""Readers of texts in blocks of whole lines; blocks have a limited length, to limit memory.
 
 One kind of line is selected from receivers' logs whose lines begin with their kind.
 """
@@ -34,7 +34,7 @@ _INSPVA_UNITS = {
 
 
 def blocks_of(file: BinaryIO, doubts: set[str]) -> Iterator[bytes]:
-    """Yield blocks of as many whole lines as fit; raise ValueError if a line is too long.
+    """Yield large blocks of whole lines; raise ValueError if a line is too long.
 
     The last line is never a block of its own. If it lacks a newline, `doubts` gets a note about it.
     """
@@ -92,7 +92,7 @@ def utf8(blocks: Iterator[bytes]) -> Iterator[bytes]:
 
 
 def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield lines with commas in place of the white space between cells, without comments."""
+    """Yield lines without comments, with commas in place of the white space between cells."""
     for block in blocks:
         yield b"".join(
             b",".join(line.split()) + b"\n"
@@ -102,7 +102,7 @@ def delimited(blocks: Iterator[bytes]) -> Iterator[bytes]:
 
 
 def without(blocks: Iterator[bytes], heads: Sequence[bytes], left_out: Counter[str]) -> Iterator[bytes]:
-    """Yield blocks without lines that repeat the header, which are counted."""
+    """Yield blocks without the lines that repeat the header; count these lines."""
     for block in blocks:
         if any(head in block for head in heads):
             lines = block.splitlines(keepends=True)
@@ -154,9 +154,9 @@ class Tagged(NamedTuple):
 
 
 def tagged_of(file: BinaryIO, path: Path) -> Tagged | None:
-    """Recognise a receiver's log by its first lines, and return the rows to read; None for other files.
+    """Recognise a receiver's log by its first lines; return the rows to read, or None for other files.
 
-    Raises BadInput if it is such a log, but without rows that can be read.
+    Raises BadInput if the file is such a log, but has no rows that can be read.
     """
     lines = [line.rstrip() for line in islice(lines_of(file), 1)]
     first = lines[0] if lines else b""

@@ -20,12 +20,12 @@ _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 def read_ns(
     cells: pa.Array, digits: int, since_ns: int | Stamps = 0, *, where: str, remedy: str
 ) -> Stamps:
-    """Convert cells (n,) to stamps; texts keep all digits, which doubles do not.
+    """Convert cells (n,) to stamps; texts keep all of their digits, unlike doubles.
 
     Args:
         cells: whole numbers, floats, texts of numbers, or timestamps or durations, which have their own
             unit.
-        digits: number of decimal places of the unit down to a nanosecond, such as 9 for seconds.
+        digits: number of decimal places at which the unit reaches a nanosecond, such as 9 for seconds.
         since_ns: stamp at which the values are zero.
         where: beginning of error messages.
         remedy: end of error messages.
@@ -72,7 +72,7 @@ def sided(cells: pa.Array) -> tuple[pa.Array, pa.Array]:
 
 
 def _plain(texts: pa.Array, digits: int) -> Stamps | None:
-    """Convert texts (n,) to nanoseconds if all are plain decimals of at most `digits` digits; else None.
+    """Convert texts (n,) to nanoseconds; None unless all are plain decimals of at most `digits` digits.
 
     This is fast, and sufficient for most files.
     """

@@ -116,7 +116,7 @@ def _magnetic(table: GuessedTable) -> Iterator[str]:
 
 
 def _field_lines(field: Sequence[GuessedColumn]) -> list[str]:
-    """Write the field and unit of a magnetometer's columns; an empty list without columns."""
+    """Write the field and unit of a magnetometer's columns, or an empty list without such columns."""
     if not field:
         return []
     sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
@@ -174,7 +174,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
 
 
 def _target(table: GuessedTable) -> Iterator[str]:
-    """Write ranges and bearings; a range or bearing alone needs a column of target numbers."""
+    """Write ranges and bearings; a range or a bearing by itself needs a column of target numbers."""
     columns = table.columns
     whole = list(columns)
     number = take(columns, _TARGET)
@@ -309,7 +309,7 @@ def _position(
 def _along_axes(
     found: list[GuessedColumn], steps: Sequence[NDArray], places: Sequence[GuessedColumn]
 ) -> tuple[list[GuessedColumn], list[int], list[str]]:
-    """Order x, y and z as east, north and up: by their frame, by the motion, or by assumption.
+    """Order x, y and z as east, north and up, according to their frame, the motion or an assumption.
 
     Args:
         found: the columns.
@@ -371,7 +371,7 @@ def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[Gu
 
 
 def truth_lines(table: GuessedTable) -> Iterator[str]:
-    """Write the stream of a table's true columns, and no stream that filters could read."""
+    """Write the stream of a table's true columns, but no stream that a filter could read."""
     columns = table.columns
     place, factors, said = _position(columns, table.places)
     if not place and (geodetic := take(columns, *_GEODETIC, usual="deg")):
@@ -444,7 +444,7 @@ def _truth(
 
 
 def _heading(table: GuessedTable) -> Iterator[str]:
-    """Write headings next to fixes; a course is not used, as it is undefined at rest."""
+    """Write headings next to fixes; courses are not used, since they are undefined at rest."""
     if not table.places or not (found := take(table.columns, _HEADING_ALONE, usual="rad")):
         return
     is_compass = is_ais(table) or bool(re.search("compass|course|heading|hdg", found[0].plain))

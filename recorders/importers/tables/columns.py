@@ -49,7 +49,7 @@ class GuessedTable(NamedTuple):
         has_truth: whether other columns are the truth.
         time_s: times of the rows (rows,), NaN if missing; None without times.
         whole: all columns.
-        places: east and north of the rows, from which courses are computed, as soon as they are known.
+        places: east and north of the rows, once they are known; courses are computed from them.
         made: lines of the table's mapping outside its streams.
         prepared: entries of the mapping that prepare columns, such as `missing`, by name.
     """
@@ -82,7 +82,7 @@ def column_named(
 
 
 def take(columns: list[GuessedColumn], *patterns: str, usual: str = "") -> list[GuessedColumn]:
-    """Take a `column_named` by each pattern from the list; take none and return [] if one is missing."""
+    """Take a column for each pattern from the list; if one is missing, take none and return []."""
     found = [each for pattern in patterns if (each := column_named(columns, pattern, usual))]
     if len(found) < len(patterns):
         return []
@@ -122,7 +122,7 @@ def stated_unit(column: GuessedColumn, usual: str) -> str:
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """Choose the unit that gives a vector its expected length, else the first; return the reason too."""
+    """Choose the unit that gives a vector its expected length, or the first; return the reason too."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
@@ -141,7 +141,7 @@ def length_of(columns: Sequence[GuessedColumn]) -> float:
 def unit_by_largest(
     columns: Sequence[GuessedColumn], usual: str, other: str, limit: float
 ) -> tuple[str, str]:
-    """Choose the other unit if numbers exceed a limit, else the usual unit; return the reason too."""
+    """Choose the other unit if numbers exceed a limit, else the usual one; also return the reason."""
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
     largest = largest_of(columns)
@@ -191,7 +191,7 @@ _MARKS = str.maketrans({"\u03bc": "\u00b5", "°": "deg", "(": "", ")": ""})
 
 
 def parted(name: str) -> tuple[str, str]:
-    """Split a name into its lower-case form with underscores and its unit, in brackets or at the end.
+    """Split a name into its lower-case form (with underscores) and its unit, in brackets or at the end.
 
     >>> parted("Höhe [ft]"), parted("speed_kmh"), parted("TimeUS")
     (('altitude', 'ft'), ('speed', 'km/h'), ('time', 'us'))
@@ -262,8 +262,8 @@ def direction_of(
 ) -> Direction:
     """Determine a heading's unit and convention from the course of positions, or from its numbers.
 
-    A heading may be unwrapped, so its largest value does not determine the unit. `usual` is whether such
-    a heading is usually a compass heading; this decides if the course is not clear.
+    A heading may be unwrapped, so its largest value does not determine the unit. `usual` states whether
+    such a heading is usually a compass heading; it is used if the course is not clear.
     """
     stated = stated_unit(heading, "rad")
     units = [stated] if stated else _angle_units(largest_of([heading]))
@@ -293,7 +293,7 @@ def direction_of(
 
 
 def frame_of(steps: Sequence[NDArray], places: Sequence[GuessedColumn]) -> str:
-    """Determine by the motion of positions whether two axes are east and north or north and east.
+    """Determine from the motion of positions whether two axes are east and north or north and east.
 
     Args:
         steps: displacement along the first and the second axis (rows,), NaN if unknown.
@@ -339,7 +339,7 @@ def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
 
 
 def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray] | None:
-    """Find rows, directions (rad) and lengths of the steps between positions; None for fewer than 3."""
+    """Find the rows, directions (rad) and lengths of steps; return None for fewer than 3 positions."""
     east, north = (each.values for each in places[:2])
     rows = np.flatnonzero(np.isfinite(east) & np.isfinite(north))
     if len(rows) < 3:

@@ -84,7 +84,7 @@ class Table:
         mended: corrections that were made.
         units: units from a row of units, by column.
         doubts: doubtful facts about the rows.
-        is_text: whether cells are texts; cells that say NaN are null.
+        is_text: whether cells are texts; a cell with the text NaN is null.
     """
 
     path: Path
@@ -152,7 +152,7 @@ def open_table(
     Args:
         path: the file; .gz, .bz2 and .xz are decompressed.
         format: format of the file; by default it follows from the suffix, and is CSV for unknown ones.
-        options: facts that a text does not state.
+        options: options for a text table, which the file itself does not state.
         more: text files whose lines follow those of the first.
         split: columns whose cells contain several numbers, with the names of these numbers.
 
@@ -178,7 +178,7 @@ def open_table(
 
 
 def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
-    """Split the cells of some columns into columns of their own."""
+    """Split the cells of some columns into separate columns."""
     parts = {table.column(source): names for source, names in split.items()}
     source_of = {name: source for source, names in parts.items() for name in names}
     twice = [name for name in source_of if name in table.columns]

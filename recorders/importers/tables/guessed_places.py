@@ -1,6 +1,7 @@
-"""Guesses of the units of latitudes, longitudes, altitudes and speeds, and of codes for missing ones.
+"""Guesses of the units of latitudes, longitudes, altitudes and speeds, and of codes for missing values.
 
-They use names, magnitudes, and the speed from row to row; if a unit is ambiguous, the table is rejected.
+The guesses use names, magnitudes, and the speed from row to row; if a unit is ambiguous, the table is
+rejected.
 """
 
 import json
@@ -120,13 +121,13 @@ def _rows(count: int) -> str:
 
 
 def _is_code(values: NDArray, code: float, largest: float) -> bool:
-    """Test whether a value is a code: beyond the range of degrees, unlike most others."""
+    """Test whether a code occurs and all other values are within the range of degrees."""
     others = values[np.isfinite(values) & ~np.isin(values, _NOT_A_PLACE)]
     return bool(np.any(values == code)) and (not len(others) or float(np.abs(others).max()) <= largest)
 
 
 def fixes_of(table: GuessedTable) -> tuple[list[str], NDArray[np.bool_]]:
-    """Write the lines that select rows with a fix; return them, and which rows (rows,) have one."""
+    """Write the lines that select rows with a fix; return the lines, and a mask (rows,) of the rows."""
     rows = len(table.whole[0].values)
     found: list[tuple[str, NDArray[np.bool_], Sequence[float | str]]] = []
     is_of_satellites = any(column.plain == "nsats" for column in table.whole)
@@ -239,7 +240,7 @@ def _refuse(table: GuessedTable, place: Sequence[GuessedColumn], why: str) -> No
 
 
 def _signed(table: GuessedTable, column: GuessedColumn, letters: str) -> NDArray:
-    """Apply the signs from a column of hemispheres to a column, if there is one."""
+    """Apply the signs of the matching column of hemispheres, if there is one, to a column."""
     if column.name in table.prepared.get("hemispheres", {}):
         return column.values
     sides = [
@@ -294,7 +295,7 @@ def _degrees(name: str, values: NDArray) -> NDArray:
 
 
 def _by_speed(table: GuessedTable, pair: tuple[NDArray, NDArray], fitting: Sequence[str]) -> list[str]:
-    """Return the units in which positions agree with a column of speeds; all units without one."""
+    """Return the units in which positions agree with a column of speeds, or all if there is none."""
     speed = column_named(table.whole, _SPEED)
     if speed is None or len(fitting) == 1:
         return list(fitting)
@@ -315,7 +316,7 @@ def _speed_sizes(table: GuessedTable) -> list[float]:
 
 
 def is_ais(table: GuessedTable) -> bool:
-    """Test by the names of columns whether a table contains AIS reports."""
+    """Test from the column names whether a table contains AIS reports."""
     names = {each.plain for each in table.whole}
     return {"sog", "cog"} <= names or column_named(table.whole, "(.*_)?mmsi") is not None
 
@@ -394,7 +395,7 @@ def _by_name(
 
 
 def named_unit(field: str, length: str) -> list[str]:
-    """Write the unit of a length that the name of its column states, unless it is m."""
+    """Write the unit of a length if its column's name states a unit other than m."""
     return [f'units.{field} = "{length}"   # as its name says'] if length not in ("", "m") else []
 
 
@@ -437,9 +438,9 @@ def accuracy_of(table: GuessedTable, accuracy: GuessedColumn, position_unit: str
 
 
 def speed_unit_of(table: GuessedTable, velocity: Sequence[GuessedColumn]) -> tuple[str, str]:
-    """Determine the unit of a speed, or of a velocity of east, north and up, and the reason.
+    """Determine the unit of a speed, or of a velocity (east, north and up), and the reason.
 
-    It follows from the name, or from how fast positions change; otherwise it is m/s.
+    The unit follows from the name, or from how fast positions change; otherwise it is m/s.
     """
     speed = velocity[0]
     if stated := stated_unit(speed, "m/s"):

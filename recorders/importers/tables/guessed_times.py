@@ -308,7 +308,7 @@ def _check_frames(table: _Table) -> None:
 
 
 def _rises(values: NDArray) -> bool:
-    """Test whether numbers nearly always rise, and end above the first."""
+    """Test whether numbers nearly always rise, and whether the last is above the first."""
     known = values[np.isfinite(values)]
     return len(known) > 1 and float(np.mean(np.diff(known) >= 0)) >= 0.9 and bool(known[-1] > known[0])
 
@@ -320,7 +320,7 @@ def _is_steady(values: NDArray) -> bool:
 
 
 def _passed_over(table: _Table, used: set[str]) -> list[str]:
-    """Write which columns with other dates were not chosen as the time."""
+    """Name the columns with other dates that were not chosen as the time."""
     others = [
         column.name
         for column in table.columns
@@ -654,7 +654,7 @@ def _calendars(table: _Table) -> Iterator[tuple[TimeMapping, list[str]]]:
 
 
 def _parts_of_date(table: _Table) -> dict[str, str]:
-    """Return the columns with parts of a date and time, by their letters; empty without a year."""
+    """Return the columns with parts of dates and times, by format letter; empty without a year."""
     found: dict[str, str] = {}
     for pattern, letters in _PARTS:
         for column in table.columns:
@@ -669,7 +669,7 @@ def _parts_of_date(table: _Table) -> dict[str, str]:
 
 
 def _nameless_parts(table: _Table) -> dict[str, str]:
-    """Find the parts of a date by the numbers in columns without names; empty if ambiguous."""
+    """Infer from their numbers which unnamed columns are the parts of a date; empty if ambiguous."""
     fitting = []
     for day in _DAYS_IN_PARTS:
         own = {
@@ -835,7 +835,7 @@ def _is_fit(table: _Table) -> bool:
 
 
 def _relative_unit(table: _Table, column: GuessedColumn, step: float) -> tuple[str, str]:
-    """Choose the unit of a counter with unknown zero, by speeds or else by its steps."""
+    """Choose the unit of a counter with unknown zero from the speeds, or else from its steps."""
     if (ratio := _seconds_a_count(table, column)) is not None:
         nearest = min(_LIKELY, key=lambda each: abs(np.log(_SIZES[each] / ratio)))
         if abs(np.log10(_SIZES[nearest] / ratio)) < 1.0:

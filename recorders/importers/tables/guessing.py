@@ -1,4 +1,4 @@
-"""Guesses of a first mapping: which messages the columns contain, by their names and numbers.
+"""Guesses of a first mapping: names and numbers of columns show which messages they contain.
 
 The mapping gives the reason for each guess in a comment; columns that fit no message become a vector of
 plain numbers. The result is text, not an import, so that a person can read and correct the mapping.
@@ -107,9 +107,9 @@ class Source(NamedTuple):
     Attributes:
         path: the first file.
         name: pattern of the names of all files.
-        more: the files whose rows follow.
+        more: the files whose rows follow those of `path`.
         stamps: the file with the times of the rows, and its name relative to the folder.
-        columns: names of the columns from another file.
+        columns: names of the columns, if another file lists them.
     """
 
     path: Path
@@ -120,7 +120,7 @@ class Source(NamedTuple):
 
 
 def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
-    """Group files with their names into tables; the one-row files of a folder are one table."""
+    """Group files, given with their names, into tables; the one-row files of a folder are one table."""
     groups: dict[tuple[Path, str], list[tuple[Path, str]]] = {}
     for path, name in files:
         if path.suffix.lower() in _TEXTS and re.fullmatch(r"\D*\d+", path.stem):
@@ -142,7 +142,7 @@ def sources_of(files: Sequence[tuple[Path, str]]) -> list[Source]:
 
 
 def _count(path: Path, most: int) -> int:
-    """Count the rows of a text, up to `most`; 0 if it cannot be read."""
+    """Count the rows of a text, up to `most`; return 0 if it cannot be read."""
     try:
         with open_text(path) as file:
             rows = (line for line in lines_of(file) if line.strip() and not line.startswith(COMMENTS))
@@ -334,7 +334,7 @@ def _table(source: Source, *, is_alone: bool) -> str:
 
 
 def _check_kinds(path: Path, columns: Sequence[str], batch: Batch) -> None:
-    """Raise BadInput for a table with several kinds of rows, named in a column of texts."""
+    """Raise BadInput for a table with several kinds of rows, which a column of texts names."""
     plain = {name: parted(name)[0] for name in columns}
     for of_value, of_kind in _KINDS.items():
         value = next((name for name in columns if re.fullmatch(of_value, plain[name])), "")
@@ -372,7 +372,7 @@ def _of_sensor(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
 
 
 def _in_frame(columns: list[GuessedColumn], path: Path) -> list[GuessedColumn]:
-    """Set the frames that the names of columns, or that of the file, state."""
+    """Set the frames that the names of the columns or of the file state."""
     of_file = "ned" if re.search(_NED, path.stem) else ""
     found = []
     for column in columns:
@@ -404,7 +404,7 @@ def _time(
     *,
     has_others: bool,
 ) -> GuessedTime:
-    """Guess the time of rows, which may be in a file of its own."""
+    """Guess the rows' time, which may be in a separate file."""
     if source.stamps is None:
         return guess_time(source.path, batch, columns, texts, has_others=has_others)
     path, name = source.stamps
@@ -417,7 +417,7 @@ def _time(
 
 
 def _in_order(table: GuessedTable, batch: Batch, vehicle: str) -> GuessedTable:
-    """Sort the rows by time; of several vehicles, keep only the one with the most rows."""
+    """Sort the rows by time; if there are several vehicles, keep only the one with the most rows."""
     rows = np.arange(len(next(iter(batch.values()))))
     if vehicle:
         names = np.array(batch[vehicle].cast(pa.string()).fill_null("").to_pylist())
@@ -476,7 +476,7 @@ def _has_commas(cells: pa.Array) -> bool:
 
 
 def _split(name: str, cells: pa.Array) -> list[str]:
-    """Return names for the numbers in each cell of a column; empty unless all cells have several."""
+    """Return names for the numbers in each cell of a column; empty unless each cell has several."""
     if not pa.types.is_string(cells.type) or not re.search(r"\d[\s,;]+[-+.\d]", first_cell(cells)):
         return []
     is_point = pc.any(pc.match_substring_regex(cells, r"(?i)^\s*POINT")).as_py()
@@ -570,7 +570,7 @@ def of_device(columns: list[GuessedColumn]) -> list[GuessedColumn]:
 
 
 def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str]:
-    """Write the lines of an exported table's mapping after `files`; empty for other tables."""
+    """Write the lines of an exported table's mapping after `files`; return [] for other tables."""
     if tuple(columns[:3]) != _CLOCKS:
         return []
     fitting = [
@@ -599,7 +599,7 @@ def export_mapping(path: Path, columns: Sequence[str], batch: Batch) -> list[str
 
 
 def _fields(schema: Schema, columns: Sequence[str]) -> dict[str, str | list[str]] | None:
-    """Assign columns to the fields of a message; None if a field or a column is left over."""
+    """Assign columns to a message's fields; return None if a column is left over or a field has none."""
     found: dict[str, str | list[str]] = {}
     left = list(columns)
     for entry in sorted(list(schema)[1:], key=lambda each: -len(each.name)):

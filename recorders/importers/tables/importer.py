@@ -42,12 +42,12 @@ class TableParameters(Parameters):
     Attributes:
         mapping: the mapping, by its name (walk) or file (own.toml).
         more: further files and folders.
-        mounting_deg: roll, pitch, yaw that replace those of the mapping.
+        mounting_deg: roll, pitch and yaw that replace the mapping's values.
         delays_s: by topic, the time from a message's measurement to its stamp, in s; replaces the
             delays of the mapping.
         seed: seed of the noise that a mapping adds.
         origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
-            plane; replaces that of the mapping.
+            plane; replaces the mapping's origin.
         quaternions: what to do with messages whose quaternions are not of unit length: "refuse" stops
             the import, "normalise" scales them, "skip" leaves such messages out.
     """

@@ -28,7 +28,7 @@ class Layout(NamedTuple):
         delimiter: delimiter of cells, " " for any white space.
         skipped: number of lines of the file before the rows.
         heads: lines of the header, which are not rows if they are repeated.
-        units: units from a row below the header, by column; empty without one.
+        units: units from a row below the header, by column; empty if there is no such row.
         above: number of lines above the header.
         is_empty: whether there are no rows below the header.
     """

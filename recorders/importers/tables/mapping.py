@@ -82,7 +82,7 @@ class Geodetic(Parameters):
 
 
 class Attitude(Parameters):
-    """Columns with a body's angles (axes forward, left, up), converted to quaternion_w to quaternion_z.
+    """A body's angles (axes forward, left, up), from which quaternion_w to quaternion_z are made.
 
     The quaternion rotates to a frame of east, north, up.
 
@@ -91,7 +91,7 @@ class Attitude(Parameters):
         yaw: column of the angle anticlockwise from east, instead of a heading; with it `pitch` is nose
             down.
         pitch: column of the pitch.
-        roll: column of the roll, right side down.
+        roll: column of the roll, positive with the right side down.
         unit: unit of the angles.
     """
 
@@ -109,7 +109,7 @@ class TableStream(StreamMapping):
         topic: name of the topic.
         delay_s: time from a message's measurement to its stamp.
         only_first: whether only the first row is used, as for a prior.
-        every: only the first of each group of this many rows is used.
+        every: number of rows in a group, of which only the first is used.
         noise: standard deviation of white Gaussian noise to add, by field; this makes fixes from a known
             path.
     """
@@ -138,8 +138,8 @@ class TableMapping(Parameters):
     """Files of one kind, and the streams made from their rows.
 
     Attributes:
-        files: a pattern of names relative to the given folder, or of the name of a given file; * and
-            {name} match any text, ? one letter; each name in braces occurs once.
+        files: a pattern for file names relative to the given folder, or for the name of a given file. *
+            and {name} match any text, ? matches one letter. Each name in braces occurs once.
         optional: whether such a file may be missing.
         format: format of the files; by default it follows from the suffix, and is CSV for unknown ones.
         columns: names of the columns, if the files do not name them.
@@ -147,13 +147,14 @@ class TableMapping(Parameters):
         delimiter: delimiter of cells, " " for any white space; by default it is recognised.
         decimal: the decimal mark.
         skip: number of lines at the start of the file that are not part of the table.
-        split: columns whose cells contain several numbers, such as "47.5 8.7", and the names of these.
+        split: columns whose cells contain several numbers, such as "47.5 8.7", with the names of these
+            numbers.
         missing: numbers that mark a missing value, by column, in every stream that uses the column.
         degrees_minutes: columns of latitudes and longitudes in degrees and minutes, ddmm.mmmm, as in
             NMEA.
-        hemispheres: for columns of latitudes and longitudes the columns that state N or S, E or W.
+        hemispheres: for columns of latitudes and longitudes, the columns that state N or S, E or W.
         vehicle: the column that identifies the vehicle of a row; its value replaces {vehicle} in topics.
-        joined: whether the files are the rows of one table, in the order of their names.
+        joined: whether the files together are one table, with its rows in the order of the files' names.
         time: when a row was measured.
         arrival: when a row reached the recorder, if the table states it.
         sensor: the reading of the sensor's own clock, if the table states it and it differs from `time`.
@@ -195,7 +196,7 @@ class TableMapping(Parameters):
 
 
 class ConstantStream(Parameters):
-    """Messages that are stated in the mapping, such as anchors; their stamps are the log's first.
+    """Messages that are stated in the mapping, such as anchors; all have the log's first stamp.
 
     Attributes:
         topic: name of the topic.
@@ -305,7 +306,7 @@ def adapted(
 
 
 def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
-    """Find the folders under a path that have all files of a mapping; raise BadInput if none has."""
+    """Find the folders under a path with all files of a mapping; raise BadInput if there are none."""
     below = [each for each in place.rglob("*") if each.is_dir()] if place.is_dir() else []
     folders = []
     for folder in sorted([place, *below], key=lambda each: (len(each.name), each)):
@@ -323,7 +324,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
 class FileMatch(NamedTuple):
     """A file, its mapping, the texts that match the names in braces, and files that belong to it.
 
-    `more` lists the files whose rows follow, and `stamps` is the file with the times of all rows.
+    `more` lists the files with further rows, and `stamps` is the file with the times of all rows.
     """
 
     path: Path
@@ -370,7 +371,7 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch],
 def _joined(
     mapping: LogMapping, found: list[FileMatch], others: list[Path]
 ) -> tuple[list[FileMatch], list[Path]]:
-    """Join the files that are one table, and remove the file of their times from the others."""
+    """Join the files that form one table, and leave out the file that has their times."""
     for table in mapping.tables:
         if not table.joined:
             continue
@@ -400,7 +401,7 @@ def _ends_with(path: Path, name: str) -> bool:
 
 
 def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:
-    """Yield the tables that a file matches; a single file for a single table may have any name."""
+    """Yield the tables that a file matches; if there is one file and one table, any name matches."""
     for table in mapping.tables:
         pattern = (
             table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]
@@ -418,11 +419,12 @@ def names_in(pattern: str) -> list[str]:
 
 
 def fitted(pattern: str, name: str) -> dict[str, str] | None:
-    """Match a name with a pattern; return the texts for the names in braces, or None.
+    """Match a name against a pattern; return the texts for the names in braces, or None.
 
-    From the left, each name in braces and each star matches as many characters as possible, a name in
-    braces at least one; neither matches a slash. The time for a match is limited by the lengths of
-    pattern and name; a regular expression of `re` would try all ways to divide a name among many stars.
+    From left to right, each name in braces and each star matches as many characters as possible; a name
+    in braces matches at least one. Neither matches a slash. The time for a match is limited by the
+    lengths of pattern and name; a regular expression of `re` would try all ways to divide a name among
+    many stars.
     """
     parts = _WILD.split(pattern)
     # bit k of a number: the rest of the pattern after a part matches the name from character k on

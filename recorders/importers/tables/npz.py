@@ -45,7 +45,7 @@ class _Column(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """The columns of an archive: their names, and a function that reads some, block by block."""
+    """The columns of an archive: their names, and a function that reads some of them, block by block."""
 
     names: list[str]
     read: Callable[[Collection[str]], Iterator[dict[str, NDArray]]]
@@ -54,8 +54,8 @@ class Columns(NamedTuple):
 def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
     """Describe the arrays of an archive as columns; two-dimensional ones are NAME.0, NAME.1, ...
 
-    Raises BadInput if their lengths differ, and ValueError if the archive is damaged, or has too many
-    columns or too large values.
+    Raises BadInput if the arrays' lengths differ, and ValueError if the archive is damaged, has too many
+    columns, or has values that are too large.
     """
     with _archive(path) as archive:
         arrays = {name.removesuffix(".npy"): _described(archive, name) for name in archive.namelist()}

@@ -329,7 +329,7 @@ class Rows:
         return found
 
     def _parts(self, batch: Batch, rows: NDArray[np.int64]) -> Iterator[tuple[Batch, NDArray[np.int64]]]:
-        """Yield the rows of a batch by vehicle; meanwhile {vehicle} is replaced by its name."""
+        """Yield the rows of a batch by vehicle; meanwhile, the vehicle's name replaces {vehicle}."""
         if self._vehicle is None:
             self._numbers_of.clear()
             yield batch, rows
@@ -358,7 +358,7 @@ class Rows:
         return found if clock.tag is None else self._ticks.stamps_ns(found, str(self.path))
 
     def _goes_back(self, batch: Batch) -> bool:
-        """Test by the local times of the first rows whether rows are newest first."""
+        """Test from the local times of the first rows whether rows are newest first."""
         if self._time.order == "any" or not self._time.columns or self._time.tag:
             return False
         zone = "UTC" if self._time.zone else None
@@ -607,7 +607,7 @@ class Rows:
     def _kept(
         self, own: TableStream, found: Mapped, timed: NDArray[np.bool_], rows: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Choose the messages to keep; count the others by reason."""
+        """Choose the messages to keep; count those left out by reason."""
         topic = self._filled(own.topic)
         lacking = not_finite(schema_of(own, topic), found.columns)
         keep = timed[found.rows] & (rows[found.rows] % own.every == 0)

@@ -80,17 +80,17 @@ class TimeMapping(Parameters):
             seconds and nanoseconds.
         unit: unit of numbers; "date" is for dates and times as text. Several columns of numbers have a
             list of units, such as ["s", "ns"], and are added.
-        zero: date from which numbers count; by default 1970-01-01, with `week` 1980-01-06.
+        zero: date from which numbers count; by default 1970-01-01, or 1980-01-06 if `week` is given.
         week: column of GPS weeks; `column` then has the seconds of the week.
-        rate_hz: rows per second of files without stamps, from `zero` on; with `column`, counts of that
-            column per second, as for frame numbers.
+        rate_hz: rows per second, counted from `zero`, of files without stamps; with `column`, counts of
+            that column per second, as for frame numbers.
         utc_offset_h: how far local clocks are ahead of UTC, for dates that do not state it.
         zone: name of the local time zone, such as Europe/Berlin, which includes summer time, or CET.
         format: format of dates that do not follow ISO 8601, in the letters of strptime; for times
             without a date, the day is that of `zero`.
         leap_seconds: leap seconds to subtract, in s; by default GPS time is kept as it is.
-        tag: suffix of a file next to each file that states when its counter started, and its rate
-            (RTKLIB's time tags).
+        tag: suffix of RTKLIB's time tags: next to each file, a tag states when the file's counter
+            started, and the counter's rate.
         rollover: number at which the counter rolls over to 0, such as 4294967296; it is then unwrapped.
         order: order of the rows; "rising" allows single late rows, and reverses a file whose rows are
             newest first; "any" sorts rows whatever their times are.
@@ -161,12 +161,12 @@ class TimeMapping(Parameters):
 
     @property
     def counts_all_weeks(self) -> bool:
-        """Test whether there are GPS weeks, and they count from 1980 without rollovers."""
+        """Test whether there are GPS weeks that count from 1980 without rollovers."""
         return self.week is not None and "zero" not in self.model_fields_set
 
     @property
     def units(self) -> list[CountUnit]:
-        """Return the units of the columns of numbers, except that of weeks."""
+        """Return the units of the columns of numbers, except the unit of weeks."""
         if isinstance(self.unit, list):
             return self.unit
         return [] if self.unit == "date" else [self.unit]
@@ -518,7 +518,7 @@ def _since_utc(local: pd.Series, zone: ZoneInfo, *, is_first: bool) -> Stamps:
 class Ticks(NamedTuple):
     """A file's own counter: its first reading in ns, the stamp of that reading, and its rate.
 
-    `cut_ns` is the last reading if its line was truncated, else NOT_A_TIME.
+    `cut_ns` is the last reading if its line was truncated, otherwise NOT_A_TIME.
     """
 
     first_ns: int
@@ -527,7 +527,7 @@ class Ticks(NamedTuple):
     cut_ns: int
 
     def stamps_ns(self, ticks_ns: Stamps, where: str) -> Stamps:
-        """Compute the stamps (n,) of readings; a reading from a truncated line has none."""
+        """Compute the stamps (n,) of readings; a reading from a truncated line gets no stamp."""
         since = np.rint(to_ns(ticks_ns, 1, -self.first_ns, where=where) * self.rate)
         none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
         return to_ns(np.where(none, np.nan, since), 1, self.start_ns, where=where)
@@ -604,7 +604,7 @@ class Order:
             self._behind = 0
 
     def end(self) -> None:
-        """Raise BadInput if the last rows are behind earlier ones."""
+        """Raise BadInput if the last rows are earlier than rows before them."""
         self._check(_ROWS_AT_END)
 
     def _check(self, fewest: int) -> None:

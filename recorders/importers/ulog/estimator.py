@@ -1,7 +1,7 @@
 """Import of the autopilot's own filter, EKF2: states, innovations, and a simulator's truth.
 
-PX4's innovations are prediction minus measurement; ours have the other sign. EKF2 fuses components one
-by one, and logs the variance of each, so the covariances here are diagonal.
+PX4's innovations are prediction minus measurement; fuselog's have the opposite sign. EKF2 fuses
+components one by one, and logs the variance of each, so the covariances here are diagonal.
 """
 
 from collections import Counter
@@ -33,10 +33,10 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """The innovations of a sensor: their fields, our component names, and our signs relative to PX4's.
+    """The innovations of a sensor: fields, fuselog's component names, and signs relative to PX4's.
 
-    For each component, `bits` has those bits of the filter's status of which at least one is set while
-    the component is in use. It is empty if there are no such bits.
+    For each component, `bits` lists bits of the filter's status; at least one of them is set while the
+    component is in use. A component without such bits has an empty tuple.
     """
 
     fields: tuple[str, ...]
@@ -236,7 +236,7 @@ class Autopilot:
     def _is_in_use(
         self, instance: int, sensor: _Sensor, time_us: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
-        """Test by the filter's status whether it used the components (n, m) of a sensor."""
+        """Test from the filter's status whether it used the components (n, m) of a sensor."""
         is_used = np.ones((len(time_us), len(sensor.fields)), bool)
         status = self._status.get(instance)
         if status is None:
@@ -285,7 +285,7 @@ def _innovation(
     at: _Table,
     found: tuple[Floats, Floats, NDArray[np.bool_]],
 ) -> Part:
-    """Make innovations (n, m) with their variances (n, m), and whether they were accepted (n,)."""
+    """Make innovations (n, m) with their variances (n, m), and flags (n,) for the accepted ones."""
     innovation, variance, accepted = found
     size, width = innovation.shape
     is_known = np.isfinite(innovation)
@@ -309,7 +309,7 @@ def _innovation(
 
 
 def _unit(quaternions: Floats) -> Floats:
-    """Scale quaternions (n, 4) to unit length; NaN if they are far from it."""
+    """Scale quaternions (n, 4) to unit length; NaN for those whose length is far from one."""
     length = np.linalg.norm(quaternions, axis=1, keepdims=True)
     return np.where(np.abs(length - 1.0) < _UNIT_TOLERANCE, quaternions, np.nan) / length
 
@@ -317,7 +317,7 @@ def _unit(quaternions: Floats) -> Floats:
 def _state(fields: Fields) -> Part:
     """Make the filter's position, velocity and orientation from its states and their variances.
 
-    Biases are left out: in old firmware they are increments over a step of the filter.
+    Biases are left out, because in old firmware they are increments over a step of the filter.
     """
     states = fields.vector("states", width=10)
     count = sum(name.startswith("covariances[") for name in fields.rows.data.dtype.names or ())

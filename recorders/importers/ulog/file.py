@@ -129,8 +129,8 @@ def _flat(
 class Rows(NamedTuple):
     """Some rows (n,) of an instance of a topic, in the order of the file or of their stamps.
 
-    `time_us` are their stamps; rows without a stamp get one between those of their neighbours in the
-    file, and `untimed` counts them.
+    `time_us` are their stamps. A row without a stamp gets one between the stamps of its neighbours in
+    the file; `untimed` counts these rows.
     """
 
     topic: str
@@ -163,10 +163,11 @@ class UlogFile:
         path: the file.
         start_us: stamp at which logging began.
         info: information messages, by key.
-        parameters: parameters of the autopilot at the beginning, and `defaults` if they are stated.
+        parameters: the autopilot's parameters at the beginning; `defaults` has their default values, if
+            stated.
         changes: changed parameters: time, name, value.
         texts: messages of the autopilot.
-        dropouts: stamp and length in us of losses that the logger reported.
+        dropouts: stamp and length, both in us, of the losses that the logger reported.
         rows: number of rows of each topic and instance so far.
         losses: number of unreadable parts, by description.
     """
@@ -194,7 +195,7 @@ class UlogFile:
             raise BadInput(f"{path}: cannot be read ({error.strerror}); give a .ulg file") from error
 
     def blocks(self, is_wanted: Callable[[str], bool]) -> Iterator[list[Rows]]:
-        """Yield the rows of the wanted topics, with a block for some megabytes of the file."""
+        """Yield the rows of the wanted topics, in blocks of a few megabytes of the file."""
         ends = sorted({each for each in self._appended if self._begins <= each < self._size})
         if len(ends) < len(self._appended):
             self.losses["appended section outside the file"] += 1
@@ -208,7 +209,7 @@ class UlogFile:
     # Definitions.
 
     def _read_definitions(self, file: BinaryIO) -> int:
-        """Read everything before the first subscription; return its position."""
+        """Read everything before the first subscription; return the position of that subscription."""
         head = file.read(16)
         if head[:7] != MAGIC or len(head) < 16:
             what = "is empty" if not head else "is not a ULog file"
@@ -302,14 +303,14 @@ class UlogFile:
     def _resumption(
         self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
     ) -> int:
-        """Find where messages resume: at a sync message (old firmware has none) or at rows; else -1."""
+        """Return the position of the next sync message (old firmware has none) or row; -1 if neither."""
         found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
         return min((each for each in found if each >= 0), default=-1)
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
-        """Parse a piece at `place`; return where the messages end, if one is broken, and the rows."""
+        """Parse a piece at `place`; return where messages end, whether one is broken, and the rows."""
         found = walk(data, size)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:
@@ -361,7 +362,7 @@ class UlogFile:
     def _times(
         self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """Compute stamps (n,) of rows; those without one are interpolated between their neighbours."""
+        """Compute the stamps (n,) of rows; missing stamps are interpolated between their neighbours."""
         last_us = self._last_us
         # A topic that stands still may have a stamp from long before.
         recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
@@ -468,7 +469,7 @@ def _parameter(body: bytes) -> tuple[str, float]:
 
 
 def _number(kind: str, value: bytes) -> float | None:
-    """Read a number of one of ULog's types; None if this fails."""
+    """Read a number of one of ULog's types; return None if this fails."""
     dtype = np.dtype(TYPES[kind]) if kind in TYPES else None
     if dtype is None or len(value) != dtype.itemsize:
         return None

@@ -276,7 +276,7 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """Describe the use of parameters, by subject: metadata, settings, or a reason why unused."""
+    """Describe the use of parameters, by subject: as metadata, as settings, or why they are unused."""
     notes = {}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:

@@ -48,7 +48,7 @@ class Sorted(NamedTuple):
     `order` has the rows grouped by message number, each group in file order, and `counts` (NUMBERS + 1,)
     has the sizes of the groups; rows without a topic are the last group. `stamps` are in us, 0 for rows
     without a topic; `is_timed` marks valid stamps, and `reached` is the latest valid stamp before each
-    row, and at the end. The rows end before one whose length does not match its format.
+    row, and at the end. The rows end before the first row whose length does not match its format.
     """
 
     order: NDArray[np.int64]
@@ -62,7 +62,7 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
     """Find where the messages of a piece of a file begin.
 
     Args:
-        data: the piece, and at least `BEYOND_BYTES` more.
+        data: the piece, followed by at least `BEYOND_BYTES` more bytes.
         size: length of the piece in bytes.
     """
     found, others, sizes = (np.empty(count, np.int64) for count in (size // 5 + 1, size // 3 + 1, 3))
@@ -72,10 +72,10 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
 
 
 def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
-    """Find where rows resume after invalid bytes: several in sequence, with matching lengths.
+    """Find where rows resume after invalid bytes: at several rows in sequence with matching lengths.
 
     Args:
-        data: a piece of the file, and at least `BEYOND_BYTES` more.
+        data: a piece of the file, followed by at least `BEYOND_BYTES` more bytes.
         begin: first byte of the piece to try.
         size: length of the piece in bytes.
         place: position of the piece in the file.
@@ -97,11 +97,12 @@ def sort(
     """Sort the rows of a piece of a file by the message numbers of their topics.
 
     Args:
-        data: the piece, and at least `BEYOND_BYTES` more.
+        data: the piece, followed by at least `BEYOND_BYTES` more bytes.
         at: (n,), positions of the rows in the piece, as in `Walk.data`.
         place: position of the piece in the file.
         known: the known topics.
-        times: in us: valid stamps are strictly between the first two; the third is the latest so far.
+        times: three times (us): valid stamps are strictly between the first two; the third is the latest
+            stamp so far.
     """
     whose, stamps = np.empty((2, len(at)), np.int64)
     is_timed = np.empty(len(at), np.bool_)
@@ -139,7 +140,7 @@ def _examine(
     reached: NDArray[np.int64],
     counts: NDArray[np.int64],
 ) -> int:
-    """Fill in the topics and stamps of rows, up to the first of a wrong length; count them."""
+    """Fill in the topics and stamps of rows up to the first with a wrong length; count these rows."""
     low, high, latest = times
     for row in range(len(at)):
         position = at[row]
@@ -162,7 +163,7 @@ def _examine(
 
 
 def _sort(whose: NDArray[np.int64], places: NDArray[np.int64], order: NDArray[np.int64]) -> None:
-    """Fill in the rows, number by number; `places` is where the rows of each number begin in `order`."""
+    """Fill in the rows by message number; `places` is where the rows of each number begin in `order`."""
     for row in range(len(whose)):
         order[places[whose[row]]] = row
         places[whose[row]] += 1
@@ -175,7 +176,7 @@ def _walk(
     others: NDArray[np.int64],
     sizes: NDArray[np.int64],
 ) -> bool:
-    """Fill in where messages begin, their counts and their end; test whether the next is invalid."""
+    """Fill in the positions, counts and end of messages; test whether the next message is invalid."""
     count, other, position, is_broken = 0, 0, 0, False
     while position + 3 <= size:
         length, kind = _length(data, position), _kind(data, position)

@@ -31,7 +31,7 @@ _FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 
 @dataclass(frozen=True)
 class Part:
-    """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
+    """Messages (n,) of a stream, with times of measurement and logging in us, and their columns.
 
     The maker of the stream leaves out rows in which a required number is not finite; `facts` counts rows
     that are left out or changed for other reasons.
@@ -69,7 +69,7 @@ class Fields(NamedTuple):
         return name if self.is_first else f"{name}_{self.rows.topic}_{self.rows.instance}"
 
     def has(self, name: str) -> bool:
-        """Test whether there is such a field."""
+        """Test whether there is a field of this name."""
         return name in (self.rows.data.dtype.names or ())
 
     def of(self, name: str) -> Floats:
@@ -85,7 +85,7 @@ class Fields(NamedTuple):
 
     @property
     def measured_us(self) -> NDArray[np.int64]:
-        """Return when rows were measured: by the sample's stamp if there is one, else by the row's."""
+        """Return when rows were measured: by the sample's stamp, or by the row's if there is none."""
         if not self.has("timestamp_sample"):
             return self.rows.time_us
         sample = self.rows.data["timestamp_sample"].astype(np.int64)
@@ -141,7 +141,7 @@ def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
 
 
 def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
-    """Apply a sensor's time, stated relative to the row's, and keep each of its messages once."""
+    """Apply a sensor's time, which is relative to the row's; keep each of its messages only once."""
     relative_us = fields.rows.data[f"{sensor}_timestamp_relative"].astype(np.int64)
     is_valid = relative_us != _INVALID_US
     time_us = part.time_us + np.where(is_valid, relative_us, 0)
@@ -256,7 +256,7 @@ def air(fields: Fields) -> Iterator[Part]:
 
 
 def barometer(fields: Fields) -> Iterator[Part]:
-    """Yield the readings of one barometer; the pressure is in Pa, with old firmware in hPa."""
+    """Yield the readings of one barometer; the pressure is in Pa, or in hPa with old firmware."""
     names = {"pressure": "pressure", "temperature_degc": "temperature"}
     yield fields.values(f"barometer_{fields.rows.instance}", names)
 
@@ -313,5 +313,5 @@ def to_flu(vectors: Floats) -> Floats:
 
 
 def orientations(quaternions: Floats) -> Floats:
-    """Convert rotations (n, 4; w, x, y, z) from a body's FRD to NED into those from its FLU to ENU."""
+    """Convert a body's rotations (n, 4; w, x, y, z) from FRD-to-NED to FLU-to-ENU."""
     return compose(compose(np.broadcast_to(_TO_ENU, quaternions.shape), quaternions), _FROM_FLU)

@@ -18,7 +18,7 @@ THREADS = min(4, os.cpu_count() or 1)
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Map items in their order, with a few of them in advance, so that memory stays bounded."""
+    """Map items in order, processing only a few of them in advance, so that memory stays bounded."""
     rest = iter(items)
     yield from map(work, islice(rest, 1))  # a log of one chunk needs no threads
     with ThreadPoolExecutor(THREADS) as pool:

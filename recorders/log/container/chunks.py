@@ -101,7 +101,7 @@ def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[by
 
 
 def open_region(raw: bytes, offset: int) -> Contents:
-    """Open the region at byte `offset` of a file, and compare its checksum.
+    """Open the region at byte `offset` of a file, and verify its checksum.
 
     Raises Damaged.
     """
@@ -167,7 +167,7 @@ def _stated_size(region: bytes) -> int:
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
-    """Yield the small records in `data`, without those of other kinds.
+    """Yield the small records in `data`, and skip all other kinds of records.
 
     Raises Damaged if a record is incomplete or invalid.
     """

@@ -98,7 +98,7 @@ class _Place(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Return the position after this one."""
+        """Return the position after the last byte."""
         return self.offset + self.length
 
 
@@ -110,13 +110,13 @@ class _Summary(NamedTuple):
 
 
 class _Index(NamedTuple):
-    """The summary's entries on chunks, by position, and numbers of messages, by channel."""
+    """The summary's entries for chunks, by position, and numbers of messages, by channel."""
 
     chunks: dict[int, records.ChunkIndex]
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """Return the entry of the chunk at a position, if it matches and the chunk is not empty."""
+        """Return the index entry of the chunk at a place, if they match and the chunk is not empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None
@@ -133,7 +133,7 @@ class NotMcap(BadInput):
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
-    """Describe the contents of a file; without its index, all regions are opened, and intact ones kept.
+    """Describe a file's contents; without its index, open all regions and keep the intact ones.
 
     Raises BadInput if the file is missing, unreadable, or not MCAP.
     """
@@ -195,7 +195,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
 
 
 def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
-    """Describe bytes that are ignored after the data section; empty if there are none."""
+    """Describe the ignored bytes after the data section; return an empty text if there are none."""
     position = data_end
     while (place := _record_at(file, size, position)) is not None:
         position = place.end

@@ -1,4 +1,4 @@
-"""Checksums for our metadata records, which MCAP does not protect."""
+"""Checksums for fuselog's metadata records, which MCAP does not protect."""
 
 import json
 import zlib
@@ -13,12 +13,12 @@ _SEAL = "crc32"
 
 
 def seal(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Add a checksum to the pairs of one of our records."""
+    """Add a checksum to the pairs of one of fuselog's records."""
     return {**pairs, _SEAL: _checksum(pairs)}
 
 
 def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
-    """Remove the checksum from the pairs after comparing it; return records of others unchanged.
+    """Verify and remove the checksum of one of fuselog's records; return other records unchanged.
 
     Raises Damaged if the checksum is wrong.
     """

@@ -104,7 +104,7 @@ class ContainerWriter:
         return channel.id
 
     def add_metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Write one of our metadata records."""
+        """Write one of fuselog's metadata records."""
         start = self._offset
         self._append_record(records.Metadata(name=name, metadata=seal(pairs)))
         entry = records.MetadataIndex(offset=start, length=self._offset - start, name=name)
@@ -160,7 +160,7 @@ class ContainerWriter:
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Raise errors of the disk as BadInput, immediately and at every later access to the file."""
+        """Raise disk errors as BadInput, immediately and at every later access to the file."""
         if self._failure is not None:
             raise self._failure
         try:

@@ -1,4 +1,4 @@
-"""Estimators made from plain functions, and the types that these functions are given and return.
+"""Estimators made from plain functions, and the types that these functions receive and return.
 
 Begin with `functions`.
 """

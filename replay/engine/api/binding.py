@@ -1,4 +1,4 @@
-"""Binding of estimators made from functions to a log's topics, and descriptions of the needed topics."""
+"""Binding of function-based estimators to a log's topics, and descriptions of the topics they need."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
@@ -39,7 +39,7 @@ def requirements_of(asked: Mapping[str, Schema], optional: Collection[str]) -> s
 
 
 def topics_of(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the processed topics and of the static ones."""
+    """Return the names of the topics that are processed, and of the static topics."""
     streams, static = (
         tuple(topic.name for topic in each.values()) for each in (bound.streams, bound.static)
     )

@@ -84,26 +84,27 @@ def recursive(
 
     Args:
         summary: one-line description of the estimator.
-        parameters: type of its parameters; without it, the estimator has no parameters.
+        parameters: type of its parameters; without a type, the estimator has no parameters.
         streams: topics to process, with their schemas; see `bindings` for how their names are resolved.
-        static: topics that `start` needs as a whole, such as a map or a prior. Gaussian estimates among
-            them are priors with the components of the estimate; see `Given.prior`.
+        static: topics that `start` needs as a whole, such as a map or a prior. Static topics of Gaussian
+            estimates are priors that have the estimate's components; see `Given.prior`.
         find: replaces `streams` and `static` if their names depend on the log or the parameters:
             find(name, topics, parameters) yields a `Binding` for each object that can be estimated in
             the log (for each robot, say), or nothing if the log does not fit. `name` is the name of the
             estimator, for error messages.
         requirements: with `find`, a description of what the log must contain.
-        variant: the parameter that is set by the second part of a name such as `shooter:bearings-only`.
+        variant: the parameter that is set by the part after the colon in a name such as
+            `shooter:bearings-only`.
         components: components of the estimate by name, with their kinds.
         truth: topic with the true values of the estimated quantities.
         measured: components of the innovations, if `follow` fills them.
-        vectors: by topic of `streams`, the vector components to read. The log must state these
-            components. Vectors of topics without an entry are read as they are in the log.
+        vectors: the vector components to read, by topic of `streams`. The log must state these
+            components. Vectors of a topic that has no entry are read as they are in the log.
         optional: topics of `streams` and `static` that a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
-        draws: whether the estimator draws random numbers. `follow` then gets the generator of the run
-            as its last argument, and `follow_all` those of all runs. A generator depends on the
-            parameter `seed` and on the first message of the run, not on other runs, blocks or cores.
+        draws: whether the estimator draws random numbers. `follow` then gets the run's generator as its
+            last argument, and `follow_all` the generators of all runs. Each run's generator depends only
+            on the parameter `seed` and the run's first message, not on other runs, blocks or cores.
         start: start(given) -> the settings and the initial state: a NamedTuple of arrays whose first
             axis is the run. A run has failed if its row in the first of these arrays is not finite.
         follow: follow(run, settings, messages, state, results) processes the messages of one run in a
@@ -300,7 +301,7 @@ def batch(
 
     Args:
         summary: one-line description of the estimator.
-        parameters: type of its parameters; without it, the estimator has no parameters.
+        parameters: type of its parameters; without a type, the estimator has no parameters.
         streams: topics of measurements within the replayed span, with their schemas.
         static: topics that are read as a whole, such as a map or a prior.
         find: as for `recursive`.
@@ -404,9 +405,9 @@ def each_run(
 
 
 class _Carried(NamedTuple):
-    """State that a recursion carries from block to block; `reported` (runs,) marks reported failures.
+    """State that a recursion carries between blocks; `reported` (runs,) marks reported failures.
 
-    A generator is None before the first message of its run, and if the estimator draws no random
+    A generator is None before its run's first message, and always if the estimator draws no random
     numbers.
     """
 

@@ -1,4 +1,4 @@
-"""Types that the functions of an estimator are given: streams, a single run, the messages of a block."""
+"""Types that an estimator's functions receive: streams, a single run, and the messages of a block."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,8 +33,9 @@ class Binding(NamedTuple):
     Attributes:
         streams, static: the topics, by the names that the functions use for them; see `recursive`.
         suffix: the end of the estimator's name, such as `/robot1`.
-        priors: components to read from each static topic that is a Gaussian prior, by the same names.
-        setup: further data for the functions, as `Given.setup`.
+        priors: components to read from each static topic that is a Gaussian prior, by the topic's name
+            in `static`.
+        setup: further data for the functions, which get it as `Given.setup`.
     """
 
     streams: Mapping[str, Topic]
@@ -77,8 +78,8 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
         """Return the priors on `topic`: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
-        The components are those of the estimate, in its order, regardless of the order in the log. A run
-        without a usable prior has NaN in all of them; it has failed and gets no messages.
+        The components have the order of the estimate, regardless of the order in the log. A run without
+        a usable prior has NaN in its mean and covariance; it has failed and gets no messages.
         """
         return gaussians(self.static[topic])
 
@@ -122,7 +123,7 @@ class OneRun(Mapping[str, Stream]):
 
     @cached_property
     def generator(self) -> np.random.Generator:
-        """Make the run's random generator from the parameter `seed` and its first messages.
+        """Make the run's random generator from the parameter `seed` and the run's first messages.
 
         The generator therefore depends neither on the number of cores nor on the other runs.
         """
@@ -146,7 +147,8 @@ def generator_of(parameters: AnyParameters, first: Iterable[AnyArray]) -> np.ran
     """Make a counter-based random generator (Philox), keyed by a seed and the first data of a run.
 
     Args:
-        parameters: the estimator's parameters; their `seed` is used, or 0 if they have none.
+        parameters: the estimator's parameters; the seed is their `seed`, or 0 if they have no such
+            parameter.
         first: arrays of the run's first messages.
     """
     key = run_key(getattr(parameters, "seed", 0), first)
@@ -160,8 +162,9 @@ class Messages(NamedTuple):
         offsets: (runs + 1,) first row of each run, and the total number of rows.
         time_ns: (n,) stamps.
         topic: (n,) index of the stream, in the order in which the streams were requested.
-        value: (n, width) the fields after the sensor's clock, in order of declaration, padded with NaN.
-            Vectors contribute only the requested components, in the requested order.
+        value: (n, width) the fields that follow the sensor's clock in a message, in order of
+            declaration, padded with NaN. Vectors contribute only the requested components, in the
+            requested order.
     """
 
     offsets: Integers
@@ -182,7 +185,7 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: AnyParameters
 ) -> tuple[Messages, Skipped]:
-    """Convert the messages of a block to arrays of numbers, and list those that lack a covariance.
+    """Convert the messages of a block to arrays of numbers, and list messages that lack a covariance.
 
     Args:
         block: messages of all runs.

@@ -36,8 +36,8 @@ class Results(NamedTuple):
             components are linear or angles.
         innovation, innovation_covariance: (n, m), (n, m, m) the innovation of the message and its
             covariance.
-        squared: (n,) the normalised innovation squared. Together with the two above it gives the
-            likelihood of the message, which `tune` and `diagnose` use.
+        squared: (n,) the normalised innovation squared. Together with the innovation and its covariance,
+            it gives the likelihood of the message, which `tune` and `diagnose` use.
         accepted: (n,) whether a gate accepted the message; 1 unless set.
         target: (n,) identifier of the target that was measured; 0 unless set.
         further: (n, k) the fields of the further outputs after the sensor's clock, side by side in order
@@ -76,7 +76,7 @@ class Diagnostics(NamedTuple):
 
     Attributes:
         time_ns: (n,), the stamps.
-        columns: by field of the schema, (n, ...).
+        columns: the columns (n, ...) by field of the schema.
     """
 
     time_ns: Integers
@@ -121,8 +121,8 @@ class Solved(NamedTuple):
     """Estimates and failures of the runs; a failed run has no estimates.
 
     Attributes:
-        estimates: by the number of the run.
-        failures: time and reason of each failure, by the number of the run.
+        estimates: the estimates by run number.
+        failures: time and reason of each failure, the estimates by run number.
     """
 
     estimates: Mapping[int, Estimates]
@@ -161,7 +161,7 @@ class Outputs:
         )
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
-        """Make the output streams of one block; only the last estimate of a stamp is kept."""
+        """Make the output streams of one block, with only the last of several estimates at one stamp."""
         # invalid covariances are found and reported by the replay
         is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
         rows = np.flatnonzero(is_estimate)

@@ -1,9 +1,9 @@
 """Assignment of innovations to topics by their stamps, for estimators that use several topics.
 
-Innovations do not state their topic. If messages of several topics have the same stamp, and there is one
-innovation with this stamp for each of them, the innovations belong to these messages in the order of the
-file. If the number of innovations differs from that of messages, or if innovations have other stamps (an
-estimator may shift its messages by their delay), the topics are counted together.
+Innovations do not state their topic. If several topics have messages with the same stamp, and the number
+of innovations with this stamp equals the number of these messages, innovations and messages are matched
+in the order of the file. The topics are counted together if the numbers of innovations and messages
+differ, or if innovations have other stamps (an estimator may shift its messages by their delay).
 """
 
 from collections import Counter
@@ -106,7 +106,7 @@ def _joined(parts: list[_Messages]) -> _Messages:
 
 
 def _topic_of(there: _Messages, run: Integers, time_ns: Integers) -> Integers | None:
-    """Return the index (n,) of each innovation's topic; None if it is not known for all of them."""
+    """Return the topic index (n,) of each innovation, or None if a topic cannot be determined."""
     stamps, stamp = np.unique(np.concatenate([there.time_ns, time_ns]), return_inverse=True)
     of_run = np.concatenate([there.run, run]) * len(stamps) + stamp
     moments, moment = np.unique(of_run, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Share of each run that the estimates of a case cover, computed from their stamps."""
+"""Share of each run's time that a case's estimates cover, computed from the estimates' stamps."""
 
 import math
 from functools import cached_property
@@ -14,7 +14,7 @@ Integers = NDArray[np.int64]
 
 
 class Coverage:
-    """Counts of the intervals between a case's estimates, by run, in bins that double in length.
+    """Counts of the intervals between a case's estimates, by run, in bins whose widths double.
 
     Intervals much longer than both the median and a second are gaps. The last block is counted only
     when a result is requested.
@@ -100,7 +100,7 @@ def count_intervals(
         run: number of the run.
         offsets: (runs + 1,) first stamp of each run.
         time_ns: (n,) the stamps.
-        before_ns: (runs,) the last stamp before these; negative if there is none.
+        before_ns: (runs,) the last stamp before this block; negative if the run has no earlier stamp.
         counts: (BINS, runs) number of intervals in each bin, updated.
         sums_ns: (BINS, runs) total length of these intervals, updated; exact up to 2^53 ns, a hundred
             days.

@@ -41,7 +41,7 @@ class Initialization:
     """Method for finding values that a log does not state, such as the initial state.
 
     Attributes:
-        topics: topics whose first messages it is given.
+        topics: topics whose first messages are passed to `find` or `find_broad`.
         find: find(first messages, static topics, clock) -> the static topics to start from, and output
             streams; `clock` is the clock by which the replay stamps estimates.
         find_broad: find_broad(first messages, static topics, clock, a stamp for each run) -> equally
@@ -69,9 +69,9 @@ class Reading:
         controls: topics that drive the motion.
         kinds: by topic, the kinds of the components that the model reads from a message: controls or
             measurements.
-        measured: by topic of a sensor, the names of these components, as used for innovations.
-        numbers: numbers(stream of one of these topics) -> the values (n, m) of these components; NaN if
-            one is missing.
+        measured: by topic of a sensor, the names that innovations use for these components.
+        numbers: numbers(stream of one of these topics) -> the values (n, m) of these components; missing
+            values are NaN.
         noises: parameters that are standard deviations of noise, each with the topic of its sensor, or
             "" for the motion.
         augmentable: parameters that can be estimated together with the state, each with its kind and
@@ -80,9 +80,9 @@ class Reading:
             or that multiplies it.
         delays: by topic, the parameter with the delay of the topic's messages.
         calibration: parameters of the mounting, scale, bias and delay of the model's sensors, each with
-            the largest standard deviation of a useful estimate.
+            the largest standard deviation at which its estimate is useful.
         control_noise: control_noise(time in s for which a control message holds) -> by topic and index
-            of a component, the variance that the model states; empty if it states none.
+            of a component, the variance that the model states; empty if the model states no variance.
     """
 
     controls: tuple[str, ...]
@@ -143,28 +143,29 @@ class Recursive:
         start: start(static topics) -> the state before the first block.
         run: run(state, block) -> the state after the block, and the output streams. `run` never
             modifies the state that it is given.
-        priors: static topics that are Gaussian priors, and the components wanted from each. `start`
-            gets one message of each for every run, with these components, NaN if the run cannot start;
-            see `fuselog.replay.engine.streams.priors`.
-        given: static topics that are not read from the runs, see `fuselog.pipeline.runs.initial_states`.
+        priors: static topics that are Gaussian priors, and the components wanted from each. For every
+            run, `start` gets one message of each prior, with these components, or with NaN if the run
+            cannot start; see `fuselog.replay.engine.streams.priors`.
+        given: static topics that are not read from the runs; see `fuselog.pipeline.runs.initial_states`.
         finish: finish(state after the last block) -> the outputs that were still waiting for further
             messages.
         parameters: its parameters, including defaults.
         out_of_sequence: out_of_sequence(nanoseconds) -> the same estimator for messages in order of
-            arrival whose stamps go back by at most this time; None if it cannot reprocess messages. It
-            raises BadInput if the parameters do not allow this.
-        initialization: how it finds initial values that the log does not state; None if the log states
-            them all.
+            arrival whose stamps go back by at most this time. The function is None if the estimator
+            cannot reprocess messages. It raises BadInput if the parameters do not allow reprocessing.
+        initialization: how the estimator finds initial values that the log does not state; None if the
+            log states them all.
         assumed: values of the parameters that are assumed, because the log does not state them.
         is_random: whether it draws random numbers, so that its likelihood is not a smooth function of
             its parameters.
-        offers: by topic that it does not use, the setting that would make it use the topic.
-        reading: what it reads; None if that is not known.
-        needed: by topic, a field without which it does not fit a log.
-        truth: topic against which its estimates are judged, and which it must not read.
+        offers: for each topic that the estimator does not use but could, the setting that makes it use
+            the topic.
+        reading: what the estimator reads; None if this is unknown.
+        needed: by topic, a field that a log must have for the estimator to fit it.
+        truth: topic with the truth to which the estimates are compared; the estimator must not read it.
         is_bound: whether it computes a bound instead of estimates; a bound may read the truth.
-        alike: how it processes runs together with other estimators that differ only in numerical
-            settings; None if it cannot.
+        alike: how the estimator processes runs together with others that differ only in numerical
+            settings, or None if it cannot.
     """
 
     name: str
@@ -201,10 +202,10 @@ class Batch:
         static: topics that are read as a whole.
         solve: solve(streams of all runs by topic) -> the output streams.
         priors: topics of priors, with their components.
-        given: streams that the replay passes in addition to those of the log.
+        given: streams that the replay passes in addition to the log's streams.
         parameters: its parameters, including defaults.
-        needed: by topic, a field without which it does not fit a log.
-        truth: topic against which its estimates are judged, and which it must not read.
+        needed: by topic, a field that a log must have for the estimator to fit it.
+        truth: topic with the truth to which the estimates are compared; the estimator must not read it.
     """
 
     name: str
@@ -230,9 +231,10 @@ class Estimator(Generic[ParametersType]):
         summary: one-line description.
         requirements: what a log must contain, in one line.
         parameters: type of its parameters.
-        bind: bind(name, topics, parameters) -> one bound estimator for each object that it can estimate
-            in a log with these topics (for each robot, say); empty if the log does not fit.
-        variant: the parameter that is set by the second part of a name such as `lrkf:s2kf-50`.
+        bind: bind(name, topics, parameters) -> a list with one bound estimator for each object that it
+            can estimate in a log with these topics (for each robot, say). The list is empty if the log
+            does not fit.
+        variant: the parameter that is set by the part after the colon in a name such as `lrkf:s2kf-50`.
         label: label of the estimator if the user gives none.
     """
 
@@ -247,7 +249,7 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Setting]) -> "AnyEstimator":  # noqa: ARG002
-        """Return the estimator for `label` and `settings`: itself, except for a foreign filter."""
+        """Return the estimator for `label` and `settings`: `self`, unless the filter is foreign."""
         return self
 
     # an estimator of any model overrides these two: `_OfAnyModel`
@@ -260,7 +262,7 @@ class Estimator(Generic[ParametersType]):
         name: str,  # noqa: ARG002
         variant: Mapping[str, Setting],  # noqa: ARG002
     ) -> dict[str, type[Parameters]]:
-        """Return the parameters of `name` with `variant`, by model; empty if it uses no models."""
+        """Return the parameters of `name` with `variant`, by model, or {} if it uses no models."""
         return {}
 
 
@@ -279,7 +281,7 @@ def find_estimator(name: str) -> tuple[AnyEstimator, dict[str, Setting]]:
 
 
 def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Setting]:
-    """Return the parameter that the variant of a name sets; empty if the name has no variant.
+    """Return the parameter that a name's variant sets, or an empty dict if the name has no variant.
 
     Raises BadInput if the named estimator or method has no variants.
     """
@@ -291,11 +293,11 @@ def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) ->
 
 
 def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, Parameters]:
-    """Make the estimator of a label, and its parameters.
+    """Create the estimator that a label names, together with its parameters.
 
-    `label` is the estimator's name, or any word if an entry `kind` of the settings gives the name; one
-    estimator can therefore be replayed with several settings in one pass. A `kind` may also be an
-    `Estimator`, which needs no name. The other settings are parameters.
+    `label` is the estimator's name. If the settings have an entry `kind`, that entry gives the name, and
+    the label can be any word; one estimator can therefore be replayed with several settings in one pass.
+    A `kind` may also be an `Estimator`, which needs no name. The other settings are parameters.
 
     Raises BadInput if the name or a parameter is unknown, or if the label cannot be part of a topic
     name.
@@ -314,7 +316,7 @@ def configure(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
 
 
 def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator, dict[str, Setting]]:
-    """Return the estimator of a label and the values of its parameters, which are not yet checked.
+    """Return the estimator that a label names, and its parameters' values, which are not yet checked.
 
     Raises BadInput if the name is unknown, if it conflicts with a setting, or if a foreign filter may
     not be run or does not answer.

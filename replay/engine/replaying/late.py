@@ -8,11 +8,11 @@ policies:
     wait:SECONDS    hold back every message until this time after its stamp; then do the same as drop
     rewind:SECONDS  go back by at most this time, and reprocess all later messages; skip older messages
 
-Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. Messages for
-which newer messages waited are reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator
-does the reprocessing itself and reports it on `rewound`, as `schemas.REWOUND`
-(`Recursive.out_of_sequence`; for filters of models, `fuselog.replay.inference.run.out_of_sequence`, for
-those of libraries `fuselog.replay.foreign.native.out_of_sequence`).
+Skipped messages are reported on the estimator's topic `skipped`, as `schemas.SKIPPED`. A message that
+newer messages waited for is reported on `waited`, as `schemas.WAITED`. For `rewind` the estimator does
+the reprocessing itself and reports it on `rewound`, as `schemas.REWOUND` (`Recursive.out_of_sequence`;
+for filters of models, `fuselog.replay.inference.run.out_of_sequence`, for those of libraries
+`fuselog.replay.foreign.native.out_of_sequence`).
 """
 
 from collections.abc import Mapping
@@ -170,7 +170,8 @@ class _Arrivals(NamedTuple):
     Attributes:
         streams: the topics.
         run, topic, row: (n,) the run, the index of the topic, and the row in that topic.
-        stamp_ns, moment_ns: (n,) when they were measured, and when they are processed.
+        stamp_ns, moment_ns: (n,) the times at which the messages were measured, and at which they are
+            processed.
         position: (n,) position in the file.
     """
 
@@ -189,7 +190,7 @@ class _Arrivals(NamedTuple):
 
 
 def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragged]) -> _Arrivals:
-    """Merge the next messages and those held back; equal times keep the order of the file."""
+    """Merge new messages with those held back; messages with equal times stay in the file's order."""
     if waiting:
         streams = {topic: join([waiting[topic], streams[topic]]) for topic in streams}
     columns = [
@@ -212,7 +213,7 @@ def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragg
 
 
 def _reached(streams: dict[str, Ragged]) -> Integers:
-    """Return the arrival time (runs,) of the last message of every run; zero if a run has no message."""
+    """Return the arrival time (runs,) of each run's last message, or zero if a run has no message."""
     reached = []
     for ragged in streams.values():
         last = np.maximum(ragged.offsets[1:], 1) - 1
@@ -278,7 +279,7 @@ def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> R
 def _waited(
     name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
 ) -> tuple[Integers, Ragged]:
-    """Find the newest stamps (runs,) that have arrived, and the messages for which newer ones wait."""
+    """Find the newest stamps (runs,) that have arrived, and the messages that newer ones wait for."""
     arrivals = _arrivals(Late("drop", 0), streams, {})
     everything = np.ones(len(arrivals.run), bool)
     arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)

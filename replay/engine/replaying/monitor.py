@@ -1,9 +1,9 @@
 """Monitoring of an estimator while it processes the runs of an ensemble, for any kind of estimator.
 
-A run fails on its own if it cannot start, if its code raises, if a covariance is invalid, if stamps go
-back, or if its estimates end before the run does. A failed run gets no further messages and has no
-further outputs; other runs are not affected. The monitor also measures the share of each run that has
-estimates, and the computing time of the estimator.
+A run fails on its own if it cannot start, if the estimator's code raises an exception, if a covariance
+is invalid, if stamps go back, or if its estimates end before the run does. A failed run gets no further
+messages and has no further outputs; other runs are not affected. The monitor also measures the share of
+each run that has estimates, and the computing time of the estimator.
 """
 
 import time
@@ -48,9 +48,9 @@ class RunMonitor:
         name: name of the bound estimator.
         runs: number of runs.
         seconds: computing time of the estimator in s, without one-time work such as compiling.
-        usage: counts of how its measurements were used; None if they are not counted.
-        static: the streams that it starts from.
-        refused: the exception that all runs of a part of an ensemble raised.
+        usage: counts of how the estimator's measurements were used; None if they are not counted.
+        static: the streams that the estimator starts from.
+        refused: the exception, if all runs raised one and they are only a part of an ensemble.
         plane: origin of the local tangent plane (ENU) of its estimates, if the runs state one.
     """
 
@@ -100,11 +100,11 @@ class RunMonitor:
         self._has_ends = True
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
-        """Pass the next streams of the runs that have not failed to `work`, and return its result.
+        """Pass the next streams of all runs without a failure to `work`, and return its result.
 
-        If `work` raises BadInput, it is called again from the same state without the runs that cause it.
-        The exception is raised if every run of the whole ensemble causes it, or if it is not due to
-        single runs.
+        If `work` raises BadInput, it is called again from the same state, without the runs that cause
+        the exception. The exception is raised if every run of the whole ensemble causes it, or if it
+        occurs even without messages.
         """
         self._note_span(streams)
         if self.usage is not None:
@@ -169,7 +169,7 @@ class RunMonitor:
         return list(failures.values())
 
     def coverage(self) -> list[Ragged]:
-        """Return, by case, how much of the span of every run with messages was estimated.
+        """Return, by case, how much of each run's span has estimates, for all runs with messages.
 
         Outputs that are not estimates of a state, such as fused scores, have no coverage.
         """
@@ -210,7 +210,7 @@ class RunMonitor:
         }
 
     def _end_raising(self, work: Callable[[Streams], object], streams: Streams, error: BadInput) -> None:
-        """Bisect the runs to find those that raise, and the stamp at which each of them raises."""
+        """Bisect the runs to find which of them raise an exception, and at which stamp each does."""
 
         def raised(end_ns: Integers) -> BadInput | None:
             try:
@@ -289,7 +289,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """Remove the rows of each run from its first invalid row on, or after the run has ended."""
+        """Remove each run's rows from its first invalid row on, and rows after the run has ended."""
         if first_bad is None and not self._has_ends:
             return output
         run = run_of_rows(output.offsets)
@@ -335,7 +335,7 @@ def _no_failures(topic: str, runs: int) -> Ragged:
 
 
 def _span_of(ragged: Ragged, clock: Clock) -> tuple[Integers, Integers]:
-    """Return the first and last stamp of every run (runs,); FOREVER and -1 if it has no messages."""
+    """Return each run's first and last stamp (runs,), or FOREVER and -1 if it has no messages."""
     first, last = np.full(ragged.runs, FOREVER), np.full(ragged.runs, -1)
     runs, times = np.flatnonzero(np.diff(ragged.offsets)), ragged.stream.times(clock)
     begin = ragged.offsets[runs]

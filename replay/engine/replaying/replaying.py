@@ -71,15 +71,15 @@ def replay(
     """Replay an ensemble and yield the output streams of all estimators, block by block.
 
     Args:
-        sources: the runs, with the same topics; their time spans may differ.
+        sources: the runs, which must have the same topics but may have different time spans.
         estimators: bound estimators with different names.
         order: the clock that defines the order: publish time, or log time (order of arrival).
-        late: in order of log time, the policy for messages whose publish times go back; without it, log
-            time is used as the time of measurement.
-        block_messages: approximate number of messages of a run in memory at a time.
-        report: filled after the last block.
+        late: the policy for messages whose publish times go back, if the order is log time. Without a
+            policy, log time is used as the time of measurement.
+        block_messages: approximate number of messages of each run that are in memory at a time.
+        report: the report, which is filled after the last block.
         is_part: whether `sources` are only a part of all runs. It is then not an error if an estimator
-            can process none of them: they fail, and the report contains the error.
+            can process none of the runs: the runs fail, and the report contains the error.
 
     A run that an estimator cannot process fails on its own, see
     `fuselog.replay.engine.replaying.monitor`; the failures come last.
@@ -163,8 +163,8 @@ class _Start(NamedTuple):
     """Start of a bound estimator.
 
     Attributes:
-        state: state of a recursion, or input of a batch estimator; _REFUSED if it cannot start in any
-            run.
+        state: state of a recursion, or input of a batch estimator; _REFUSED if the estimator cannot
+            start in any run.
         unable: by run, the reason why the estimator cannot start.
         why: the error if it cannot start in any run.
         streams: output streams of the initialization.
@@ -183,7 +183,7 @@ def _kept_start(
     order: Clock,
     stamps: Clock,
 ) -> _Start:
-    """Return the start of an estimator; an ensemble in memory caches it if it is small."""
+    """Return an estimator's start; if the runs are in memory and its state is small, cache the start."""
     key = "start", bound, order, stamps
     kept: _Start | None = ensemble.findings.get(key)
     if kept is not None:
@@ -253,8 +253,8 @@ def _initialized(
 def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str, BadInput]:
     """Return, by label, the error of each estimator that cannot start in any run.
 
-    If only some of the bound estimators of a label (one for each robot, say) cannot start, these fail
-    on their own.
+    If only some of the bound estimators of a label (one for each robot, say) cannot start, only those
+    fail.
     """
     errors_of: dict[str, list[BadInput | None]] = {}
     for bound, start in zip(estimators, starts, strict=True):
@@ -323,7 +323,7 @@ def _refuse_asymmetric_priors(
 
 
 def _first_asymmetric(prior: Ragged) -> int | None:
-    """Return the first run with a covariance that is not symmetric; None if all are symmetric."""
+    """Return the first run with a covariance that is not symmetric, or None if all are symmetric."""
     covariance = prior["covariance"]
     size = isqrt(covariance.shape[1])
     if not len(covariance) or size**2 != covariance.shape[1]:

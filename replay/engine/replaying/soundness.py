@@ -58,7 +58,7 @@ def find_unsound(
         run: number of the run.
         offsets: (runs + 1,) first row of each run.
         time_ns: (n,) stamps.
-        before_ns: (runs,) the last stamp before these.
+        before_ns: (runs,) the last stamp before this block.
         mean: (n, d).
         covariance: (n, t * t) row-major.
         rows: (runs,) row of the first invalid estimate, filled if there is one.

@@ -24,9 +24,9 @@ def refuse_truths(label: str, read: Collection[str], truths: Collection[str], ho
 
     Args:
         label: label of the estimator.
-        read: topics that it reads.
+        read: topics that the estimator reads.
         truths: topics that are truths.
-        how: the setting that makes it read them, if there is one.
+        how: the setting that makes the estimator read truths, if there is one.
     """
     for topic in read:
         if topic in truths:
@@ -46,7 +46,7 @@ def refuse_named_truths(
         label: label of the estimator.
         renamed: topics by role.
         topics: topics of the log.
-        own: the roles that are truths, for which a truth may be selected.
+        own: the roles that are truths; a truth may be selected for these.
     """
     truths = truths_among(topics)
     for role, name in renamed.items():

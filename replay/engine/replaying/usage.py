@@ -1,7 +1,7 @@
 """Counts of an estimator's measurements by outcome: used, gated, skipped, or without effect.
 
-They are computed from the inputs and outputs of any estimator: its messages by topic, its innovations,
-and the messages that it reports as skipped.
+The counts are computed from the inputs and outputs of any estimator: its messages by topic, its
+innovations, and the messages that it reports as skipped.
 """
 
 from collections import Counter
@@ -31,9 +31,10 @@ class Row(NamedTuple):
 
     Attributes:
         estimator: its label.
-        topic: topic of the measurements; several topics if innovations cannot be assigned to one.
+        topic: topic of the measurements, or several topics if innovations cannot be assigned to a single
+            topic.
         messages: number of messages.
-        used, gated: numbers of accepted and of rejected innovations; None if the estimator has no
+        used, gated: numbers of accepted and of rejected innovations, or None if the estimator has no
             innovations.
         skipped: number of messages that the estimator reports as skipped.
         why: reasons for unused messages, in words.
@@ -54,7 +55,7 @@ class Row(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Return a sentence about unused messages; empty if all were used or the reason is known."""
+        """Return a sentence about unused messages or a doubtful topic; "" if no sentence is needed."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -68,14 +69,14 @@ class Usage:
     Attributes:
         name: name of the bound estimator.
         given: number of messages by topic.
-        measured: topics of measurements among these.
+        measured: the topics of measurements among the topics of `given`.
         facts: by topic, the number of messages to which each description applies.
         used, gated: numbers of accepted and rejected innovations.
         skipped: number of skipped messages, by reason.
         speaks: whether the estimator has innovations.
-        doubtful: by topic that it starts from, a sentence about a problem with the topic.
+        doubtful: sentences about problems with topics that the estimator starts from, by topic.
         shares: counts of innovations by topic.
-        begins_ns: (runs,) the stamp of the first prior; None if there are no priors.
+        begins_ns: (runs,) the stamp of the first prior, or None if there are no priors.
     """
 
     name: str

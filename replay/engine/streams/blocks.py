@@ -45,7 +45,7 @@ class Ragged:
 
     Attributes:
         stream: the rows of all runs, end to end.
-        offsets: (runs + 1,), first row of each run, and the end of the last.
+        offsets: (runs + 1,), first row of each run, and the end of the last run.
     """
 
     stream: Stream
@@ -100,7 +100,7 @@ class Block(NamedTuple):
         arrival: (n, 2), for every event, the time at which it is processed and its position in the file,
             if the events are not simply in the order of their stamps; see
             `fuselog.replay.engine.replaying.late`.
-        findings: cache of a block that is replayed again; otherwise None.
+        findings: cache of values computed from the block if it will be replayed again, otherwise None.
     """
 
     streams: dict[str, Ragged]
@@ -113,7 +113,7 @@ class Block(NamedTuple):
         return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> AnyArray:
-        """Return a column over all events: the first of `names` that its topic has, or `missing`."""
+        """Return a column over all events, from the first of `names` that a topic has, or `missing`."""
         parts = []
         for ragged in self.streams.values():
             found = [name for name in names if name in ragged.stream.columns]
@@ -160,7 +160,7 @@ def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def by_runs(parts: Sequence[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Compute an order of the rows of several parts in which the rows of each run are together.
+    """Compute an order that puts the rows of each run together, from several parts.
 
     Args:
         parts: offsets (runs + 1,) of each part.
@@ -236,10 +236,10 @@ def side_by_side(parts: Sequence[Ragged]) -> Ragged:
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
-    """Merge messages of the topics in time order, run by run; equal stamps keep the order of the file.
+    """Merge topics in time order, run by run; messages with equal stamps keep the order of the file.
 
     Args:
-        streams: by topic, in all runs.
+        streams: messages of all runs, by topic.
         order: the clock.
     """
     everything = list(streams.values())
@@ -287,14 +287,14 @@ def merge_run(
     events: Events,
     heads: NDArray[np.int64],
 ) -> None:
-    """Merge the sorted topics of one run in time order; equal stamps keep the order of the file.
+    """Merge a run's sorted topics in time order; messages with equal stamps keep the file's order.
 
     Args:
         run: number of the run.
-        bounds: (topics, runs + 1), first message of each topic in each run, and the end of the last.
-        times_ns, positions: (n,) stamp and position in the file of the messages of all topics, end to
-            end.
-        events: events of all runs, filled for this one.
+        bounds: (topics, runs + 1), first message of each topic in each run, and the end of the last run.
+        times_ns, positions: (n,) stamps of the messages of all topics, end to end, and their positions
+            in the file.
+        events: events of all runs; those of run `run` are filled.
         heads: (topics,), work space.
     """
     for k in range(len(heads)):

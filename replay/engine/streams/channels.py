@@ -19,13 +19,13 @@ def stated(
     needed: bool = True,
     stands_for: str = "",
 ) -> float:
-    """Return the first number of this name that a channel states; NaN if it is missing and not needed.
+    """Return the first number `name` that a channel states, or NaN if it is missing but not needed.
 
     A channel may state `sigma_m` as its square, `variance_m2`, and vice versa.
 
     If the number is the value of a parameter, `parameters` is the type that checks it, and `stands_for`
-    is the parameter's name if it differs. Raises BadInput if a needed number is missing, if it is not a
-    number, or if the parameter does not accept it.
+    is the parameter's name if this differs from `name`. Raises BadInput if a needed number is missing,
+    if it is not a number, or if the parameter does not accept it.
     """
     for topic in topics:
         if name in topic.metadata:
@@ -72,7 +72,7 @@ def _number(
 
 
 def heading_variance(metadata: Mapping[str, str]) -> float:
-    """Return the variance (rad^2) about the vertical axis that a channel states; NaN if not positive.
+    """Return the variance (rad^2) about the vertical axis from a channel, or NaN if it is not positive.
 
     The channel states one number for all axes, or the variances about x, y and z.
     """
@@ -85,7 +85,7 @@ def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> f
 
     Args:
         values: the parameters.
-        topics: searched in this order.
+        topics: topics whose channels are searched, in this order.
         name: name of the parameter.
     """
     value = getattr(values, name)
@@ -98,7 +98,7 @@ def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) 
     Args:
         topics: topics of the log, by name.
         stem: part of the name before the number.
-        leaf: part of the name after it.
+        leaf: part of the name after the number.
         schema: schema that the topics must have.
     """
     found = {}
@@ -138,7 +138,7 @@ def resolved(name: str, prefix: str) -> str:
     """Return a topic's full name under a prefix; a name with a leading slash is not changed.
 
     Args:
-        name: as an estimator or model states it.
+        name: the name as an estimator or model states it.
         prefix: such as `/robot1`.
     """
     return name if name.startswith("/") or not name else f"{prefix}/{name}"

@@ -19,7 +19,7 @@ def rows_of(scan: Stream, detected: Stream) -> Integers:
 
 
 def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
-    """Return the positions (n, 2) of a sensor at its scans: its last fix, or zero without fixes."""
+    """Return a sensor's position (n, 2) at each scan: its latest fix, or zero if there are no fixes."""
     if fix is None:
         return np.zeros((len(scan), 2))
     last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1

@@ -29,7 +29,7 @@ class Ensemble(list[SourceType]):
     """List of runs that are replayed together and have the same topics.
 
     An ensemble is replayed many times, so topics that are in memory are concatenated once and cached,
-    together with what was computed from them (`findings`). Runs must not be added or removed.
+    together with values computed from them (`findings`). Runs must not be added or removed.
     """
 
     def __init__(self, sources: Iterable[SourceType]) -> None:
@@ -43,7 +43,7 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def starts_ns(self) -> dict[int, int]:
-        """Return the start of the replayed span, by run, if it is not the start of the run."""
+        """Return the start of the replayed span for each run that is not replayed from its own start."""
         starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
         return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
 

@@ -41,7 +41,7 @@ def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
 
     Args:
         topic: topic of the stream.
-        failures: time and reason of each.
+        failures: time and reason of each failure.
     """
     if not failures:
         return empty_stream(topic, schemas.FAILURE, {REASONS: "[]"})
@@ -68,7 +68,7 @@ def reason_stream(
         topic: topic of the stream.
         schema: a schema with the field `reason`.
         time_ns: (n,) stamps.
-        reason: (n,) indices in the list.
+        reason: (n,) indices in the list of sentences.
         reasons: the sentences.
     """
     return make_stream(
@@ -102,7 +102,7 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
 
 
 def _renumbered(part: Stream, merged: list[str], metadata: Mapping[str, str]) -> Stream:
-    """Renumber a part by the merged list; indices beyond its own list stay out of range."""
+    """Renumber a part's reasons by the merged list; indices outside its own list stay out of range."""
     places = np.array([*map(merged.index, _reasons(part)), len(merged)])
     numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
     columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}

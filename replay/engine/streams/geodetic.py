@@ -21,7 +21,7 @@ GEODETIC = schemas.GEODETIC_FIX.full_name
 
 
 def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:
-    """Return the origin that channels state (3,): latitude and longitude in deg, altitude in m; or None.
+    """Return the origin (3,) that channels state, or None: latitude and longitude (deg), altitude (m).
 
     An altitude that is not stated is zero. Raises BadInput if channels state different origins, or if a
     channel states only a latitude or only a longitude.
@@ -51,7 +51,7 @@ def _in_words(origin: Iterable[float]) -> str:
 
 
 def origins_of(fixes: Ragged) -> Floats:
-    """Return the first fix (runs, 3) of every run in deg, deg and m; NaN if a run has none."""
+    """Return the first fix (runs, 3) of every run in deg, deg and m, or NaN if a run has no fix."""
     has_one = np.diff(fixes.offsets) > 0
     rows = fixes.offsets[:-1][has_one]
     origins = np.full((fixes.runs, 3), np.nan)
@@ -65,8 +65,8 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
     """Convert geodetic fixes to positions (n, 3) relative to origins (runs, 3).
 
     A missing value, such as the altitude, becomes NaN. Covariances (n, 9) are rotated from the axes of
-    the fix to those of the origin; a log may store them as diagonals or in full, for east and north only
-    or including up.
+    the fix to the axes of the origin. A log may store a covariance as a diagonal or in full, for east
+    and north only or with up.
 
     Args:
         fixes: latitudes, longitudes and altitudes of all runs.
@@ -88,7 +88,7 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
 
 
 def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
-    """Rotate the fixes' covariances (n, 9) from their own axes to `axes` (n, 3, 3); NaN if missing."""
+    """Rotate the fixes' covariances (n, 9) from their own axes to `axes` (n, 3, 3); keep NaN."""
     covariance = covariances_of_fixes(stream)
     turn, unknown = axes @ own.transpose(0, 2, 1), np.isnan(covariance)
     turned = turn @ np.where(unknown, 0.0, covariance) @ turn.transpose(0, 2, 1)
@@ -96,7 +96,7 @@ def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
 
 
 def covariances_of_fixes(stream: Stream) -> Floats:
-    """Read the covariances (n, 3, 3) of fixes, in m^2 east, north and up; NaN if missing.
+    """Read the covariances (n, 3, 3) of fixes along east, north and up, in m^2; missing ones are NaN.
 
     Raises BadInput if their width is invalid.
     """

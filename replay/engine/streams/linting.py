@@ -1,4 +1,4 @@
-"""Checks of log files and recordings, with or without alterations, by the linter for logs."""
+"""Checks of log files, and of recordings with or without alterations, by the linter for logs."""
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +31,7 @@ def lint_source(source: LogSource | MemorySource, *, portions: int | None = None
 
 
 def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
-    """Yield a sentence about the worst finding, if any, with the command that lists the others."""
+    """Yield a sentence about the worst finding, if any, with the command that lists all findings."""
     if found:
         others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
         sure = "hint" if found[0].severity == "hint" else "implausible"

@@ -30,7 +30,8 @@ class Vectors(NamedTuple):
 
     Attributes:
         fields: by field, the components, or the number of components if the schema defines them.
-        covariance: field with the covariance of the first field, row-major; "" if there is none.
+        covariance: field with the covariance of the first field, row-major, or "" if there is no such
+            field.
         sigma: parameter that is used if the log lacks a covariance.
     """
 
@@ -39,7 +40,7 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Return a sentence on messages of `topic` that lack a covariance; "" if none can lack one."""
+        """Return a sentence about messages of `topic` without a covariance; "" without such a field."""
         remedy = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{remedy}" if self.covariance else ""
 
@@ -60,8 +61,8 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
     """Read the wanted components (n, d) of a vector field, in the wanted order.
 
     The channel's metadata names the components; positions with two or three components need no names.
-    Raises BadInput if a component is missing, or if the vectors have another width than the channel
-    states.
+    Raises BadInput if a component is missing, or if the vectors' width differs from the width that the
+    channel states.
 
     Args:
         stream: the messages.
@@ -80,8 +81,8 @@ def read_fixes(
     """Read wanted components of a vector field, and their covariance from another field.
 
     The covariance may be full (row-major) or diagonal. A horizontal position is accepted if a 3D
-    position is wanted; its height is NaN. Raises BadInput as `read_vectors` does, and if the covariance
-    has another width than the vector.
+    position is wanted; its height is NaN. Raises BadInput as `read_vectors` does, and if the
+    covariance's width does not fit the vector.
 
     Args:
         stream: the messages.
@@ -109,7 +110,7 @@ def read_fixes(
 
 
 def unknown(covariance: Floats) -> NDArray[np.bool_]:
-    """Find invalid covariances (n, d, d): NaN, or with a variance that is not positive."""
+    """Find covariances (n, d, d) that have a NaN or a variance that is not positive."""
     smallest = over_columns(np.minimum, np.diagonal(covariance, axis1=1, axis2=2))
     entries = covariance.reshape(len(covariance), covariance.shape[1] ** 2)
     is_none: Booleans = ~(smallest > 0.0) | np.isnan(over_columns(np.add, entries))
@@ -119,7 +120,7 @@ def unknown(covariance: Floats) -> NDArray[np.bool_]:
 def matrices(stream: Stream, field: str, covariance: str) -> Floats:
     """Read the covariances (n, d, d) of a vector field of d components, stored in full or as diagonals.
 
-    Raises BadInput if they have another width.
+    Raises BadInput if the matrices have another width.
 
     Args:
         stream: the messages.
@@ -153,7 +154,7 @@ def covariances_of(stream: Stream, wanted: Components) -> Floats:
 
 
 def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -> Stream:
-    """Convert horizontal positions to 3D positions of unknown height, if these are wanted."""
+    """Convert horizontal positions to 3D positions of unknown height, if 3D positions are wanted."""
     is_plane = field == "position_m" and len(stream) and stream[field].shape[1] == 2
     if not is_plane or "z_m" not in wanted or "components" in stream.metadata:
         return stream
@@ -212,7 +213,7 @@ def check_width(stream: Stream, field: str, width: int) -> None:
 
 
 def _stated(stream: Stream, field: str) -> Mapping[str, str]:
-    """Return the names and kinds that the channel states or the field implies; check their number."""
+    """Return the components' names and kinds, as stated or as the field implies; check their number."""
     width = stream[field].shape[1]
     stated = stream.metadata
     if "components" not in stated:

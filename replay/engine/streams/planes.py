@@ -1,8 +1,8 @@
 """Transformation of positions between local tangent planes (ENU) with different origins.
 
-The two planes are rotated and shifted against each other because the earth is curved. A position without
-a height is assumed to have the ellipsoidal height of its origin; if its true height is 100 m more and
-the other origin is 1 km away, the result has an error of 2 cm.
+The two planes are rotated and shifted relative to each other because the earth is curved. A position
+without a height is assumed to have the ellipsoidal height of its origin; if its true height is 100 m
+more and the other origin is 1 km away, the result has an error of 2 cm.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ class Movement(NamedTuple):
 
 
 def between(origin: Origin, other: Origin) -> Movement:
-    """Compute the transform from the local tangent plane of one origin to that of another."""
+    """Compute the transform between the local tangent planes of two origins."""
     axes, others = (tangent_axes(*each[:2]) for each in (origin, other))
     return Movement(others @ axes.T, np.array(into_tangent_plane(origin, other), float))
 
@@ -72,7 +72,7 @@ def moved_states(
     Args:
         components: components of the state by name, with their kinds.
         mean: (n, d).
-        movement: transform from the frame of the states to the other one.
+        movement: transform from the frame of the states to the other frame.
 
     Returns:
         The states (n, d), and the Jacobian (t, t).
@@ -100,7 +100,7 @@ def moved_states(
 
 
 def into_plane_of(stream: Stream, origin: Origin) -> Stream:
-    """Transform a stream from its stated local tangent plane to that of another origin.
+    """Transform a stream from its stated local tangent plane to the plane of another origin.
 
     Latitudes and longitudes do not change; only the stated origin does. Raises BadInput if messages of
     this type cannot be transformed.
@@ -157,7 +157,7 @@ def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
 
 
 def _below(place_m: Floats, movement: Movement) -> Floats:
-    """Compute the correction of 2D positions (n, 2) for the earth's curvature below their plane."""
+    """Compute how far 2D positions (n, 2) shift because the earth's surface is below their plane."""
     fall_m = np.sum(place_m**2, axis=1) / (2.0 * SEMI_MAJOR_M)
     moved_m: Floats = -fall_m[:, None] * movement.rotation[:2, 2]
     return moved_m

@@ -33,7 +33,7 @@ class Priors(NamedTuple):
         time_ns: (runs,) stamps.
         mean: (runs, d).
         covariance: (runs, t, t) in the tangent space.
-        reasons: (runs,) why a prior cannot be used, "" if it can; an unusable prior is NaN.
+        reasons: (runs,) why a prior cannot be used, or "" if it can be used. An unusable prior is NaN.
     """
 
     time_ns: NDArray[np.int64]
@@ -46,7 +46,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
     """Read the priors of all runs; see `Priors`.
 
     Raises BadInput if the channel does not state the components (see `match_components`), or if the
-    vectors have other widths than it states.
+    vectors' widths differ from those that it states.
 
     Args:
         prior: Gaussian estimates of all runs.
@@ -84,7 +84,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
 
 class _Layout(NamedTuple):
-    """Number of components that a channel states, and the wanted indices, in state and tangent space."""
+    """How many components a channel states, and which are wanted, in the state and the tangent space."""
 
     stated: int
     tangent: int
@@ -106,7 +106,7 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Make priors of runs that cannot start, all for one reason.
+    """Make unusable priors for runs that cannot start, all for the same reason.
 
     Args:
         runs: number of runs.

@@ -38,8 +38,8 @@ def state_stream(
     Args:
         topic: topic of the stream.
         time_ns: (n,) stamps.
-        components: by name, with their kinds.
-        truth: topic of the truth, "" for none; None to leave it out of the metadata.
+        components: components components by name, with their kinds.
+        truth: topic of the truth; "" if there is no truth, None to leave the entry out of the metadata.
         mean: (n, d).
         covariance: (n, t, t).
     """
@@ -67,7 +67,7 @@ def wrapped(mean: Floats, components: Components) -> Floats:
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Make a stream of means (n, d) and covariances (n, t, t); a NaN ends the run, see `monitor`.
+    """Make a stream of means (n, d) and covariances (n, t, t); a NaN makes a run fail (see `monitor`).
 
     Args:
         topic: topic of the stream.
@@ -91,7 +91,7 @@ def states_in(
     mean: Floats,
     covariance: Floats,
 ) -> Ragged:
-    """Make a stream of the states in some rows of columns; run r has the rows offsets[r]:offsets[r + 1].
+    """Make a stream of states from chosen rows of columns; run r has the rows offsets[r]:offsets[r + 1].
 
     Args:
         rows: (k,), the rows to use, in order.
@@ -99,7 +99,7 @@ def states_in(
         time_ns: (n,), the stamps.
         offsets: (runs + 1,), first row of each run.
         components: components of the state by name, with their kinds.
-        truth: topic of the truth; None if there is none.
+        truth: topic of the truth, or None if there is no truth.
         mean: (n, d).
         covariance: (n, t, t).
 
@@ -115,10 +115,11 @@ class InnovationColumns(NamedTuple):
 
     Attributes:
         time_ns: (n,) stamps.
-        target_id, accepted: (n,) the target of each, and whether a gate accepted it.
+        target_id, accepted: (n,) the target of each innovation, and whether a gate accepted the
+            innovation.
         innovation, covariance: (n, m), (n, m, m).
         squared: (n,), the NIS.
-        log_likelihood: (n,); None if it is not known.
+        log_likelihood: (n,), or None if it is not known.
     """
 
     time_ns: Integers
@@ -161,8 +162,8 @@ def failures_of(
 
     Args:
         topic: topic prefix of the estimator, /estimates/NAME and its case.
-        before: (runs,) ALL_WELL or an index in `reasons`, before the block.
-        after: (runs,) the same after the block.
+        before: (runs,) status before the block: ALL_WELL or an index in `reasons`.
+        after: (runs,) status after the block, in the same form.
         time_ns: (runs,) time of each failure.
         reasons: a sentence for each index.
     """
@@ -176,7 +177,7 @@ def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> R
 
     Args:
         topic: topic prefix of the estimator.
-        failures: by number of the run.
+        failures: the failures by run number.
         runs: number of runs.
     """
     failed = sorted(failures)

@@ -31,7 +31,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the name of the run that messages use."""
+        """Return the name that messages use for the run."""
 
     @property
     def run(self) -> RunMetadata | None:
@@ -43,7 +43,7 @@ class Source(Protocol):
 
     @property
     def start_ns(self) -> int | None:
-        """Return the start of the replayed span by the replay's clock; None for the run's start."""
+        """Return the start of the replayed span by the replay's clock, or None for the run's start."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -154,7 +154,8 @@ class LogSource(_Readable):
 
     Attributes:
         log: the opened file.
-        start_ns, end_ns: the span, without its end; None if the run's own start or end applies.
+        start_ns, end_ns: start (included) and end (excluded) of the span; None for the run's own start
+            or end.
     """
 
     log: Log
@@ -173,7 +174,7 @@ class LogSource(_Readable):
 
     @cached_property
     def epoch_ns(self) -> int:
-        """Return the run's time zero; if the log does not state it, the first publish stamp."""
+        """Return the run's time zero or, if the log does not state one, its first publish stamp."""
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
@@ -186,7 +187,7 @@ class LogSource(_Readable):
         return (self.main_span or self.extent(clock))[0]
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return the first and last stamp in ns by `clock`; zeros if there are no messages."""
+        """Return the first and last stamp in ns by `clock`, or zeros if there are no messages."""
         return read_span(self.log, clock)
 
     @property
@@ -205,7 +206,7 @@ class LogSource(_Readable):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics` by the clock `order`, up to `block_messages` in a block."""
+        """Yield the span of `topics`, in order of the clock, in blocks of `block_messages` at most."""
         before = Rejections()
         for block in read_blocks(
             self.log,
@@ -232,7 +233,7 @@ class LogSource(_Readable):
 
     @cached_property
     def main_span(self) -> tuple[int, int] | None:
-        """Return the first and last stamp of most messages if others are years from them."""
+        """Return the span of most messages if others are years away from it; otherwise return None."""
         topics = [topic for topic in self.topics if is_sensed(self, topic)]
         if not topics:
             return None
@@ -251,7 +252,8 @@ class MemorySource(_Readable):
         streams: by topic.
         run: metadata of the recording.
         name: name in messages.
-        start_ns, end_ns: the span, without its end; None if the run's own start or end applies.
+        start_ns, end_ns: start (included) and end (excluded) of the span; None for the run's own start
+            or end.
     """
 
     streams: Mapping[str, Stream]
@@ -270,7 +272,7 @@ class MemorySource(_Readable):
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return the first and last stamp in ns by `clock`; zeros if there are no messages."""
+        """Return the first and last stamp in ns by `clock`, or zeros if there are no messages."""
         times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
         first_ns = min((int(each.min()) for each in times), default=0)
         return first_ns, max((int(each.max()) for each in times), default=0)
@@ -297,7 +299,7 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics` by `order` as one block, regardless of `block_messages`."""
+        """Yield the span of `topics`, in order of the clock `order`, as one block of any size."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
@@ -322,7 +324,7 @@ class MemorySource(_Readable):
         return stream.take(slice(int(start), int(end)))
 
     def in_order(self, topic: str, order: Clock) -> Stream:
-        """Return `topic` in the order of the clock `order`; equal stamps keep the order of the file."""
+        """Return `topic` in order of the clock `order`; equal times keep the order of the file."""
         stream = self.stream_of(topic)
         if is_in_order(Ragged(stream, np.array([0, len(stream)])), order):
             return stream
@@ -344,7 +346,7 @@ class MemorySource(_Readable):
 
     @cached_property
     def main_span(self) -> tuple[int, int] | None:
-        """Return the first and last stamp of most messages if others are years from them."""
+        """Return the span of most messages if others are years away from it; otherwise return None."""
         return main_span(each.publish_time_ns for each in self.streams.values())
 
 
@@ -368,7 +370,7 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
 
 
 def in_memory(source: LogSource | MemorySource, topics: Iterable[str] | None = None) -> MemorySource:
-    """Read topics of a log, by default all that were recorded; a recording is in memory already."""
+    """Read a log's topics into memory, by default all recorded ones; return a recording as it is."""
     if isinstance(source, MemorySource):
         return source
     if topics is None:

@@ -24,10 +24,11 @@ def components_of(names: Sequence[str]) -> Components:
 
 
 def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Find the indices of the wanted components among those that a channel states.
+    """Find the indices of the wanted components among the components that a channel states.
 
     Args:
-        stated: metadata of the channel: names as `components`, with or without their `kinds`.
+        stated: metadata of the channel, with the names under `components` and optionally the kinds under
+            `kinds`.
         wanted: names and kinds, in the wanted order.
         where: name of the channel in messages, such as `topic /prior`.
 
@@ -53,8 +54,8 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
 def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
     """Find the rows and columns of a stated covariance that belong to the wanted components, in order.
 
-    A covariance is in the tangent space: one row for an axis, three for a quaternion, see
-    `fuselog.replay.engine.vectors.tangent`. Args and errors are those of `match_components`.
+    A covariance is in the tangent space, in which an axis has one row and a quaternion has three; see
+    `fuselog.replay.engine.vectors.tangent`. Arguments and errors are the same as for `match_components`.
     """
     columns = match_components(stated, wanted, where)
     rows_of: list[range] = []
@@ -70,7 +71,7 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
 
 
 def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
-    """Return the names and kinds that a channel states, in its order; empty if it names no components.
+    """Return the components' names and kinds in the channel's order, or {} if it names no components.
 
     If a channel states no kinds, a component has the wanted kind, or "linear" if it is not wanted.
     Raises BadInput if a name occurs twice, if a kind is unknown, or if there is not one kind for each
@@ -78,7 +79,7 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
 
     Args:
         stated: metadata of the channel.
-        wanted: components whose kinds are used if the channel states none.
+        wanted: components whose kinds are used if the channel states no kinds.
         where: name of the topic in messages.
     """
     listed = stated.get("components", ""), stated.get("kinds", "")

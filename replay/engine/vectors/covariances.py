@@ -79,8 +79,8 @@ def fill_squares(
 def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:
     """Compute the log-likelihood of Gaussian errors (..., n) from their NEES or NIS `squared` (...).
 
-    A component that is NaN is missing. The result is NaN if the covariance of the others is not
-    positive definite.
+    A component that is NaN is missing. The result is NaN if the covariance of the remaining components
+    is not positive definite.
 
     Args:
         squared: (...).

@@ -2,9 +2,9 @@
 
 Every component of a state has a kind. The two components of an axis and the four of a quaternion are
 adjacent; an axis or a quaternion equals its negative. The error of an axis or a quaternion is the
-rotation from truth to estimate in the body's frame, as an angle or a rotation vector; the covariances of
-estimates are those of this error. Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter",
-JAIF 9(2), 2014, sections 5.3 and 7.
+rotation from truth to estimate in the body's frame, as an angle or a rotation vector. The covariances of
+estimates are covariances of this error. Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham
+Filter", JAIF 9(2), 2014, sections 5.3 and 7.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,9 +51,9 @@ def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, "slice[int, int
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
     """Return names and kinds of error components: `heading_w`, ... become `heading_x_rad`, ...
 
-    A linear component or an angle keeps its name; an axis has one "angle", a quaternion three
-    components of kind "rotation". If the names have no common stem, as `qw, qx, qy, qz`, the result is
-    `rotation_x_rad`, ...
+    A linear component or an angle keeps its name; an axis becomes one component of kind "angle", a
+    quaternion three components of kind "rotation". If the names have no common stem, as in `qw, qx, qy,
+    qz`, the result is `rotation_x_rad`, ...
 
     Args:
         components: names.
@@ -80,7 +80,7 @@ def _tangent_components(
 
 
 def _common(names: Sequence[str]) -> str:
-    """Return the common prefix of component names of a vector; `rotation` if this is too short."""
+    """Return the common prefix of a vector's component names, or `rotation` if it is too short."""
     stem = names[0]
     while not all(name.startswith(stem) for name in names):
         stem = stem[:-1]
@@ -269,11 +269,12 @@ def bracket(
     Args:
         times: (m,), times of states in ns, run by run and in order.
         starts: (runs + 1,), first state of each run.
-        time_ns: (n,), stamps in ns, run by run; fast if they are in order.
+        time_ns: (n,), stamps in ns, run by run; the search is fast if they are in order.
         offsets: (runs + 1,), first stamp of each run.
         longest_ns: the longest gap to interpolate over.
-        left, right: (n,), filled unless a run has no states; equal at a stamp that has a state.
-        weight: (n,), filled; NaN if the state is unknown.
+        left, right: (n,), indices of the states before and after each stamp, filled unless a run has no
+            states; they are equal if a state has this stamp.
+        weight: (n,), weights of the later states, filled; NaN if the state at the stamp is unknown.
     """
     for run in range(len(offsets) - 1):
         begin, end = starts[run], starts[run + 1]

@@ -1,10 +1,10 @@
 """Iterated least squares over many runs together, and the Cramer-Rao lower bound of the estimates.
 
 For parameters (runs, n), a model returns the residuals of the measurements, the derivatives of the
-predictions, and the covariance of the measurements. The module computes the step of the search, the
-Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the unobservable directions from
-them. The search uses the Gauss-Newton method (ILS in Bar-Shalom, Li and Kirubarajan, 2001), with scaled
-columns and a line search that halves steps; the weights are computed at the latest estimate.
+predictions, and the covariance of the measurements. From these, the module computes the step of the
+search, the Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the unobservable
+directions. The search uses the Gauss-Newton method (ILS in Bar-Shalom, Li and Kirubarajan, 2001), with
+scaled columns and a line search that halves steps; the weights are computed at the latest estimate.
 """
 
 from collections.abc import Callable, Sequence
@@ -281,7 +281,7 @@ def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
 
 
 def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
-    """Compute roots of the inverse information, and whether they prove that the rank is full.
+    """Compute roots of the inverse information, and test whether the roots prove that the rank is full.
 
     With F the inverse of the triangular factor, no singular value is below 1 / |F| or above sqrt(n).
     """
@@ -346,7 +346,7 @@ def _whiten(at: Linearization) -> _Whitened:
 
 
 def _whitener(covariance: Floats) -> Floats:
-    """Compute an inverse square root of the covariance, of the same shape; NaN if it is not positive."""
+    """Compute an inverse square root of the covariance (same shape), or NaN if it is not positive."""
     if covariance.ndim == 2:
         positive = covariance > 0.0
         return np.where(positive, 1.0 / np.sqrt(np.where(positive, covariance, 1.0)), np.nan)

@@ -98,7 +98,7 @@ def stated_or(sigma: float | None, otherwise: Any) -> Any:
 
 
 def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | None:
-    """Return the finite velocities; None if there are none."""
+    """Return the finite velocities, or None if no velocity is finite."""
     stream = streams.get("velocity")
     if stream is None:
         return None
@@ -136,25 +136,27 @@ class AlignmentParameters(ModelParameters):
 
     The tilt is computed from the first samples. The body is assumed to be at rest until shortly before
     it first moves (`rest_margin_s`). The heading is the course at the first sufficient speed, minus the
-    turn that the gyro measured until then; without such a speed it is unknown. Standard deviations of
-    the start that are not given are estimated from the data: position and velocity are so uncertain that
-    their first messages determine them; the uncertainty of the tilt follows from the accelerometer's
-    bias and the motion, that of the gyro's bias from its mean at rest, and that of the heading from the
-    differences between the course and the turn of the gyro.
+    turn that the gyro measured until then; without such a speed, the heading is unknown. Standard
+    deviations of the start that are not given are estimated from the data. Position and velocity are
+    made so uncertain that their first messages determine them. The uncertainty of the tilt follows from
+    the accelerometer's bias and the motion, the uncertainty of the gyro's bias from its mean at rest,
+    and the uncertainty of the heading from the differences between the course and the gyro's turn.
 
     The mounting rotates the unit's axes to forward, left, up: by yaw about up, then pitch about left,
     then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: angles of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: relative excess of the measured force, per axis.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative excess of the measured rate, per axis.
+        force_scale_x, force_scale_y, force_scale_z: relative excess of the measured over the true force,
+            per axis.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative excess of the measured over the true rate, per
+            axis.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
         velocity_delay_s: delay of velocities: time from the measurement to the stamp.
         inertial_delay_s: delay of inertial samples: time from the measurement to the stamp.
         level_s: duration of the first samples, from which the tilt is computed.
         still_mps: speed above which the body counts as moving.
-        rest_margin_s: margin before the first motion, until which the body is assumed to be at rest.
+        rest_margin_s: the body is assumed to be at rest until this time before its first motion.
         course_mps: speed above which the course determines the heading.
         course_s: duration over which courses are compared with the turn of the gyro to estimate the
             heading's standard deviation.
@@ -195,25 +197,25 @@ class AlignmentParameters(ModelParameters):
 
 
 def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
-    """Return the specific force of the body from a sample of the unit (force, rate) and this bias."""
+    """Return the body's specific force, given a sample of the unit (force, rate) and the bias."""
     x, y, z = mounted(samples[:3], parameters)
     sx, sy, sz = parameters.force_scale_x, parameters.force_scale_y, parameters.force_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
 
 
 def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
-    """Return the turn rate of the body from a sample of the unit and this bias; see `specific_force`."""
+    """Return the body's turn rate, given a sample of the unit and the bias; see `specific_force`."""
     x, y, z = mounted(samples[3:], parameters)
     sx, sy, sz = parameters.gyro_scale_x, parameters.gyro_scale_y, parameters.gyro_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the start: the first fix in the time span of the samples, and the velocity nearest in time.
+    """Find the start from the first fix in the samples' time span and the velocity nearest in time.
 
     Args:
-        streams: `inertial` samples, `fix`, positions in the local tangent plane (east, north, up), and
-            optionally `velocity`, velocities in that plane.
+        streams: streams: `inertial` (samples), `fix` (positions in the local tangent plane: east, north,
+            up), and optionally `velocity` (velocities in that plane).
         parameters: `AlignmentParameters`.
 
     Raises BadInput if there is no such fix, if the inertial unit does not measure gravity, or if values
@@ -255,7 +257,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
     """Describe apparent errors in the first samples of a body whose initial state is known.
 
-    The checks are those of `align`, but they raise no exception, because the body may start in motion.
+    The checks are the same as in `align`, but raise no exception, because the body may start in motion.
 
     Args:
         streams: see `align`.
@@ -280,7 +282,7 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """Return the wide covariance (3, 3) of a start at a message, which is also used as a measurement."""
+    """Return a wide covariance (3, 3) for a start from a message that is also used as a measurement."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
@@ -288,8 +290,8 @@ def _wide(sigma: float | None, covariance: Floats) -> Floats:
 def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
     """Return the covariance (6, 6) of tilt and accelerometer bias in body axes; `up` is vertical.
 
-    If the tilt's standard deviation is not given, both are correlated: levelling mistakes a bias for a
-    tilt; the error of the tilt is the ratio of the bias to gravity.
+    If the tilt's standard deviation is not given, tilt and bias are correlated: levelling mistakes a
+    bias for a tilt, so the error of the tilt is the ratio of the bias to gravity.
     """
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
@@ -421,7 +423,7 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 def _heading(
     turning: tuple[Floats, Floats], start_ns: int, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[float, float] | None:
-    """Find the heading at the start and its standard deviation, in rad; None if the body never moves.
+    """Find the heading at the start and its standard deviation in rad, or None without motion.
 
     The heading is the first course, minus the body's turn about the vertical axis until then. If the
     body faces its direction of motion, all later courses give the same heading; their differences

@@ -38,7 +38,7 @@ class AttitudeParameters(ModelParameters):
     """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
     The filter assumes that the velocity is near zero and the field nearly constant. It uses these
-    assumptions only once a second, because their errors persist for about that long.
+    assumptions only once a second, because their errors persist for about a second.
 
     Attributes:
         gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it includes scale errors
@@ -128,7 +128,7 @@ def field_noise(parameters: Any) -> Components:
 
 
 def first_of_periods(stream: Stream) -> Booleans:
-    """Test whether each sample (n,) is the first in a second of the clock, regardless of blocks."""
+    """Test which samples (n,) are the first within a second of the clock, regardless of blocks."""
     rate_hz = stream.metadata.get("rate_hz")
     steps_ns = np.diff(stream.publish_time_ns)
     step_ns = 1e9 / float(rate_hz) if rate_hz else np.median(steps_ns[steps_ns > 0])
@@ -141,7 +141,7 @@ def read_velocity(stream: Stream) -> Floats:
 
 
 def read_field(stream: Stream) -> Floats:
-    """Return the first field sample (n, 3) of every period, including those of a slower magnetometer."""
+    """Return the first field sample (n, 3) of every period, also if the magnetometer is slower."""
     field = stream["magnetic_field_ut"]
     if field.shape[1:] != (3,):  # the magnetometer has a separate topic
         return np.full((len(stream), 3), np.nan)

@@ -44,8 +44,8 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 class NavigationParameters(AlignmentParameters):
     """Noise of the inertial unit and other sensors, their mounting, and gaps.
 
-    The biases are in the body's axes. Gravity and the rotation of the earth are those at the origin of
-    the plane. After more than `inertial_gap_s` without samples, everything except the biases becomes
+    The biases are in the body's axes. Gravity and the earth's rotation have their values at the origin
+    of the plane. After more than `inertial_gap_s` without samples, everything except the biases becomes
     uncertain: the body may have accelerated, turned and tilted, with the standard deviations given for a
     gap.
 
@@ -64,10 +64,11 @@ class NavigationParameters(AlignmentParameters):
             (forward, left, up).
         axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit in body axes
             (forward, left, up).
-        wheel_scale: relative excess of the speed that the wheels measure.
+        wheel_scale: relative excess of the speed that the wheels measure over the true speed.
         field_east_ut, field_north_ut, field_up_ut: local magnetic field by direction.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
-        standing_delay_s: delay of messages about standing still: time from the measurement to the stamp.
+        standing_delay_s: delay of the messages that state whether the body stands still: time from the
+            measurement to the stamp.
         sigma_velocity_mps: standard deviation of each component of a velocity whose message states no
             covariance.
         sigma_heading_rad: standard deviation of a heading.
@@ -172,12 +173,12 @@ def velocity(state: Components, samples: Components, parameters: Any) -> Compone
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix whose message states none."""
+    """Return the variances of a fix whose message states no covariance."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """Return the variances of a velocity whose message states none."""
+    """Return the variances of a velocity whose message states no covariance."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 

@@ -1,6 +1,6 @@
 """Models of additional sensors of a body with an inertial unit, such as a compass or wheels.
 
-They measure the state of `navigation`; each has a topic of its own, which a log may lack. Groves,
+The sensors measure the state of `navigation`; each has its own topic, which a log may lack. Groves,
 Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters
 6 and 15.
 """
@@ -105,7 +105,7 @@ def slip_noise(parameters: Any) -> Components:
 
 
 def field_noise(parameters: Any) -> Components:
-    """Return the variances of a field whose message states none."""
+    """Return the variances of a field whose message states no covariance."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
@@ -137,13 +137,13 @@ def read_wheels(stream: Stream) -> Floats:
 
 
 def read_standing(stream: Stream) -> Floats:
-    """Return zero velocities (n, 3) for nonzero values; NaN for zero, because the body may move."""
+    """Return zero velocities (n, 3) for nonzero values, and NaN for zeros, when the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
 
 
 def read_rolling(stream: Stream) -> Floats:
-    """Return zero velocities (n, 2) to the left and up for nonzero values; NaN for zero."""
+    """Return zero velocities (n, 2) to the left and up for nonzero values, and NaN for zeros."""
     return read_standing(stream)[:, :2]
 
 

@@ -36,8 +36,8 @@ class ShooterParameters(Parameters):
     Attributes:
         mode: data that the sensors send to the fusion centre.
         estimate_sensors: whether the sensors' own positions are estimated too.
-        cross_covariances: whether local estimates keep the covariances of range and angles; the paper
-            leaves them out.
+        cross_covariances: whether local estimates keep the covariances between range and angles; the
+            paper leaves them out.
     """
 
     mode: Mode = Mode.NATIVE_MEASUREMENTS
@@ -87,7 +87,7 @@ def _solve(given: Given[ShooterParameters]) -> list[Ragged]:
 
 
 def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tuple[Batches, Detections]:
-    """Arrange detections by shot and sensor, with the latest fix of each sensor at that shot."""
+    """Arrange detections by shot and sensor, with each sensor's latest fix at the last detection."""
     table = table_of(detections, ["shot_id", *HEARD])
     batches, shot = batches_of(table, "shot_id", detections[0].runs)
     heard = np.full((3, len(batches.run), len(detections)), np.nan)
@@ -98,7 +98,7 @@ def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tupl
 
 
 def _latest(positions: Ragged, batches: Batches) -> Floats:
-    """Return the latest fix (batches, 2) of a sensor at the end of each batch; NaN if there is none."""
+    """Return a sensor's latest fix (batches, 2) at the end of each batch, or NaN if it has no fix."""
     times = positions.stream.publish_time_ns
     latest = np.full(len(batches.run), -1)
     for run in np.unique(batches.run):

@@ -47,8 +47,8 @@ class Setting(NamedTuple):
     """Assumptions of the estimator about sensors and medium.
 
     `cross_covariances` keeps the covariances between range and angles in local estimates. The paper
-    leaves them out: with them, the search is unstable, and the bound of eq (48) falls below the bound of
-    the native measurements, from which the local estimates are derived, so it is invalid.
+    leaves them out. With them, the search is unstable, and the bound of eq (48) is invalid: it falls
+    below the bound of the native measurements, from which the local estimates are derived.
     """
 
     mode: Mode
@@ -184,8 +184,8 @@ class _Blocks(NamedTuple):
     """Blocks of k measurements per sensor, NaN where missing, with derivatives in the last axis.
 
     residual (runs, sensors, k), jacobian (..., k, d), covariance (..., k, k), and its derivative slope
-    (..., k, k, d). The derivatives are first with respect to azimuth, range and trajectory (d = 3),
-    and in the end with respect to all parameters.
+    (..., k, k, d). The derivatives are first with respect to azimuth, range and trajectory (d = 3), and
+    finally with respect to all parameters.
     """
 
     residual: Floats
@@ -315,7 +315,7 @@ def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
 
 
 def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
-    """Append the position fix of every sensor as two further measurements, of the sensor's position."""
+    """Append each sensor's position fix as two further measurements of the sensor's position."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)
     wider = [(0, 0), (0, 0), (0, 2), (0, 2)]
@@ -330,7 +330,7 @@ def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
 
 
 def _absorb_fixes(view: _Blocks, sigma_m: float) -> _Blocks:
-    """Add the error of position fixes to the covariance; it acts like a shift of the shooter."""
+    """Add the position fixes' error to the covariance; the error acts like a shift of the shooter."""
     by_shooter = view.jacobian[..., :2]
     share = sigma_m**2 * by_shooter @ np.swapaxes(by_shooter, 2, 3)
     return view._replace(covariance=view.covariance + share)

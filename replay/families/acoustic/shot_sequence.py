@@ -4,8 +4,8 @@ A report contains the muzzle blast's direction of arrival, the bullet's directio
 shockwave, and the shockwave's lead, that is, the time from the shockwave to the muzzle blast. All of
 them refer to the shooter's position at the time of the shot, not at the arrival of the sound. Reports
 may be wrong, because of an echo or a shockwave of another shot. Gaussian methods treat a report as
-entirely right or entirely wrong, see `fuselog.replay.inference.linear_algebra.inflation`;
-`particles:N` treats each component separately.
+entirely right or entirely wrong (see `fuselog.replay.inference.linear_algebra.inflation`); `particles:N`
+treats each component separately.
 """
 
 from collections.abc import Mapping
@@ -48,7 +48,7 @@ class MovingShooterParameters(ModelParameters):
         outlier_probability: probability that a component of a report is wrong and may have any value;
             only `particles:N` uses it.
         longest_s: longest time between shockwave and muzzle blast in a wrong report.
-        start_s: length of the span of first reports from which the initial state is found.
+        start_s: time span of the first reports, from which the initial state is found.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
         start_sigma_rad: standard deviation of the direction of shots at the start.
@@ -133,7 +133,7 @@ def log_likelihood(
 
 
 def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> float:
-    """Compute the log density of a Gaussian mixed with a uniform density; 0 if the deviation is NaN."""
+    """Compute the log density of a Gaussian mixed with a uniform density, or 0 for a NaN deviation."""
     if np.isnan(deviation):
         return 0.0
     gaussian = -0.5 * (deviation / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_TWO_PI
@@ -143,10 +143,11 @@ def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> f
 def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Find the shot that fits most of the first reports.
 
-    Candidates are all points where the directions of two muzzle blasts intersect, each with every
-    reported direction of the bullet. A least-squares fit with Cauchy loss starts from the candidate with
-    the smallest residuals, which are clipped at three standard deviations. The fit suppresses wrong
-    reports if most reports are right. Raises BadInput if the reports do not determine a shot.
+    Candidates are all points where the directions of two muzzle blasts intersect, each combined with
+    every reported direction of the bullet. A least-squares fit with Cauchy loss starts from the
+    candidate with the smallest residuals, which are clipped at three standard deviations. The fit
+    suppresses wrong reports if most reports are right. Raises BadInput if the reports do not determine a
+    shot.
     """
     reports, sensors = streams["reports"], streams[SENSORS.topic]
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))

@@ -33,7 +33,7 @@ WIDER = 100.0  # factor on the standard deviations of the start, which then has 
 class SoundSourceParameters(ModelParameters):
     """Speed of sound, and standard deviations of the initial state.
 
-    The initial state is found by least squares. Its standard deviations are a hundred times those that
+    The initial state is found by least squares. Its standard deviations are a hundred times as large as
     the measured differences imply, so the initial state has little weight.
 
     Attributes:
@@ -71,7 +71,7 @@ def read_variances(stream: Stream) -> Floats:
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the position that best fits the first stamp's differences, by searches on all sides.
+    """Find the position that best fits the first stamp's differences, with searches from all sides.
 
     Raises BadInput if there are fewer differences than unknown coordinates.
     """

@@ -81,7 +81,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _place(scene: Scene, sensor: int) -> Floats:
-    """Find the position (2,) of a sensor, from the truth or its first fix; NaN if it has neither."""
+    """Find a sensor's position (2,) from the truth or its first fix, or NaN if it has neither."""
     for truth in scene.truths_of(CASE):
         columns = [truth.components.index(name) for name in sensor_components(sensor)]
         return truth["state"][0, columns]
@@ -90,7 +90,7 @@ def _place(scene: Scene, sensor: int) -> Floats:
 
 
 def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
-    """Return the Mach angle that the detections' channels state, or that of the default medium."""
+    """Return the Mach angle that the detections' channels state, or the default medium's angle."""
     for sensor in sensors:
         stated = scene.source.topics[f"/sensor{sensor}/detections"].metadata
         if "mach_number" in stated:

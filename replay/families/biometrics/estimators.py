@@ -78,7 +78,8 @@ class LearnerParameters(Subsets):
     Attributes:
         seed: seed of the random folds and impostors.
         folds: number of folds of users for cross-validation.
-        pairs: the paper's trimmed database (all genuine, two random impostors per user), or all pairs.
+        pairs: pairs to score: the paper's trimmed database (all genuine pairs and two random impostor
+            pairs per user), or all pairs.
         failures: whether the scores of failed enrolments are kept, as in the paper, or treated as
             missing.
         logarithmic: modalities whose scores are replaced by log(1 + score).
@@ -135,7 +136,7 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """Fit a classifier, positive for genuine pairs; missing training scores are replaced by the mean.
+    """Fit a classifier with genuine pairs as positive class; the mean replaces missing training scores.
 
     QDA, LDA, logistic regression and all calibrated classifiers compute a log-likelihood ratio for equal
     priors.
@@ -301,7 +302,7 @@ def _learnt(
 
 
 def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
-    """Return z-normalized scores (users, users, matchers), for some modalities of their logarithms."""
+    """Return z-normalized scores (users, users, matchers); for some modalities, log scores are used."""
     scores = compared.scores
     if parameters.failures == "missing":
         scores = np.where(compared.failed, np.nan, scores)

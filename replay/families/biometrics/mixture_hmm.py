@@ -118,8 +118,8 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 def _uneven(vectors: Floats) -> Floats:
     """Return vectors (count, m) with a slight quadratic distortion, which differs between dimensions.
 
-    Integer scores are often equally far from two means, so rounding would decide to which of them they
-    belong. With the distortion, the lower mean is nearer.
+    Integer scores are often equally far from two means, so rounding would decide to which mean a score
+    belongs. With the distortion, the lower mean is nearer.
     """
     bend = UNEVEN * np.arange(1, vectors.shape[1] + 1)
     return vectors + bend * (vectors - vectors.min(axis=0)) ** 2
@@ -197,7 +197,7 @@ def _backward(model: MixtureHmm, states: Floats) -> Floats:
 
 
 def _log(probability: Floats) -> Floats:
-    """Compute the logarithm; minus infinity for zero."""
+    """Compute the logarithm, which is minus infinity for zero."""
     with np.errstate(divide="ignore"):
         return np.log(probability)
 

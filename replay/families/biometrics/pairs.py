@@ -34,8 +34,8 @@ def normalise(scores: Floats, how: str) -> Floats:
     """Convert scores to a common scale; missing scores (NaN) stay missing.
 
     `tanh` is the normalisation of Jain, Nandakumar & Ross 2005, with mean and standard deviation instead
-    of Hampel's estimates. A gallery column with equal scores becomes 0. Raises BadInput if a standard
-    deviation is zero or not finite.
+    of Hampel's estimates. `column-min-max` sets a gallery column of equal scores to 0. Raises BadInput
+    if a standard deviation is zero or not finite.
 
     Args:
         scores: (users, users, matchers), NaN if missing.
@@ -111,7 +111,7 @@ def cross_validate(
     """Fuse scores (n,); the fusion of a pair is learned without the users in its gallery user's fold.
 
     Args:
-        vectors: (n, m), a score of each matcher.
+        vectors: (n, m), for each pair the scores of m matchers.
         pairs: the users of each vector, and the folds of users.
         learner: fits a fusion to training vectors.
         limit: largest number of impostor vectors to learn from.
@@ -130,10 +130,10 @@ def cross_validate(
 
 
 def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
-    """List subsets of matchers: by modality, the k-th of each modality, all, and single matchers.
+    """List subsets: the matchers of a modality, the k-th of every modality, all, and single matchers.
 
-    A subset of a single matcher has that matcher's name. The larger subsets are those of the paper (M1,
-    M2, R1, R2, all).
+    A subset of a single matcher has that matcher's name. The larger subsets are the paper's: M1, M2, R1,
+    R2 and all.
     """
     by_modality: dict[str, list[int]] = {}
     for index, matcher in enumerate(matchers):

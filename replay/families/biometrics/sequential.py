@@ -1,8 +1,8 @@
 """Sequential tests of log-likelihood ratios: Wald's test of two hypotheses, Page's test for a change.
 
 Wald, "Sequential Tests of Statistical Hypotheses", Annals of Mathematical Statistics 16(2), 1945; Page,
-"Continuous Inspection Schemes", Biometrika 41, 1954. Their guarantees hold if the ratios are calibrated
-and independent.
+"Continuous Inspection Schemes", Biometrika 41, 1954. The guarantees of the tests hold if the ratios are
+calibrated and independent.
 """
 
 from collections.abc import Callable
@@ -104,7 +104,7 @@ def page_sums(ratios: Floats) -> Floats:
 
 
 def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
-    """Count the probes (...,) until one of the sums (..., n) exceeds its threshold; 0 if none does.
+    """Count the probes (...,) until a sum (..., n) exceeds its threshold, or return 0 if no sum does.
 
     The threshold is log(together * run_length), where `together` is the number of sums to which a probe
     adds. By the martingale of Shiryaev and Roberts, the mean number of probes until a false alarm is at

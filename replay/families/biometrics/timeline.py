@@ -37,7 +37,7 @@ OF_PROBE = "genuine and greatest impostor score of each probe"
 
 
 class Fusion(NamedTuple):
-    """Scores fused by an estimator; `note` explains the threshold if the estimator states none."""
+    """Scores fused by an estimator; `note` explains a threshold that the estimator does not state."""
 
     estimator: str
     fused: Fused
@@ -149,7 +149,8 @@ def _errors_so_far(fused: Fused, threshold: float) -> Floats:
 def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChartView:
     """Draw two normalized histograms of scores so far; the end bars include scores outside the range.
 
-    The two bars of a bin are side by side. A bar of the largest height marks the threshold.
+    The two bars of a bin are side by side. A bar as high as the largest bar of the final histograms
+    marks the threshold.
     """
     estimator, fused, time_ns, threshold, note = fusion
     entity = entity_path("fusion", case, estimator, "distribution")
@@ -189,7 +190,7 @@ def _draw_distribution(canvas: Canvas, case: str, fusion: Fusion) -> rrb.BarChar
 
 
 def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
-    """Draw the scores of each probe by the case's matchers, without failures to enrol."""
+    """Draw the scores that the case's matchers give each probe, without failures to enrol."""
     if TOPIC not in scene.source.topics:
         return []
     stream = scene.read(TOPIC)

@@ -1,8 +1,8 @@
 """Performance measures of verification and identification: rates, ROC, equal error rate, Cllr.
 
 Verification rate and relative rate increase: Zheng & Blasch, JAIF 2014, eq. 3. Cllr: Brummer & du Preez,
-Computer Speech & Language 2006. A greater score means more similar; a comparison is accepted if its
-score is not below the threshold.
+Computer Speech & Language 2006. A greater score means greater similarity; a comparison is accepted if
+its score is not below the threshold.
 """
 
 import operator
@@ -30,9 +30,9 @@ class Roc(NamedTuple):
 class Fused(NamedTuple):
     """Fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
 
-    `fold` (users,) is the fold of each user in the cross-validation, `threshold` the decision threshold
-    of the fusion; both are None if the fusion has none. `is_ratio` is true if the scores are
-    log-likelihood ratios.
+    `fold` (users,) is the fold of each user in the cross-validation, and `threshold` is the decision
+    threshold of the fusion; each is None if the fusion does not have it. `is_ratio` is true if the
+    scores are log-likelihood ratios.
     """
 
     score: Floats
@@ -88,7 +88,7 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """Find the greatest genuine accept rate for which the false accept rate does not exceed a limit.
+    """Find the greatest genuine accept rate at which the false accept rate does not exceed a limit.
 
     Args:
         curve: rates of a fusion.
@@ -127,7 +127,7 @@ def identified(scores: Floats) -> int:
 
 
 def verification_rate(fused: Fused) -> float:
-    """Compute the share of decisions with the threshold that are correct, averaged over the folds.
+    """Compute the share of correct decisions at the threshold, averaged over the folds.
 
     If the fusion has no threshold, 0 is used, as for a log-likelihood ratio.
     """

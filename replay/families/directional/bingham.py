@@ -177,7 +177,7 @@ def run_kalman_filter(
     The filter normalizes the mean after every update.
 
     Args:
-        noise: system and measurement noise; the paper adds it without rotation, for any state.
+        noise: system and measurement noise; the paper adds it without rotation, regardless of the state.
         state: the Gaussians before the first row, batch axis (runs,).
         steps: increments and measurements of all runs.
         rotations: as for `run_bingham_filter`.

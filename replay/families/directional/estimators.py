@@ -151,7 +151,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
 
 
 def as_bingham(noise: DirectionalNoise) -> Bingham:
-    """Return the Bingham distribution; for a Gaussian, fit one to its projection on the sphere."""
+    """Return the Bingham distribution, or fit one to a Gaussian's projection on the sphere."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
@@ -162,7 +162,7 @@ def as_bingham(noise: DirectionalNoise) -> Bingham:
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
-    """Return the covariance (d, d) of the Gaussian; for a Bingham distribution, by (57)."""
+    """Return the Gaussian's covariance (d, d), or that of a Bingham distribution by (57)."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
     return bingham.hemisphere_covariance(as_bingham(noise))
@@ -206,7 +206,7 @@ def _widened(state: Any, runs: int) -> Any:
 
 
 def heading_model(given: Given[Any]) -> HeadingModel:
-    """Return the model defined by the parameters and, if they are not set, by the channel."""
+    """Return the model defined by the parameters; the channel defines those that are not set."""
     stated = {name: given.stated("headings", name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])

@@ -86,8 +86,8 @@ def run_torus_grid_filter(
         model: motion and noise of the headings.
         state: probabilities (runs, n, n) at the angles of `torus_grid(n)`.
         offsets: (runs + 1,), the rows of each run.
-        measurement: (rows, 2), rad; NaN if the row is only a prediction, or if the second angle is not
-            measured.
+        measurement: (rows, 2), rad; both angles are NaN if the row is only a prediction, and the second
+            is NaN if it is not measured.
         motion: function that moves both angles by one step.
     """
     n = state.shape[1]

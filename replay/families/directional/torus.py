@@ -4,7 +4,7 @@ These are the recursive toroidal filter that Kurz and Hanebeck announce in "Dete
 Torus for Bivariate Circular Estimation", 2016, and the unscented Kalman filter with their UKF samples.
 Both process an ensemble as ragged rows: rows offsets[r]:offsets[r + 1] belong to run r. A row is a
 prediction, followed by an update with its measurement (2,). If the measurement is NaN, there is no
-update; if only the second angle is NaN, the update uses the first angle.
+update; if only the second angle is NaN, the update uses only the first angle.
 """
 
 import math

@@ -48,7 +48,7 @@ class BiasesParameters(Parameters):
 
 
 class Sightings(NamedTuple):
-    """Batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
+    """Batches and their lines of sight (batches, targets, sensors, 2), NaN if a target is not seen."""
 
     batches: Batches
     targets: list[int]
@@ -82,7 +82,7 @@ def _find(
 
 
 def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
-    """Return the known biases (sensors, 3) in rad, NaN for those to estimate."""
+    """Return the known biases (sensors, 3) in rad, with NaN for the biases to estimate."""
     if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]

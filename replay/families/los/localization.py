@@ -58,8 +58,8 @@ class Observability(NamedTuple):
     """Observability of the parameters from the measurements of one run.
 
     `turning_axis` is the unit vector about which all sensors and targets can rotate together without a
-    change in the measurements; None if all parameters are observable, or if something other than this
-    rotation is unobservable.
+    change in the measurements. It is None if all parameters are observable, or if something other than
+    this rotation is unobservable.
     """
 
     rank: int
@@ -95,7 +95,7 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
 
     Args:
         scene: known properties of the sensors.
-        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+        measured: (runs, targets, sensors, 2), in rad, NaN if the target is not seen.
         start: (runs, n), starting point of the search; by default, the intersections of the rays.
     """
     _check(scene, measured)
@@ -110,7 +110,7 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
 
     Args:
         scene: known properties of the sensors.
-        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+        measured: (runs, targets, sensors, 2), in rad, NaN if the target is not seen.
 
     Returns:
         (runs, n).
@@ -124,7 +124,7 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
 def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
     """Compute the start as printed, (21)-(23), for the first two sensors, with zero nominal attitudes.
 
-    The paper writes z, x, y for x, y, z. The start depends on the difference of two azimuths: if
+    The paper writes z, x, y for x, y, z. The start depends on the difference between two azimuths: if
     sensors and targets are nearly in one vertical plane, as in the paper's three-sensor scenes, the
     start is too inaccurate. The function is meant for experiments.
 
@@ -151,7 +151,7 @@ def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearizati
 
     Args:
         scene: known properties of the sensors.
-        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+        measured: (runs, targets, sensors, 2), in rad, NaN if the target is not seen.
         parameters: (runs, n).
     """
     runs, targets, sensors, _ = measured.shape
@@ -206,7 +206,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """Find the axis about which all sensors rotate along the direction `unseen`; None if they differ."""
+    """Find the axis about which the change `unseen` rotates all sensors; None if axes differ."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
@@ -221,10 +221,10 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 
 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
-    """Compute the CRLB sigmas of all biases for the case that one of the unknown biases is known.
+    """Compute the CRLB sigmas of all biases as if one bias were known, for each unknown bias in turn.
 
-    If a row has infinite or large values, it is not useful to know its bias, because the other biases
-    are still unobservable.
+    If a row has infinite or large values, knowing its bias does not help, because the other biases are
+    still unobservable.
 
     Args:
         scene: known properties of the sensors.

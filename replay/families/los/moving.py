@@ -3,10 +3,10 @@
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014
 (`fuselog.recorders.families.los.models`), but targets and sensors move, and the sensors are not
 synchronised. A message states the pose of its sensor, with a stamp by the sensor's own clock. If this
-clock is ahead by c, the sensor sees the targets at the time c before the stamp:
-    (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clock offsets can be estimated together with the state, see
-`fuselog.replay.inference.model.augmentation`; with `estimate_drift` they are random walks.
+clock is ahead by c, the sensor sees the targets at the time c before the stamp: (azimuth, elevation) =
+angles of R(bias) R(pose)' (target(t - c) - place). Biases and clock offsets can be estimated together
+with the state (see `fuselog.replay.inference.model.augmentation`); with `estimate_drift`, they are
+random walks.
 """
 
 from typing import Any
@@ -83,8 +83,8 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """Compute the variances that white accelerations add.
 
-    Covariances between the components are left out. They hardly matter, because in a step of a
-    fraction of a second the noise of positions is a few millimetres, and the lower triangle for 23
+    Covariances between the components are left out. These correlations hardly matter, because the noise
+    of positions is a few millimetres in a step of a fraction of a second, and the lower triangle for 23
     components takes minutes to compile.
     """
     place, _, speed = noise_moments(parameters.acceleration_density**2, duration_s)
@@ -108,7 +108,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Compute azimuth and elevation of a target in rad; `reference` is its number and the pose."""
+    """Compute azimuth and elevation of a target in rad; `reference` has its number, and a pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (

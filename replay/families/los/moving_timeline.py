@@ -96,7 +96,7 @@ def _tracks(scene: Scene, case: str) -> Iterator[Track]:
 
 
 def _targets(components: Sequence[str]) -> list[str]:
-    """Return the names of targets whose positions are among the components, such as target_1."""
+    """Return the names of targets, such as target_1, whose positions are among the components."""
     names = [name.removesuffix("_x_m") for name in components if name.endswith("_x_m")]
     return [name for name in names if {f"{name}_{axis}_m" for axis in AXES} <= set(components)]
 
@@ -133,7 +133,7 @@ def _draw_sensor(canvas: Canvas, root: str, stream: Stream, length_m: float) -> 
 
 
 def _draw_close(canvas: Canvas, scene: Scene, case: str, target: str) -> list[rrb.Spatial3DView]:
-    """Draw the errors of a target, with ellipsoids, around its true position, if there are errors."""
+    """Draw a target's errors and their ellipsoids around its true position, if there are errors."""
     found = [each for each in scene.errors_of(case) if target in _targets(each.components)]
     if not found:
         return []

@@ -53,7 +53,7 @@ class Sensor(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Ellipsoids of an estimator's targets; each stamp has `at_once` of them."""
+    """Ellipsoids of an estimator's targets; each stamp has `at_once` ellipsoids."""
 
     estimator: str
     colour: Colour

@@ -1,10 +1,10 @@
 """Cooperative localization of robots that share position estimates when they see each other.
 
 Every robot integrates its odometry; the anchors also use the mapped landmarks. When a robot sees
-another, each of the two uses the sighting as a measurement of its own pose that depends on the other's
-estimate, either as if the estimates were independent (naive) or by covariance intersection (Jin, Lee,
-Hashimoto, DIND networks, 4.2 and 5.2; the noise of the sensor is independent). The joint filter keeps
-all correlations, as a central node could.
+another, each of the two updates its own pose with the sighting and the other's estimate, either as if
+the estimates were independent (naive) or by covariance intersection (Jin, Lee, Hashimoto, DIND networks,
+4.2 and 5.2; the noise of the sensor is independent). The joint filter keeps all correlations, as a
+central node could.
 """
 
 import copy
@@ -56,8 +56,8 @@ class CooperativeParameters(Parameters):
     Noise that is not set is read from the channels.
 
     Attributes:
-        mode: fusion of sightings: none (alone), as if they were independent (naive), by covariance
-            intersection (ci), or in one filter for all robots (joint).
+        mode: how sightings are fused: not at all (alone), as if estimates were independent (naive), by
+            covariance intersection (ci), or in one filter for all robots (joint).
         criterion: quantity that covariance intersection minimizes: the trace of a pose's covariance, in
             m^2 + rad^2, or its determinant.
         anchors: numbers of the robots that know the map.
@@ -120,8 +120,8 @@ Cooperating = Given[CooperativeParameters]
 def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
     """Return the settings and the initial state: the priors of all robots, and the maps.
 
-    A robot whose prior cannot be used does not take part, and the other robots do not use it. Raises
-    BadInput if no robot has a usable prior, or if the map is not planar.
+    A robot whose prior cannot be used does not take part, and other robots do not use its estimates.
+    Raises BadInput if no robot has a usable prior, or if the map is not planar.
     """
     prefixes, _ = given.setup
     priors = [_prior(given[f"{prefix}/prior"]) for prefix in prefixes]
@@ -195,7 +195,7 @@ def advance(
 def _events(
     block: Block, state: CooperativeState, prefixes: Sequence[str], mode: Mode, settings: RobotSettings
 ) -> RobotEvents:
-    """Return the events of a block as columns; estimates of a robot are due at its odometry messages."""
+    """Return the events of a block as columns; a robot's estimate is due at its odometry messages."""
     order, is_able = block.events, state.reasons == ""
     value = np.stack(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
@@ -228,7 +228,7 @@ def _number(prefix: str) -> int:
 
 
 def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
-    """Return the prefixes of the robots that have all required topics, in order of number."""
+    """Return the prefixes of the robots that have all required topics, sorted by number."""
     leaves = {
         "odometry": schemas.ODOMETRY,
         "range_bearing": schemas.RANGE_BEARING,
@@ -241,7 +241,7 @@ def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
 def _find(
     name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters
 ) -> Iterator[Binding]:
-    """Yield one filter for all robots; raise BadInput if an anchor is not among them."""
+    """Yield one filter for all robots; raise BadInput if an anchor is not one of the robots."""
     prefixes = _robots(topics)
     if len(prefixes) < 2 or "/landmarks" not in topics:
         return

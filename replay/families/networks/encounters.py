@@ -1,4 +1,4 @@
-"""Prediction of robots by odometry, and fusion of their estimates when they see each other."""
+"""Prediction of robots by odometry, and fusion of two robots' estimates when they see each other."""
 
 from typing import NamedTuple
 
@@ -20,8 +20,8 @@ from fuselog.replay.tracing.functions import traced
 class RobotStates(NamedTuple):
     """States of the robots between blocks, by run; `failure` is an error code of `gaussian`.
 
-    The mean (3 n,) and covariance (3 n, 3 n) are those of all n robots. Only the joint filter has
-    covariances between robots.
+    The mean (3 n,) and covariance (3 n, 3 n) cover all n robots. Only the joint filter has covariances
+    between robots.
     """
 
     mean: Floats
@@ -78,7 +78,7 @@ class RobotInputs(NamedTuple):
 
 
 class RobotResults(NamedTuple):
-    """Poses (m, 3) of robots and covariances (m, 3, 3) after the events; NaN if not requested."""
+    """Poses (m, 3) of robots and covariances (m, 3, 3) after the events; NaN if `is_due` is false."""
 
     mean: Floats
     covariance: Floats
@@ -130,13 +130,12 @@ linear_sight = derivative(
 def advance(
     carried: RobotStates, run: int, robot: int, time_ns: int, density: Floats, work: RobotMemory
 ) -> None:
-    """Predict one robot, with its correlations, to a given time by its odometry.
+    """Predict one robot and its correlations to a given time, using the robot's odometry.
 
     Args:
         carried: the robots of all runs, changed in place.
         run, robot: the run and the robot.
-        time_ns: time to predict to; if the robot's state is not older than this, the state is not
-            changed.
+        time_ns: time to predict to; if the robot's state is at least as new, it is not changed.
         density: densities of the odometry's noise, forward and turn, (2,).
         work: scratch memory.
     """
@@ -165,7 +164,7 @@ def advance(
 
 
 def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
-    """Compute the exactly symmetric matrix rows P rows' for the block P (3, 3) of one robot.
+    """Compute `rows` P `rows`', exactly symmetric, for the block P (3, 3) of one robot.
 
     Args:
         covariance: (3 n, 3 n) of all robots.
@@ -301,7 +300,7 @@ def cooperate(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Predict the robots of an event to its time and process the event, unless the state is newer."""
+    """Predict the robots of an event to its time and process it, unless the sender's state is newer."""
     events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)
@@ -340,7 +339,7 @@ def write_pose(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Write the pose of the robot of an event, if it is due."""
+    """Write the pose of the robot that sent an event, if the pose is due."""
     if inputs.events.is_due[event]:
         first = 3 * inputs.events.robots[event, 0]
         mean, covariance = carried.mean[run], carried.covariance[run]

@@ -111,15 +111,15 @@ def one_of(estimates: Estimate, i: int) -> Estimate:
 
 
 def steps_for(tolerance: float) -> int:
-    """Count golden-section steps until the interval is a tenth of the square root of the tolerance."""
+    """Return how many golden-section steps shrink the interval to a tenth of sqrt(tolerance)."""
     return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
 
 
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
     """Return the next position in (0, 1) of a golden-section search for a minimum.
 
-    The last step returns the middle of the remaining interval. In this form, the function to minimize is
-    called in only one place and is compiled once.
+    The last step returns the middle of the remaining interval. Because of this form, the function to
+    minimize is called in only one place and is compiled once.
 
     Args:
         step, steps: number of this step, from 0, and number of all steps.

@@ -59,12 +59,12 @@ class NetworkParameters(Parameters):
 
     Attributes:
         rule: the fusion rule; "alone" does not fuse, "centralised" is one filter with all sensors and no
-            links, and "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses
+            links, and "own-again" is a deliberate mistake: a node fuses its own estimate and then uses
             its measurement again.
         tolerance: tolerance of the optimization of weights.
         send_interval_s: shortest time between two messages of a node.
-        send_divergence: a node sends again if the Kullback-Leibler divergence between its estimate and
-            its last message reaches this value, in nats.
+        send_divergence: a node sends again if the Kullback-Leibler divergence of its estimate from the
+            prediction of its last message reaches this value, in nats.
         gate_probability: a received estimate is fused if it agrees with the node's own; consistent
             estimates with any correlation pass this gate with at least this probability.
         liar: number of the node that sends false estimates.

@@ -55,10 +55,11 @@ class Sensing(NamedTuple):
 class NodeFusion(NamedTuple):
     """Number of the rule in `covariance_intersection.RULES`, and conditions for sending and accepting.
 
-    If `own_first`, a node fuses its own x* instead of its prediction. A node sends a message if it
-    differs by at least `divergence` nats from its last message, which must be at least `interval_ns`
-    old. `gate` is the largest squared distance between a prediction and a received estimate; it is
-    infinite if all are accepted. `faulty_node` is an index, or -1 if there is none.
+    If `own_first`, a node fuses its own x* instead of its prediction. A node sends a message if its
+    estimate differs by at least `divergence` nats from the prediction of its last message, which must be
+    at least `interval_ns` old. `gate` is the largest squared distance between a prediction and a
+    received estimate; it is infinite if all estimates are accepted. `faulty_node` is an index, or -1 if
+    no node is faulty.
     """
 
     rule: int
@@ -95,8 +96,8 @@ class Nodes(NamedTuple):
     Attributes:
         time_ns: stamps of the estimates, (nodes,).
         mean, covariance: (nodes, n), (nodes, n, n).
-        last_ns, last_mean, last_covariance: stamp, mean and covariance of each node's last message;
-            stamp -1 if there is none.
+        last_ns, last_mean, last_covariance: stamp, mean and covariance of each node's last message; the
+            stamp is -1 before the first message.
     """
 
     time_ns: Integers
@@ -215,7 +216,7 @@ def observe_all(
 
 
 def squared_distance(difference: Floats, covariance: Floats) -> float:
-    """Compute the squared Mahalanobis distance; infinity if the covariance is singular.
+    """Compute the squared Mahalanobis distance, or infinity if the covariance is singular.
 
     Args:
         difference, covariance: (n,), (n, n).
@@ -249,7 +250,7 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
 
 
 def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
-    """Test whether two estimates, with any correlation, agree sufficiently to be of the same state.
+    """Test whether two estimates, with any correlation, agree well enough to describe the same state.
 
     The covariance of the difference is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
 
@@ -371,7 +372,7 @@ def is_due(
 def receive(
     activity: int, inputs: NodeInputs, nodes: Nodes, parts: Estimate, results: NodeResults
 ) -> int:
-    """Collect the estimates to fuse, the node's own first, at the current time; return their number."""
+    """Collect estimates to fuse at the current time, the node's own first; return their number."""
     activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
     first, end = activities.received[activity], activities.received[activity + 1]

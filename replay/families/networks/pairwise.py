@@ -76,7 +76,7 @@ def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
 
 
 def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> float:
-    """Fuse two estimates with a weight; return the trace, infinite if they cannot be fused."""
+    """Fuse two estimates with a weight; return the trace, or infinity if they cannot be fused."""
     is_fused = mix_split(weight, pair, fused) if is_split else mix_inverse(weight, pair, fused)
     if not is_fused:
         return np.inf
@@ -105,8 +105,8 @@ class Stake(NamedTuple):
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
     """Find the best weight w for a sighting, which measures part of a state and uses another estimate.
 
-    One part of the measurement's noise has an unknown correlation with the state; the other part, that
-    of the sensor, is independent. The fusion uses P / w and the noise shared / (1 - w) + own, where w
+    One part of the measurement's noise has an unknown correlation with the state; the other part, the
+    sensor's noise, is independent. The fusion uses P / w and the noise shared / (1 - w) + own, where w
     minimizes the trace (which depends on the units of the state) or the determinant (which does not).
     The weight is above 0, because 0 would discard all components that the measurement does not observe.
 

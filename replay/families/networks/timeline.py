@@ -77,7 +77,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Draw the NEES plots of one node, titled by its name."""
+    """Draw the NEES plots of one node, with its name as the title."""
     views = draw_nees(canvas, scene, case, legend=False)
     for view in views:
         view.name = f"{case}: {view.name}"
@@ -212,7 +212,7 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
 
 
 def _line_of(sent: Stream) -> str:
-    """Summarize, in one line of text, the messages that are sent at one time."""
+    """Summarize, in one line of text, the messages that are sent at the same time."""
     ways = [f"{a}>{b}" for a, b in zip(sent["sender_id"], sent["receiver_id"], strict=True)]
     late_s = (sent["arrival_time_ns"] - sent.publish_time_ns) * 1e-9
     parts = [f"{len(sent)} messages sent"]

@@ -1,9 +1,9 @@
 """Models that locate tags from ranges to anchors with known positions, as with ultra-wideband radios.
 
 `ranging-pose` uses several tags on a body in the plane and also estimates the body's heading;
-`ranging-position` uses one tag. Velocities are random walks. In addition to white noise, ranges have a
-bias, `bias_range_m`; an error of each anchor, or of each pair of anchor and tag, that lasts for seconds;
-and outliers if the line of sight is blocked. All three are options, see
+`ranging-position` uses one tag. Velocities are random walks. Besides white noise, the models include
+three other errors of ranges: a bias (`bias_range_m`), an error of each anchor or anchor-tag pair that
+lasts for seconds, and outliers when the line of sight is blocked. All three are options, see
 `fuselog.replay.inference.model.augmentation` and `fuselog.replay.inference.linear_algebra.inflation`.
 """
 
@@ -41,9 +41,9 @@ class RangingParameters(ModelParameters):
         bias_range_m: bias of ranges: measured minus true.
         height_m: height at which the tag moves.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
-        start_s: length of the span of first ranges from which the initial state is found.
-        start_reach_m: distance of the starting points of the search from the anchors' centre, on all
-            sides.
+        start_s: duration of the initial span of ranges, from which the initial state is found.
+        start_reach_m: distance from the anchors' centre to the positions, on all sides of it, at which
+            the search starts.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
     """
@@ -145,7 +145,7 @@ def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the pose at rest that best fits the first ranges, by searches from several headings.
+    """Find the pose, assumed at rest, that best fits the first ranges; start from several headings.
 
     Args:
         streams: `ranges`, the map of anchors, and the tags.
@@ -178,10 +178,10 @@ def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
 def first_ranges(
     streams: Mapping[str, Stream], parameters: Any, least: int
 ) -> tuple[int, Floats, Floats, Floats]:
-    """Find the first span of `start_s` with `least` pairs of anchor and tag, and at least three anchors.
+    """Find the first span of length `start_s` with at least three anchors and `least` anchor-tag pairs.
 
-    Returns the stamp of the first range, the ranges (n,), their anchors (n, 3) and their tags (n, 3),
-    which are zeros for a model without tags. Raises BadInput if there is no such span.
+    Returns the stamp of the first range, the ranges (n,), their anchors (n, 3) and their tags (n, 3).
+    The tags are zeros for a model without tags. Raises BadInput if there is no such span.
     """
     stream = streams["ranges"]
     time_ns, pairs = stream.publish_time_ns, np.stack([stream["anchor_id"], stream["tag_id"]], axis=1)
@@ -209,7 +209,7 @@ def first_ranges(
 
 
 def places(points: Stream | None, asked: Map) -> dict[int, Floats]:
-    """Return the positions (3,) of a map by number."""
+    """Return the position (3,) of each point of a map, by the point's number."""
     if points is None:
         return {}
     return dict(zip(points[asked.number].tolist(), points[asked.point], strict=True))

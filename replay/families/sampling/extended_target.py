@@ -1,9 +1,9 @@
 """Model of an extended target: a random walk, measured with multiplicative noise.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
-VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012.
-The filters treat the scales h, which are uniform, as Gaussian; they therefore use E h^4 = 1/3 instead
-of 1/5.
+VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The
+scales h are uniformly distributed. The filters treat them as Gaussian, and therefore use E h^4 = 1/3
+instead of 1/5.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ class ExtendedTargetParameters(ModelParameters):
     """Variances added per step, and the variance of a measured point.
 
     Attributes:
-        size_drift_m2: variance that a step adds to each half side.
+        size_drift_m2: variance that a step adds to each half side length.
         position_drift_m2: variance that a step adds to the position, per axis.
         point_variance_m2: variance of a measured point, per axis.
     """
@@ -48,7 +48,7 @@ def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
 
 
 def measure(target: Components, noise: Components, reference: Any, parameters: Any) -> Components:
-    """Compute a point of the surface with noise in both scales and in the point, and its squares."""
+    """Compute a noisy point from two noisy scales, and append the squares of its coordinates."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
 
@@ -115,9 +115,9 @@ def moments(
 def scatter(
     mean: Floats, covariance: Floats, axis: int, point_variance_m2: float
 ) -> tuple[float, float, float]:
-    """Compute the means of v, 2cv and 2v^2 + 4c^2 v over the state for one axis; see `moments`.
+    """Compute the means of v, 2cv and 2v^2 + 4c^2 v for one axis, over the state; see `moments`.
 
-    They are the means of Var m, Cov(m, m^2) and Var m^2 given the state.
+    These three quantities are Var m, Cov(m, m^2) and Var m^2 given the state.
 
     Args:
         mean, covariance: (4,), (4, 4).

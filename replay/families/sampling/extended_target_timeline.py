@@ -25,7 +25,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw the plane next to consistency and errors; sizes are in a separate tab."""
+    """Draw the plane next to plots of consistency and errors; plots of sizes are in a separate tab."""
     turn_up(canvas)
     shown = [np.empty((0, 2))]
     points = f"{ROOT}/points"

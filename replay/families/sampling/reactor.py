@@ -50,7 +50,8 @@ def moments(
 ) -> None:
     """Predict mean and covariance exactly.
 
-    x' = x + g a^2 with a Gaussian: E a^2 = m^2 + P, Var a^2 = 2 P^2 + 4 m^2 P, Cov(x, a^2) = 2 m P_xa.
+    x' = x + g a^2, where a is Gaussian: E a^2 = m^2 + P, Var a^2 = 2 P^2 + 4 m^2 P, Cov(x, a^2) = 2 m
+    P_xa.
 
     Args:
         mean, covariance: (2,) and (2, 2), of both partial pressures, changed in place.

@@ -1,13 +1,14 @@
 """Filter of guaranteed position sets, which are moved by odometry and cut by every frame of bearings.
 
 Briechle, Hanebeck (2004) derive the set of one frame of relative bearings, see `set_membership`; the
-recursion that moves and intersects sets is that of Schweppe, Recursive State Estimation: Unknown but
-Bounded Errors and System Inputs (1968). The error of odometry is bounded over a span, not per second,
-because a delayed start of the robot, for example, adds its error only once. Each frame therefore also
-cuts the set at an earlier stamp, the anchor, and the current set is moved from the anchor in one step.
+recursion that moves and intersects sets is from Schweppe, Recursive State Estimation: Unknown but
+Bounded Errors and System Inputs (1968). The error of odometry is bounded over a span of time instead of
+per second: a delayed start of the robot, for example, adds its error only once. Each frame therefore
+also cuts the set at an earlier stamp, which is called the anchor. The current set is moved from the
+anchor in one step.
 
-If a frame contradicts the set before it, both sets are kept; if only one of the two is wrong, the other
-contains the robot. Their union is the estimate until later frames have emptied one of them.
+If a frame contradicts the previous set, the sets of both are kept; if only one of the two is wrong, the
+other one contains the robot. Their union is the estimate until later frames have emptied one of them.
 """
 
 from __future__ import annotations
@@ -80,9 +81,9 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 class SetFilterParameters(SetParameters):
     """Bounds of the errors; missing bounds are read from the channels.
 
-    Over a span of T s, relative to the pose at its start, the position of the odometry has an error of
-    at most `position_error_m` + T `position_error_mps`, and its heading of at most `heading_error_rad` +
-    T `heading_error_radps`.
+    Consider a span of T s, and the robot's pose at its start. Relative to this pose, the position of the
+    odometry has an error of at most `position_error_m` + T `position_error_mps`, and its heading of at
+    most `heading_error_rad` + T `heading_error_radps`.
 
     Attributes:
         bearing_bound_rad: bound of the error of single bearings, which determine the heading;
@@ -92,8 +93,8 @@ class SetFilterParameters(SetParameters):
         heading_error_rad: constant part of the bound of the odometry's heading error.
         heading_error_radps: increase of the bound of the odometry's heading error per second.
         anchor_s: time after which the current set becomes the new anchor, from which motion is measured.
-        most_edges: number of edges above which a part of a set is replaced by a larger one of the form
-            L = 8.
+        most_edges: number of edges above which a part of a set is enclosed in a pseudo-ellipsoid with L
+            = 8, which replaces it.
     """
 
     least_landmarks: Annotated[int, Field(ge=2)] = 2
@@ -113,9 +114,9 @@ class SetStep(NamedTuple):
         time_ns: stamp of the frame.
         anchor_ns: stamp of the set that was moved to this frame; the frame's own stamp if no set was
             moved.
-        parts: the set; if a frame contradicts it, also the set of that frame.
+        parts: the set; if a frame contradicts the moved set, also the set of that frame.
         headings: interval of the heading.
-        growth: factor by which the form L = 8 enlarged the set.
+        growth: factor by which the enclosing pseudo-ellipsoid with L = 8 enlarged the set.
         finding: index in FINDINGS of the finding at this frame; None if there is none.
         blamed: the index of the wrong relative bearing, if any.
     """
@@ -157,7 +158,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """Narrow headings to those that agree with the bearings of landmarks; None if no heading agrees."""
+    """Narrow headings to those that agree with the bearings of landmarks; if none agree, return None."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:
@@ -205,7 +206,7 @@ def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) 
 def _advance(
     anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> SetStep:
-    """Move the set of an anchor to a frame, and cut the set and the anchor by the frame."""
+    """Move an anchor's set to a frame, and cut both sets by the positions that the frame allows."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
     motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
     past = [moved(part, anchor.headings, motion) for part in anchor.parts]
@@ -230,7 +231,7 @@ def _advance(
 def _cut(
     anchor: Anchor, step: SetStep, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
 ) -> SetStep | None:
-    """Cut the step and its anchor by a frame; return None, without a change, if the cut is empty."""
+    """Cut the step and its anchor by a frame; if nothing is left of a set, return None."""
     common = shapely.union_all(step.parts).intersection(cut)
     if common.area == 0.0:
         return None
@@ -254,7 +255,7 @@ def _cut(
 
 
 def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
-    """Find the relative bearing with the greatest excess, at the best-fitting corner of a set."""
+    """Find the relative bearing that is violated most at the best-fitting corner of a set."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None

@@ -1,4 +1,4 @@
-"""Guaranteed position sets from bounded relative bearings, one for each frame of equal stamps.
+"""Guaranteed position sets from bounded relative bearings, one set for each stamp of bearings.
 
 Briechle, Hanebeck (2004). The estimate is a set: the exact one, its tightest box, or a
 pseudo-ellipsoid with L = 4 or L = 8. An empty set is a fault: the relative bearing that is probably
@@ -46,7 +46,7 @@ class SetParameters(Parameters):
         sweeps: number of times that pseudo-ellipsoids fuse all pairs.
         least_landmarks: smallest number of landmarks at one stamp for which a set is computed.
         arena_m: rectangle that certainly contains the robot (low x, low y, high x, high y).
-        maximum_range_m: without an arena, the greatest distance of a robot from a landmark that it
+        maximum_range_m: if no arena is given, the greatest distance of a robot from a landmark that it
             sees; by default, the longest range that its sensor measured.
     """
 
@@ -60,7 +60,7 @@ class SetParameters(Parameters):
 
 
 def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floats]:
-    """Compute the border of the chosen set of one frame; no polygons if the set is empty."""
+    """Compute the border of the chosen set of one frame, as a list of polygons; it may be empty."""
     if parameters.shape in ("l4", "l8"):
         order: Literal[4, 8] = 4 if parameters.shape == "l4" else 8
         try:
@@ -155,7 +155,7 @@ def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
 
 
 def bearings_in(topics: Mapping[str, Topic], leaves: Sequence[str]) -> Iterator[tuple[str, Topic]]:
-    """Find the prefixes of robots with bearings in a log with landmarks, and a topic for each.
+    """Find the robots with bearings in a log with landmarks; yield each prefix and topic of bearings.
 
     Args:
         topics: topics of the log.
@@ -175,7 +175,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: SetParameters) -> Ite
 
 
 def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
-    """Read bounds and arena from the parameters, or from the metadata of channels if not given."""
+    """Read bounds and arena from the parameters; read missing ones from the metadata of channels."""
     bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
     arena_m: tuple[float, ...] | None = parameters.arena_m
     if arena_m is None and "arena_m" in landmarks.metadata:

@@ -49,7 +49,7 @@ SIZE = schemas.ESTIMATE_SIZE
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw for each robot the plane and the events, next to the areas."""
+    """Draw, for each robot, the plane and a list of events next to plots of the areas."""
     turn_up(canvas)
     landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
     if landmarks is not None:
@@ -88,7 +88,7 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
 
 
 def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list[str]:
-    """Draw the positions that each single bearing and its bound allow; return the entity, if any.
+    """Draw the positions that each single bearing and its bound allow; return the entities drawn.
 
     The channel of a set states the topic with the bearings, and the bounds.
     """

@@ -1,8 +1,8 @@
 """Timeline of vessels: a map and the tangent plane, with reports coloured by track.
 
 Map tiles are loaded from the network; offline, the reports are still drawn at their positions. Next to
-the map are the numbers of live tracks and vessels, and the share of each vessel's reports in its own
-track.
+the map are the numbers of live tracks and vessels, and a table of the share of each vessel's reports
+that are in its own track.
 """
 
 import numpy as np
@@ -94,7 +94,7 @@ def _send_curve(canvas: Canvas, entity: str, time_ns: Times, values: NDArray) ->
 
 
 def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.TextDocumentView:
-    """List vessels with the shares of their reports in their own tracks, most reports first."""
+    """List the share of each vessel's reports in its own track, sorted by decreasing report count."""
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(reports_of(output)):

@@ -55,7 +55,8 @@ class PhdParameters(Parameters):
     Attributes:
         sensor: the sensor to use, such as `network`; by default each sensor has its own filter.
         sigma_m: standard deviation of a detection, per axis.
-        variance_m2: variance of a detection, an older form of `sigma_m` that the next release removes.
+        variance_m2: variance of a detection; an older alternative to `sigma_m`, to be removed in the
+            next release.
         detection_probability: probability that a scan detects a target.
         clutter_per_m2: mean number of false detections in a scan, per area.
         survival_probability: probability that a target is still present at the next scan.
@@ -63,8 +64,8 @@ class PhdParameters(Parameters):
         birth_sigma_mps: standard deviation of a new target's velocity, per axis.
         acceleration_sigma_mps2: standard deviation of the acceleration between two scans, per axis.
         gate_probability: probability that the detection of a component is inside its gate.
-        prune_weight: weight up to which a component is dropped.
-        merge_squared: squared Mahalanobis distance up to which components are merged.
+        prune_weight: components with at most this weight are dropped.
+        merge_squared: components are merged if their squared Mahalanobis distance is at most this value.
         most_components: greatest number of components that are kept.
     """
 
@@ -153,7 +154,7 @@ def _work(most: int, detections: int) -> PhdMemory:
 
 
 def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
-    """Make empty sets with room for twice the greatest possible weight after each scan."""
+    """Make empty sets, with room after each scan for twice the greatest possible total weight."""
     count = len(scans.time_ns)
     bound = np.empty(count)
     passed = (1.0 - settings.detection_probability) * settings.survival_probability
@@ -243,7 +244,7 @@ def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
 
 
 def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Iterator[Binding]:
-    """Bind a filter to every sensor with scans and detections, and to the priors in its frame."""
+    """Bind a filter to every sensor with scans and detections; use the priors in the sensor's frame."""
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
         found["prior"].name: found["prior"]

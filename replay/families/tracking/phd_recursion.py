@@ -162,13 +162,13 @@ def add_detected(
     work: PhdMemory,
     end: int,
 ) -> int:
-    """Append all components as updated with one detection, and a birth; return the new end.
+    """Append components in the gate, updated with one detection, and a birth; return the new number.
 
     Args:
         run: index of the run.
         parents: number of components before the scan.
         place: position of the detection, (2,), in m.
-        mixture: the predicted mixture, with weights before survival.
+        mixture: the predicted mixture, with weights that do not yet include survival.
         settings: settings of the filter.
         work: memory that `prepare` filled for each component; components are appended to it.
         end: number of components in the memory.
@@ -243,8 +243,8 @@ def squared_distance(work: PhdMemory, member: int, other: int) -> float:
 def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
     """Merge components around the heaviest remaining one, repeatedly; return the number of groups.
 
-    Each merged component replaces the heaviest of its group; `heaviest` lists their indices. Returns -1
-    if a covariance is not positive definite.
+    Each merged component replaces the heaviest of its group; `heaviest` lists the indices of these
+    components. Returns -1 if a covariance is not positive definite.
     """
     for component in range(count):
         work.is_merged[component] = False
@@ -343,7 +343,7 @@ def process(
 def extract(
     run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
 ) -> int:
-    """Fill the set of a scan; a component's number of targets is its rounded weight."""
+    """Fill the set of a scan; the number of targets at a component is its rounded weight."""
     row = sets.room[scan]
     for component in range(mixture.used[run]):
         weight = mixture.weight[run, component]

@@ -48,8 +48,8 @@ class Tracks(NamedTuple):
         weight: (runs, places, LEVELS).
         interval_s: (runs, places) usual time between reports.
         course_rad, speed_mps: (runs, places), last reported values.
-        held: (runs, places, 2) counts, from 1, of how often a slow vessel repeated or changed its
-            course.
+        held: (runs, places, 2), how often a slow vessel repeated or changed its course; both counts
+            start at 1.
     """
 
     used: Integers
@@ -175,7 +175,7 @@ def mixed(weight: float, settings: ReportSettings) -> float:
 
 
 def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> bool:
-    """Test whether a course repeats the previous one, or both are unavailable."""
+    """Test whether a course repeats the previous one, or whether both courses are unavailable."""
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
     turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
@@ -206,7 +206,7 @@ def birth_density(velocity: Floats, own_variance: float, settings: ReportSetting
 def ratio_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> float:
-    """Compute the ratio of the likelihoods that a report is from a track and from a new vessel."""
+    """Compute how many times more likely a report is from a given track than from a new vessel."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     if duration_s <= 0.0:
         return 0.0

@@ -6,12 +6,12 @@ its predictive density of the report is compared with the same product for new v
 appear anywhere; some are at rest, close to each other in harbours, and the others have any velocity.
 Reports with equal stamps are from different vessels; the most likely pairs are assigned first.
 
-A track has one of several levels of noise, from that of a moored vessel to that of a vessel that turns
-sharply or was silent for a long time. The weights of the levels are updated by Bayes' rule and move
-slightly back towards equal weights with every report. The state is the Gaussian with the moments of the
-mixture, as in the first-order generalised pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 11.6.2). Both axes have the same noise, so three
-numbers are enough for a track's covariance.
+A track has one of several levels of noise: the lowest is for a moored vessel, the highest for a vessel
+that turns sharply or was silent for a long time. The weights of the levels are updated by Bayes' rule
+and move slightly back towards equal weights with every report. The state is the Gaussian with the
+moments of the mixture, as in the first-order generalised pseudo-Bayesian filter (Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 11.6.2). Both axes have the same
+noise, so three numbers are enough for a track's covariance.
 """
 
 from collections.abc import Iterator, Mapping
@@ -49,23 +49,23 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """Assumptions about vessels and receivers, common to all vessels and receivers.
+    """Assumptions about vessels and receivers, the same for all of them.
 
-    Each track has weights for several levels of noise, which are sorted from the smallest.
+    Each track has weights for several levels of noise, in increasing order of the noise.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration by level, in m^2/s^3.
         sigma_position_m: standard deviation of a position by level, per axis, in m.
         sigma_velocity_mps: standard deviation of a velocity by level, per axis, in m/s.
-        forgetting: share by which each report moves the weights of the levels back to equal weights.
+        forgetting: share by which each report moves the weights of the levels towards equal weights.
         births_per_km2_h: number of new vessels per area and time.
         resting_share: share of new vessels that are at rest.
         top_speed_mps: greatest speed of a vessel.
         usual_interval_s: time between reports that is assumed for a new track.
         slow_mps: speed below which a vessel may be at rest; a vessel at rest often repeats its last
             course.
-        course_width_deg: difference up to which a course counts as repeated, which is a sign of a vessel
-            at rest.
+        course_width_deg: greatest difference at which a course counts as repeated, which is a sign of a
+            vessel at rest.
         forget_s: time without a report after which a track ends.
     """
 

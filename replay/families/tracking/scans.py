@@ -16,7 +16,8 @@ from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
 class SensorTopics(NamedTuple):
     """Kinds, topics and frames of a log's sensors.
 
-    `origins` has the topics of the sensors' own positions, empty for a sensor that states none.
+    `origins` has the topics of the sensors' own positions; it is empty for a sensor without a stated
+    position.
     """
 
     kinds: tuple[int, ...]
@@ -71,7 +72,7 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
 
 
 def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
-    """Sort detections by scan; return the order (n,) and the bounds (2, scans) of each scan in it.
+    """Sort detections by scan; return the order (n,), and the bounds of each scan in it (2, scans).
 
     Raises BadInput if two scans of a run have the same number, if a scan does not have the number of
     detections that it states, or if the scan of a detection is missing.
@@ -113,7 +114,7 @@ def _measured(stream: Stream, kind: ScanSensor) -> Floats:
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Find the positions (n, 2) of a sensor at its scans: the last fix, or the first known one."""
+    """Find a sensor's position (n, 2) at each scan: its last fix so far, otherwise the first known."""
     found = np.empty((len(scans), 2))
     places = read_vectors(fixes.stream, "position_m", PLANE)
     for run, before in enumerate(known):

@@ -65,7 +65,7 @@ class Targets(NamedTuple):
     Attributes:
         bound_model: bound model of the targets, with one motion or with all modes.
         parameters: the parameters of the model; NaN for those that are not used.
-        newborn: a target of which only the position is known.
+        newborn: a target whose position is known, but nothing else.
     """
 
     bound_model: BoundModel
@@ -74,7 +74,7 @@ class Targets(NamedTuple):
 
 
 def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
-    """Build the targets from the parameters of a tracker, or from channels for missing parameters.
+    """Build the targets from the parameters of a tracker; read missing parameters from channels.
 
     Raises BadInput, with a message that begins with `where`, if the model cannot describe a target or if
     a parameter is missing.
@@ -139,7 +139,7 @@ def _bound_model_of(where: str, model: Model, mode: str | None) -> BoundModel:
 
 
 def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats]:
-    """Return mean (n,) and sigmas (t,) of a target of which only the position is known."""
+    """Return mean (n,) and sigmas (t,) of a target whose position is known, but nothing else."""
     mean, sigma = unknown(model.state, model.start)
     for row, (name, _) in enumerate(tangent_components(list(model.state), model.kinds)):
         if name in POSITION:

@@ -1,10 +1,10 @@
-"""Timeline of multi-target tracking: the scans of each sensor, and the tracks in their own colours.
+"""Timeline of multi-target tracking: the scans of each sensor, and each track in its own colour.
 
 The map has x east and y north. Detections stay visible until the sensor's next scan, so an empty scan
 clears them; bearings are rays from the sensor's position. Lines connect a track to its associated
 detections of positions; less probable associations are fainter. Next to the map are GOSPA, the number of
-tracks and their probabilities of existence. Below the map are events: a track is confirmed or ends, or a
-target switches to another track.
+tracks and their probabilities of existence. Below the map are the events: when a track is confirmed or
+ends, and when a target switches to another track.
 """
 
 from collections.abc import Iterator, Mapping
@@ -55,7 +55,7 @@ SCANS = "scans"
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Draw, for each tracker, a map with all sensors in a tab, next to plots of all trackers."""
+    """Draw a map with all sensors for each tracker, in tabs, next to plots of all trackers."""
     turn_up(canvas)
     ground, paths, places = f"{ROOT}/ground", [], []
     for topic, place, stroke in _ways(scene):
@@ -181,7 +181,7 @@ def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) 
 
 
 class Joined(NamedTuple):
-    """Detections of a sensor as trackers use them: row of the scan, and relative position."""
+    """Detections of a sensor in the form that trackers use: rows of scans, and relative positions."""
 
     scan: Integers
     place: Floats
@@ -212,7 +212,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
 
 
 def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np.bool_]]:
-    """Find the positions (n, 2) of associated tracks at the time, and whether each is known."""
+    """Find the positions (n, 2) of associated tracks at a given time, and whether each is known."""
     keys = [
         np.stack([stream.publish_time_ns, stream["track_id"].astype(np.int64)], axis=1)
         for stream in (tracks, associations)
@@ -248,7 +248,7 @@ def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happe
 
 
 def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers, dict[str, TrackErrors]]:
-    """Compute each tracker's errors at the judged instants; return no errors without scans or truths."""
+    """Compute each tracker's errors at the judged instants; without scans or truths, there are none."""
     try:
         judged = instants_of(scene.source)
     except BadInput:

@@ -35,8 +35,8 @@ def track_outputs(
 ) -> list[Ragged]:
     """Make the output streams of the tracker `name` for these scans.
 
-    `repeated` is the number of scans after an out-of-sequence scan that were processed again; `scans`
-    then has only the last of them.
+    `repeated` is the number of scans that were processed again after an out-of-sequence scan; if it is
+    not zero, `scans` contains only the last of these scans.
     """
     topic = f"/estimates/{name}"
     return [
@@ -151,7 +151,7 @@ def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) ->
 def _innovations(
     topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
-    """Yield, by sensor, the innovations of confirmed tracks with their most likely detections."""
+    """Yield, by sensor, the innovations of each confirmed track with its most likely detection."""
     ends = tracked.end[:, 1]
     pair, probability = _filled(tracked.pair, ends), _filled(tracked.associated, ends)
     white, factor = _filled(tracked.white, ends), _filled(tracked.factor, ends)

@@ -12,7 +12,7 @@ from fuselog.replay.families.tracking.targets import Targets
 
 
 def check_smoothing(name: str, targets: Targets, errors: Sequence[str]) -> None:
-    """Raise BadInput if tracks cannot be smoothed because of several motions or sensor errors.
+    """Raise BadInput if tracks have sensor errors, or if their model has no single linear motion.
 
     Args:
         name: name of the estimator.

@@ -70,19 +70,19 @@ class TrackerParameters(Parameters):
     applies to all sensors.
 
     A detection begins a track if it is outside all gates and far enough from all confirmed tracks. With
-    `undetected_per_m2`, any detection that may be the first of a target begins a track; the probability
-    of this is the existence of the track. `management` selects the method of confirmation: "existence"
-    uses the probability that the target exists, "hits" counts detections, and "score" uses the
-    log-likelihood ratio of target and clutter.
+    `undetected_per_m2`, any detection that may be the first of a target begins a track. The existence of
+    this track is the probability that the detection is a first one. `management` selects the method of
+    confirmation: "existence" uses the probability that the target exists, "hits" counts detections, and
+    "score" uses the log-likelihood ratio of target and clutter.
 
-    A registration error is a constant error of all measurements of a sensor, which all tracks estimate
-    together. A correlated error differs between tracks and changes over time. Both are components of the
-    states of tracks.
+    A registration error is a constant error of all measurements of a sensor; it is estimated jointly
+    from all tracks. A correlated error differs between tracks and changes over time. Both are components
+    of the states of tracks.
 
     Attributes:
-        association: method of associating detections with tracks: greedily, the most likely pair first
-            (nearest); by the best assignment (hungarian); or by all joint associations, weighted by
-            their probabilities (jpda, jipda, pmbm).
+        association: method of associating detections with tracks: the most likely pairs first (nearest),
+            the best assignment (hungarian), or all joint associations, weighted by their probabilities
+            (jpda, jipda, pmbm).
         management: method of confirming and ending tracks; by default, existence for jipda and pmbm, and
             hits for the other associations.
         sensors: the sensors to use, such as ["radar", "lidar"]; all by default.
@@ -93,11 +93,11 @@ class TrackerParameters(Parameters):
         acceleration_density: power spectral density of the acceleration of targets without a model, in
             m^2/s^3.
         birth_sigma_mps: standard deviation of a new track's velocity, per axis.
-        birth_distance_m: least distance of a new track from all confirmed tracks.
+        birth_distance_m: distance from all confirmed tracks that a new track must at least have.
         birth_existence: existence of a new track; with hits or score, existence of a track until it is
             confirmed.
         undetected_per_m2: density of targets that were never detected.
-        confirming_existence: with management by existence, smallest existence of a track that is
+        confirming_existence: with management by existence, existence at or above which a track is
             confirmed.
         keeping_existence: existence below which a track is no longer confirmed.
         ending_existence: existence below which a track ends.
@@ -125,14 +125,14 @@ class TrackerParameters(Parameters):
         bias_x_m: bias of measured positions along x, measured minus true.
         bias_y_m: bias of measured positions along y, measured minus true.
         bias_range_m: bias of measured ranges, measured minus true.
-        near_range_m: range up to which detection and clutter are constant; beyond it, they change
-            linearly.
+        near_range_m: range up to which detection and clutter are constant; beyond this range, they
+            change linearly.
         far_range_m: range beyond which detection and clutter are constant again.
         far_detection_probability: probability that a target at `far_range_m` or beyond is detected.
         clutter_per_m2: mean number of false detections in a scan, per area, near the sensor.
         far_clutter_factor: factor on clutter far from the sensor.
-        sector_from_rad: start of a sector with different detection and clutter, anticlockwise from the x
-            axis.
+        sector_from_rad: start of a sector in which detection and clutter differ, anticlockwise from the
+            x axis.
         sector_to_rad: end of the sector, anticlockwise from the x axis.
         sector_detection_factor: factor on the probability of detection in the sector.
         sector_clutter_factor: factor on clutter in the sector.
@@ -145,7 +145,7 @@ class TrackerParameters(Parameters):
         blind_from_rad: start of the sector in which a sensor cannot detect targets, anticlockwise from
             the x axis.
         blind_to_rad: end of the sector, anticlockwise from the x axis.
-        interval_s: least time between two detections of one sensor that update a track.
+        interval_s: minimum time between two detections of a sensor that update the same track.
         registration_sigma_m: standard deviation of the registration error of positions or ranges; 0 for
             no such error.
         registration_sigma_rad: standard deviation of the registration error of bearings; 0 for no such
@@ -216,7 +216,7 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Set defaults of management and existence that suit the association; check given values."""
+        """Set defaults of management and existence that suit the association; check the given values."""
         association = values.get("association", "jipda")
         goes_by_existence = association in EXISTING
         given = values.get("management")
@@ -305,7 +305,7 @@ class TrackerSettings(NamedTuple):
 def settings_of(
     topics: Mapping[str, Topic], found: SensorTopics, parameters: TrackerParameters, targets: Targets
 ) -> TrackerSettings:
-    """Read the settings of sensors and targets from the parameters or, if missing, from the channels."""
+    """Read the settings of sensors and targets from the parameters; read missing ones from channels."""
     names, own = number_fields(TrackerParameters), targets.parameters._asdict()
     kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
     for kind, scan in zip(kinds, found.scans, strict=True):

@@ -62,8 +62,9 @@ class OutOfSequenceState(NamedTuple):
     """State of one run with out-of-sequence scans.
 
     Attributes:
-        base: the tracks after all scans that a late scan can no longer precede.
-        pending: the later scans, in time order.
+        base: the tracks after the settled scans, that is, those before which no late scan can arrive any
+            more.
+        pending: the scans after the settled ones, in time order.
         head: the tracks after all scans.
     """
 
@@ -77,7 +78,8 @@ class TrackerState(NamedTuple):
 
     Attributes:
         fixes: the last sensor positions, by topic and run.
-        tracks: the tracks of all runs after all scans; with out-of-sequence scans, before all scans.
+        tracks: the tracks of all runs after all scans so far; if scans may be out of sequence, the
+            initial tracks.
         late: state of each run with out-of-sequence scans.
         outputs: with smoothing, the outputs to write at the end, by block.
     """
@@ -161,7 +163,7 @@ def _before_all(tracks: Tracks, scans: Scans) -> Iterator[OutOfSequenceState]:
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
-    """Yield rows of scans that can be processed together: scans in time order, or single late scans."""
+    """Yield rows of scans to process together: scans in time order, or a single late scan."""
     known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
     newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
     late = scans.time_ns[first:end] < newest_ns

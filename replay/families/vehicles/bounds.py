@@ -1,7 +1,8 @@
 """Total error of vehicles: exact for the Kalman filter, bounded for methods with more information.
 
 All axes of all vehicles are equal and uncoupled, so one axis is sufficient. The filter assumes random
-accelerations; the truth has random accelerations (stochastic) or none (deterministic).
+accelerations; the truth either has random accelerations (stochastic) or no accelerations
+(deterministic).
 """
 
 from typing import NamedTuple
@@ -17,7 +18,7 @@ SETTLED = 2000
 class Axis(NamedTuple):
     """Squared position errors of one axis, for a truth with random accelerations and for one without.
 
-    `gain` (2,) is the last gain, of position and velocity.
+    `gain` (2,) has the last gains of position and velocity.
     """
 
     stochastic: Floats
@@ -65,7 +66,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """Compute the total errors; the topology measures one combination, a free pose all but three."""
+    """Compute total errors; the sensor measures 1, all but 3, or all combinations (see `Bounds`)."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

@@ -64,7 +64,7 @@ _choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):
-    """Method and random numbers, which depend on `seed` and on the first fixes of the run.
+    """Method, and seed of the random numbers, which also depend on the first fixes of the run.
 
     Attributes:
         method: kind of the particles (set, axes or associations) and their number, as in
@@ -180,7 +180,7 @@ def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: in
 def _generator(
     method: Method, cloud: Cloud, frames: Frames, run: int, number: int
 ) -> np.random.Generator:
-    """Return the generator of a run; if new, make it from the first fixes and sample the states."""
+    """Return a run's generator; if there is none, make it from the first fixes and sample the states."""
     found = cloud.generators[run]
     if found is None:
         seen = frames.network[run, number]

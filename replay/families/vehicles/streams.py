@@ -1,7 +1,7 @@
 """Filters of cooperative vehicles for replay: methods, their topics and their outputs.
 
-The name of a method is `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: the use of the
-fixes, and the use of the infrastructure sensor. A frame contains all messages of a run with the same
+The name of a method is `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how fixes are
+used, and how the infrastructure sensor is used. A frame contains all messages of a run with the same
 stamp. The filter processes frame after frame, for all runs in parallel.
 """
 
@@ -56,9 +56,9 @@ class VehiclesParameters(Parameters):
     """Method and assumptions of the filter.
 
     Attributes:
-        method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: the use of fixes (known, hungarian,
-            set, axes, powers, unscented-powers, products or complex), and that of the roadside sensor
-            (topology, registration or static).
+        method: `FIXES` or `FIXES-SENSOR`, as in hungarian-topology: how fixes are used (known,
+            hungarian, set, axes, powers, unscented-powers, products or complex), and how the roadside
+            sensor is used (topology, registration or static).
         registration_scan: number of the first scan from which the sensor's pose may be estimated.
         sigma_fix_m: standard deviation of each component of a fix without a stated covariance; if it is
             not set, fixes without a covariance are not used.
@@ -311,7 +311,7 @@ def _advance(
 
 
 def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
-    """Predict the joint states by durations (runs,), grouped by equal durations."""
+    """Predict the joint states by durations (runs,); runs with equal durations form one group."""
     for span_ns in np.unique(duration_ns):
         move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
         joint = where(duration_ns == span_ns, joint, move)
@@ -321,7 +321,7 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Yield the estimates of every vehicle and, if estimated, of the sensor's pose, and failures.
+    """Yield the estimates of every vehicle and of the sensor's pose, if it is estimated; yield failures.
 
     Args:
         setup: the bound method.
@@ -343,7 +343,7 @@ def outputs_of(
         return Ragged(stream, np.concatenate([[0], np.cumsum(rows.sum(axis=1))]))
 
     def innovations(vehicle: int) -> Ragged:
-        """Return the innovations of a vehicle; the target is the number of the detection in its scan."""
+        """Return a vehicle's innovations; their target is the number of the detection in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
         is_associated = detection != MISSED
         squared = np.einsum(

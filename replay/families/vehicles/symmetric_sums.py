@@ -3,9 +3,9 @@
 Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992; Leven
 and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement
 equations", IEEE TAC 2009. Numbers m = p + v have independent noise with variance sigma^2. A covariance R
-is never computed, only a factor W with R = W W^H, because the entries of W span ten decades or more and
-those of R twice as many. Complex numbers x + iy, whose parts have the same sigma, preserve the pairs of
-x and y.
+is never computed, only a factor W with R = W W^H, because the entries of W span ten decades or more, and
+the entries of R twice that. Complex numbers x + iy, whose parts have the same sigma, preserve the pairs
+of x and y.
 """
 
 from itertools import combinations

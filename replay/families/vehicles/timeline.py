@@ -145,7 +145,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Plot the NEES of a case, titled by its name."""
+    """Plot the NEES of a case, with the name of the case in the title."""
     views = draw_nees(canvas, scene, case)
     for view in views:
         view.name = f"{case}: {view.name}"
@@ -153,7 +153,7 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
 
 
 def _own(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Plot mode probabilities and effective particles of a case, titled by its name."""
+    """Plot mode probabilities and effective numbers of particles, with the case's name in the titles."""
     views = [*draw_modes(canvas, scene, case), *draw_effective(canvas, scene, case)]
     for view in views:
         view.name = f"{view.name}, {case}"
@@ -315,7 +315,7 @@ def _draw_close(
     canvas.fix(f"{CLOSE}/truth", truth)
 
     def near(points: Points) -> Points:
-        """Place each point in the close-ups of all vehicles to which it is near."""
+        """Place each point in the close-up of every vehicle that it is near."""
         apart = points.places[:, None] - vehicles.places[vehicles.rows(points.time_ns)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2, initial=0.0) < SHOWN_M)
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])

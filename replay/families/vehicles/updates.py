@@ -147,7 +147,7 @@ class Associated(NamedTuple):
 
 
 def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Associated | None]:
-    """Update with unordered fixes; also return their map if the method uses a single one.
+    """Update with unordered fixes; also return the map of the fixes if the method uses a single map.
 
     Args:
         setup: the bound method.
@@ -275,15 +275,15 @@ def update_by_pose(
 ) -> tuple[Joint, Booleans]:
     """Update with detections of the infrastructure sensor, whose pose is also estimated.
 
-    The pose is estimated from the vehicles' estimates if it is not yet known, or if it is assumed to
-    change between scans.
+    The pose is determined from the estimates of the vehicles if it is not yet known, or if it is assumed
+    to change between scans.
 
     Args:
         setup: the bound method.
         joint: the Gaussians of the runs.
         seen: (runs, detections, 2), in m in the sensor's frame, padded with NaN.
         registered: (runs,), whether the pose is known.
-        may_start: (runs,), whether the pose may be found.
+        may_start: (runs,), whether the pose may be determined if it is not known.
 
     Returns:
         The joint states, and whether (runs,) the pose is known now.

@@ -1,4 +1,4 @@
-"""Tracking of one vehicle by its own fixes, the reference with known association in the paper.
+"""Tracking of one vehicle by its own fixes, as in the paper's reference with known association.
 
 Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, section 4.1. Each vehicle has its own estimate.
@@ -77,7 +77,7 @@ def standing_noise(state: Components, duration_s: Any, parameters: Any) -> Compo
 
 
 def mode_rates(parameters: Any) -> Components:
-    """Return the rates from driving, manoeuvring and standing to the other modes, in this order."""
+    """Return the rates at which driving, manoeuvring and standing change to the other modes."""
     return (
         parameters.manoeuvres_per_s,
         0.0,

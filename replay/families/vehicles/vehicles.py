@@ -293,7 +293,7 @@ class Sight(NamedTuple):
 
 
 def sight_of(motion: Motion, joint: Joint) -> Sight:
-    """Predict the detections of the estimated vehicles by the sensor at its estimated pose."""
+    """Predict the sensor's detections of the estimated vehicles from the sensor's estimated pose."""
     count, states = motion.vehicles, joint.mean.shape[1]
     places, pose = positions(motion, joint.mean), joint.mean[:, -POSE:]
     seen = np.stack(into_frame(pose.T[:, :, None], np.moveaxis(places, -1, 0)), axis=-1)
@@ -319,7 +319,7 @@ def update_by_shape(
 
     Args:
         motion, joint: motion and joint states of the vehicles in all runs.
-        pose: (runs, 3), x, y, heading; only the linearization point.
+        pose: (runs, 3), x, y, heading; used only as the linearization point.
         seen: (runs, vehicles, 2) in the sensor's frame, NaN if not seen.
         variance_m2: variance of a detection, per axis.
     """

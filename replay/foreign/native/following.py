@@ -264,13 +264,13 @@ def follow_all(
     carried: Filters,
     made: Results,
 ) -> None:
-    """Pass the messages of all runs to their filters (in place), and fill the results."""
+    """Pass the messages of all runs to their filters, which change in place, and fill the results."""
     given = Given(addresses_of(library, description), static, events)
     _loop()(len(carried.handle), given, carried, made, scratch=work_of(description))
 
 
 def addresses_of(library: Library, description: Description) -> Addresses:
-    """Return the addresses of the functions of a library; 0 for innovations if it describes none."""
+    """Return a library's function addresses; 0 for innovations if its description has none."""
     addresses = library.addresses
     return addresses if description.innovation else addresses._replace(innovation=0)
 
@@ -314,7 +314,7 @@ def filters_of(
     runs: int,
     description: Description,
 ) -> Filters:
-    """Make the filters of all runs; a run whose prior is NaN does not take part.
+    """Make the filters of all runs; a run whose prior is NaN is not processed.
 
     Args:
         library: the library of the filters.

@@ -20,7 +20,7 @@ NOT_OPENED = "cannot open shared object file: No such file or directory"
 
 
 class Addresses(NamedTuple):
-    """Addresses of the functions that a kernel calls; `innovation` is 0 if there is none."""
+    """Addresses of the functions that a kernel calls; `innovation` is 0 if there is no such function."""
 
     start: int
     take: int
@@ -41,7 +41,7 @@ class Library:
     """
 
     def __init__(self, path: Path) -> None:
-        """Load a library; raise BadInput if the file is not a library, or has another version."""
+        """Load a library; raise BadInput if it cannot be loaded, or is of another version."""
         self.path = path
         if not path.is_file():
             raise BadInput(f"{path}: no such file; give the path of a shared library")

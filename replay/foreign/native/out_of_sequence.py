@@ -1,10 +1,10 @@
 """Reprocessing of out-of-sequence messages by the filters of a library.
 
-Messages are passed as they arrive, and every run has two filters. The settled filter has processed, in
-order, the messages that no other message can precede any more; the newest filter has processed all
-messages that have arrived. When a message is late, the newest filter is replaced by a copy of the
-settled one and processes the messages in the window again. Estimates are those of the newest filter and
-innovations those of the settled one, so both equal the results of processing in order.
+Messages are passed to the filters as they arrive, and every run has two filters. The settled filter has
+processed, in order, the messages that no other message can precede any more; the newest filter has
+processed all messages that have arrived. When a message is late, the newest filter is replaced by a copy
+of the settled one and processes the messages in the window again. Estimates come from the newest filter
+and innovations from the settled one, so both equal the results of processing in order.
 """
 
 from bisect import bisect
@@ -42,12 +42,12 @@ from fuselog.replay.inference.run.recursion import FilterEvents
 
 @varying(1)
 class Arrived(NamedTuple):
-    """Messages that have arrived, in order, and the largest delay of a message.
+    """Messages that have arrived, in the order of their stamps, and the largest delay of a message.
 
     Attributes:
         order: (n,) the messages that have arrived, sorted by stamp and position in the file; the
             messages of run r begin at the first event of the run.
-        estimating: (n,) 1 for messages with estimates at their stamps.
+        estimating: (n,), 1 for messages that have an estimate at their stamp.
         window_ns: (1,) the largest delay.
     """
 
@@ -96,7 +96,7 @@ def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int
 
     Args:
         begin: first row of the message's run.
-        event: index of the message; all rows before it are in order.
+        event: index of the message; all rows before this index are in order.
         events: stamps and positions of all messages.
         order: (n,), the event in each row, changed in place.
     """
@@ -122,7 +122,7 @@ def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
 
 
 def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
-    """Find the last row of the newest stamp that has an estimate; row `last` has the newest stamp."""
+    """Find the newest stamp with an estimate, up to row `last`; return the last row of this stamp."""
     row, order = last, arrived.order
     while row > 0 and arrived.estimating[order[row]] == 0:
         row -= 1
@@ -161,7 +161,7 @@ def follow_all_as_arrived(
 
 
 def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
-    """List the out-of-sequence messages in blocks, each with its number of reprocessed messages."""
+    """List the out-of-sequence messages in blocks; state how many messages each one made reprocess."""
     newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
     made = []
     for events in blocks:

@@ -42,7 +42,7 @@ class Ended(Exception):
 
 
 class Limits(NamedTuple):
-    """Limits of the time for one message and of the memory of a process."""
+    """Limits for the time per message and for the memory of a process."""
 
     time_s: float
     memory_mb: float
@@ -219,7 +219,7 @@ def follow_here(library: Library, given: RunGiven, description: Description) -> 
 
 
 def failure_at(event: int, given: RunGiven, description: Description, why: str) -> Failure:
-    """Make the failure of a run at a message, whose reason names the message."""
+    """Make the failure of a run at a message; the reason of the failure names the message."""
     events = given.events
     if not 0 <= event < len(events.time_ns):
         first_ns = int(events.time_ns[0]) if len(events.time_ns) else 0
@@ -284,7 +284,7 @@ def _end_kept() -> None:
 def follow_runs_apart(
     library: str, runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with filters in parallel, one process per core; None for runs without input."""
+    """Process runs with filters in parallel, one process per core; the result is None without input."""
     workers = Workers()
 
     def one(given: RunGiven | None) -> Ran | None:
@@ -315,7 +315,7 @@ def in_threads(
 
 
 def describe_apart(library: str) -> str:
-    """Ask a library for its description in a process."""
+    """Ask a library for its description in a separate process."""
     while True:
         worker = _kept_or_new()
         try:

@@ -33,7 +33,7 @@ def kill_family(process: psutil.Process) -> None:
 
 
 class _Guard:
-    """Guard process, which outlives its parent for a moment; each process of fuselog has one."""
+    """Guard process, which runs slightly longer than its parent; each process of fuselog has one."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -78,8 +78,8 @@ class Stream(Program):
     def _read(self) -> None:
         """Split the output of the program into frames as it arrives.
 
-        It reads from the file object and not from the file descriptor, which may belong to another
-        program after `end` has closed the file.
+        The method reads from the file object and not from the file descriptor, which may belong to
+        another program after `end` has closed the file.
         """
         assert self.process.stdout is not None
         buffer = bytearray()
@@ -287,7 +287,7 @@ def _note(
 def follow_runs_streaming(
     words: Sequence[str], runs: Sequence[RunGiven | None], description: Description, limits: Limits
 ) -> list[Ran | None]:
-    """Process runs with programs in parallel, one per core; None for runs without input."""
+    """Process runs with programs in parallel, one per core; the result is None without input."""
     started: list[Program] = []
 
     def one(given: RunGiven | None) -> Ran | None:

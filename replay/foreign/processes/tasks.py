@@ -34,10 +34,10 @@ class RunGiven(NamedTuple):
         static: messages for the filter before its start.
         events: all other messages.
         prior: stamp, mean (n,) and covariance (t, t); None if the log has none.
-        parameters: values in the order of the description.
+        parameters: values of the parameters, in the order of the description.
         seed: seed of random numbers.
-        window_ns: largest delay of messages in order of arrival; IN_ORDER if they are in order of
-            stamps.
+        window_ns: largest delay of out-of-sequence messages if messages are in order of arrival;
+            IN_ORDER if they are in order of their stamps.
     """
 
     static: Static

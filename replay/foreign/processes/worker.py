@@ -1,7 +1,7 @@
 """Worker process for the filters of a library; a crash of a filter ends only this process.
 
 `isolation` starts the process, which reads tasks as lines of JSON and ends at the end of its standard
-input. The library cannot read this standard input, and its output is discarded.
+input. The library cannot read this standard input, and everything that it prints is discarded.
 """
 
 import json

@@ -71,7 +71,7 @@ def extended(bound_model: BoundModel, parts: Parts = PLAIN) -> Steps:
 
 
 def sampled(bound_model: BoundModel, parts: Parts = PLAIN) -> Steps:
-    """Make the steps of a filter by regression at samples; linear functions are applied exactly."""
+    """Make the steps of a filter with regression at samples; linear functions are applied exactly."""
     model, motion = bound_model.model, bound_model.motion
     dimensions: list[int] = []
     shapes: list[tuple[int, tuple[str, ...]]] = []

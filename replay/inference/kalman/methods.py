@@ -86,9 +86,9 @@ class UnscentedParameters(MethodParameters):  # type: ignore[explicit-any]
     """Options of methods that can use the unscented transform.
 
     Attributes:
-        kappa: spread of the sigma points: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf uses
-            0.5, which gives all points the same weight, unless its name sets another value, as in
-            lrkf:ukf:kappa=0; with the same kappa, ukf and lrkf:ukf are equal.
+        kappa: spread of the sigma points: 3 - n is Julier's choice, and 0 gives the cubature filter. The
+            default of lrkf:ukf is 0.5, which gives all points the same weight; a name such as
+            lrkf:ukf:kappa=0 sets another value. With the same kappa, ukf and lrkf:ukf are equal.
     """
 
     kappa: float = 0.0
@@ -126,13 +126,13 @@ class Method:
         steps: function that makes the filter's steps for a bound model.
         sampling: function that makes the samples, for methods that use samples.
         lacks: function that describes what a model lacks for the method; "" if it lacks nothing.
-        variant: parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+        variant: parameter that is set by the part after the colon in a name such as `lrkf:s2kf-50`.
         made_for: function that returns the method that the parameters select, if there are several; it
-            raises BadInput if they name an unknown one.
-        filtering: class that runs through a log, if it is not
+            raises BadInput if the parameters name an unknown method.
+        filtering: class that processes a log with the method, if it is not
             `fuselog.replay.inference.run.filtering.Filter`.
-        takes_all_modes: whether it uses all modes of a model instead of one motion.
-        is_random: whether it draws random numbers other than those of its samples.
+        takes_all_modes: whether the method uses all modes of a model instead of one motion.
+        is_random: whether it draws random numbers, apart from its samples.
     """
 
     summary: str
@@ -169,7 +169,7 @@ def _analytic(bound_model: BoundModel) -> Steps:
 
 
 def no_steps(bound_model: BoundModel) -> Steps:
-    """Raise AssertionError, as a placeholder for methods whose steps `Method.made_for` selects."""
+    """Raise AssertionError, for methods whose actual steps are chosen by `Method.made_for`."""
     raise AssertionError("the method was not made for its parameters")
 
 
@@ -278,12 +278,12 @@ _SQUARE_ROOTS = {
 
 
 def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
-    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that uses it.
+    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that contains it.
 
     Args:
         text: the given name.
         method: name of the method that uses the filter.
-        use: use of the filter in words, for the error.
+        use: use of the filter, in words, for the error message.
 
     Raises BadInput if there is no such filter.
     """

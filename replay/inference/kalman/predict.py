@@ -1,4 +1,4 @@
-"""Prediction of a Gaussian by the Jacobian of a model's motion, with the noise of the motion."""
+"""Prediction of a Gaussian with the Jacobian of a model's motion and the noise of the motion."""
 
 from typing import Protocol
 
@@ -78,7 +78,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Linear
     Args:
         model: the model, for the kinds of state and control.
         motion: motion whose `move` is differentiated.
-        by_state: whether F, the derivative by the state, is requested.
+        by_state: whether F, the derivative with respect to the state, is requested.
 
     Returns:
         `linearise(state, control, duration_s, parameters, work)`. It fills `work.state` (n,),

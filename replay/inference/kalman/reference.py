@@ -1,8 +1,9 @@
 """Extended Kalman filter in two short functions, with the same results as the compiled filters.
 
 Begin here to read how a filter works. `fuselog.replay.inference.kalman.predict` and
-`fuselog.replay.inference.kalman.update` give the same results without allocating arrays, and also
-support angles and rotations in the state, and missing components of measurements; a test compares both.
+`fuselog.replay.inference.kalman.update` give the same results without allocating arrays. They also
+support angles and rotations in the state, and measurements with missing components. A test compares the
+results.
 """
 
 from collections.abc import Callable

@@ -70,7 +70,7 @@ class SampleMemory(NamedTuple):
             `narrowing`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
         offsets: (L, N) tangent vectors from the mean to the samples.
-        still: (n,) the mean after the addition of a rotation by zero, which normalises it.
+        still: (n,) the mean plus a zero rotation; this addition normalises the mean.
         point, noise: (n,) one sample, and (noises,) the variances of the noise.
         values: (L, v) values of the function, as tangent vectors from a centre.
         centre, shift: mean of the values, in the space of the values, and weighted mean (v,) of their
@@ -127,7 +127,7 @@ def sample_memory(
 
 
 def axes_of(points: Floats) -> Integers:
-    """Return the index (L,) of the only nonzero entry of each point (L, N); empty if one has several."""
+    """Return the index (L,) of each point's only nonzero entry; empty if a point (L, N) has several."""
     is_on_axes = bool(np.all(np.count_nonzero(points, axis=1) <= 1))
     return np.asarray(np.argmax(points != 0.0, axis=1)[: len(points) if is_on_axes else 0])
 
@@ -152,7 +152,7 @@ class Sampled(Protocol):
 
 
 class Sample(Protocol):
-    """Function that evaluates a function at samples about a mean (n,) and returns the weights (L,).
+    """Function that evaluates another one at samples about a mean (n,) and returns the weights (L,).
 
     See `sampling`.
     """
@@ -375,8 +375,8 @@ def no_variances(*_: object) -> Numbers:
 def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
-    The noise of the control is propagated by the derivative at the mean, the noise of the motion by
-    samples.
+    The noise of the control is propagated by the derivative at the mean, whereas the noise of the motion
+    is sampled.
 
     Args:
         bound_model: the bound model.
@@ -446,7 +446,7 @@ def sampled_sensor(bound_model: BoundModel, number: int, samples: int) -> Innova
     Args:
         bound_model: the bound model, with the sensors of the log.
         number: index of the sensor.
-        samples: index of its samples in `work.samples`.
+        samples: index of the sensor's samples in `work.samples`.
     """
     model, sensor = bound_model.model, bound_model.sensors[number]
     kinds = tuple(sensor.measured.values())

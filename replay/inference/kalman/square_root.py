@@ -129,7 +129,7 @@ def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> b
 def _predicting(
     bound_model: BoundModel, spread: Spread, add_noise: AddMotionNoise, samples: int = -1
 ) -> Predict:
-    """Make the prediction by a `spread` that uses derivatives, or the given samples."""
+    """Make the prediction by a `spread`, which uses derivatives or, if given, samples."""
     t, read_control = bound_model.model.tangent, tuple_of(bound_model.model.controls)
     read_state, fill = tuple_of(bound_model.model.size), filling(bound_model.model.size)
 

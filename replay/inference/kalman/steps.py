@@ -74,7 +74,7 @@ class Measurement(NamedTuple):
     Attributes:
         data: contents of the message; see `update.message_layout`.
         parameters: parameters of the sensor.
-        gate: (m + 1,) bounds of the NIS by number of components.
+        gate: (m + 1,), the largest NIS that the gate accepts, by number of components.
         event: index of the event; see `Interval`.
     """
 
@@ -160,16 +160,17 @@ class Steps(NamedTuple):
     """Steps of a recursive filter for one model, as the recursion calls them.
 
     Attributes:
-        memory: (sets) -> working memory of one core; `sets` are the samples, one for each of `sampled`.
+        memory: (sets) -> working memory of one core; `sets` has a set of samples for each dimension in
+            `sampled`.
         predict: (run, belief, interval, memory) -> whether it succeeded; moves the belief in place.
         updates: for every sensor, (run, belief, measurement, memory, record) -> a failure, ALL_WELL or
             NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: mean, covariance, and
             further results of the method.
-        sampled: dimensions of the sampled functions, with the motion first.
+        sampled: dimensions of the samples of each sampled function, with the motion first.
         resumes_after_gap: whether the filter continues after a gap of the control; `predict` is then
             called with NaN as the control.
-        form: form of the covariances in beliefs; estimates contain the covariances themselves.
+        form: form in which beliefs store covariances; estimates contain the covariances themselves.
     """
 
     memory: MakeMemory
@@ -200,7 +201,7 @@ class Workspace(NamedTuple):
 
     Attributes:
         state: (n,) moved state.
-        transition: (t, t) derivative by the state.
+        transition: (t, t) derivative with respect to the state.
         product: (t, t) after a prediction, the covariance between the new and the old state.
         rest: (t, t) further values that `factors` needs to reverse a prediction.
         gain, control_variance: (t, controls), (controls,).
@@ -236,7 +237,7 @@ def workspace(bound_model: BoundModel, samples: tuple[Samples, ...] = ()) -> Wor
     Args:
         bound_model: the bound model, with n state components, t tangent components, and at most m
             components of a sensor.
-        samples: memories of `regression`, motion first, one for each of `Steps.sampled`.
+        samples: memories of `regression`, one for each of `Steps.sampled`, with the motion first.
     """
     model, t = bound_model.model, bound_model.model.tangent
     m = max((len(sensor.measured) for sensor in bound_model.sensors), default=0)

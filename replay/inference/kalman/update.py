@@ -290,9 +290,10 @@ def kalman_update(bound_model: BoundModel, number: int, innovate: Innovate) -> U
     The gain K is not computed explicitly. With S = L L' and W = C L^-T, K v = W L^-1 v (see
     `gaussian.kalman_step`) and K S K' = W W' (see `gaussian.downdate`).
 
-    Missing components, and those for which the model predicts NaN, are removed from v, S and C; the
-    log-likelihood is that of the remaining components. It is zero if the gate rejects the measurement or
-    if no component remains. Accepted measurements may still be down-weighted; see `inflation`.
+    Components that are missing, or that the model predicts as NaN, are removed from v, S and C; the
+    log-likelihood is computed from the remaining components. The log-likelihood is zero if the gate
+    rejects the measurement or if no component remains. Accepted measurements may still be down-weighted;
+    see `inflation`.
 
     Args:
         bound_model: the bound model, with the sensors of the log.

@@ -16,7 +16,7 @@ r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measureme
   c: a prediction that only adds to an angle keeps its variance. The effect of nonlinearity is
   overestimated, never underestimated. This is the scaled unscented transformation (Julier, "The scaled
   unscented transformation", ACC 2002) with a scale that the angles determine. Only the mean differs: it
-  is that of the narrowed samples, which is bounded on a circle, unlike the second-order term of the
+  is the mean of the narrowed samples, which is bounded on a circle, unlike the second-order term of the
   scaled transformation.
 
 - **No wider than uniform.** A completely unknown angle has the standard deviation pi / 3^1/2 = 1.81 rad
@@ -25,9 +25,8 @@ r = 3^1/2 gives 5.196 - 2 pi = -1.09 rad, and a prediction without any measureme
   the covariance's factor.
 
 A Gaussian is a poor description of an angle beyond 1 rad: at 1 rad, 0.2 % of its probability is beyond
-half a turn, and at 1.81 rad, where its mean is meaningless, 8 %. Samples are bit-identical to the
-ordinary ones while every angle's standard deviation is at most 1 rad and no sample is beyond half a
-turn.
+half a turn; at 1.81 rad, 8 % is, and its mean is meaningless. Samples are bit-identical to the ordinary
+ones while every angle's standard deviation is at most 1 rad and no sample is beyond half a turn.
 """
 
 from functools import lru_cache
@@ -56,7 +55,7 @@ def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
 
 
 def unsuspected_rad(points: Floats) -> float:
-    """Return the largest standard deviation at which angles at points (..., L, N) are not changed."""
+    """Return the standard deviation up to which angles at points (..., L, N) need no narrowing."""
     radius = np.sqrt(np.max(np.sum(points**2, axis=-1), initial=1.0))
     return float(min(WIDE_RAD, np.pi / radius))
 
@@ -85,15 +84,16 @@ class Regressed(Protocol):
 
 @lru_cache(maxsize=64)
 def narrowing(kinds: tuple[str, ...], size: int, *, bounded: bool) -> Narrow:
-    """Make `narrow(factor, points, unsuspected)`, which returns c and scales the factor (N, N) by it.
+    """Make `narrow(factor, points, unsuspected)`, which returns c and scales the factor (N, N) by c.
 
-    See the module docstring. With `bounded`, the standard deviation of each angle is first limited to
-    that of a uniform angle.
+    See the module docstring. With `bounded`, the standard deviation of each angle is first limited to a
+    uniform angle's.
 
     Args:
         kinds: kinds of the state's components.
         size: size N of the factor.
-        bounded: whether angles are limited in this way, as for motions.
+        bounded: whether the standard deviation of angles is limited to that of a uniform angle, as for
+            motions.
     """
     turns = turning(kinds)
 

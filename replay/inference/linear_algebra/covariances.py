@@ -14,7 +14,7 @@ from fuselog.replay.inference.linear_algebra.manifold import Turning
 
 
 class Propagate(Protocol):
-    """Function that replaces the matrix of P (t, t) by that of F P F'; `product` is working memory."""
+    """Function that replaces the matrix P (t, t) by F P F'; `product` is working memory."""
 
     def __call__(self, matrix: Floats, transition: Floats, product: Floats, /) -> None: ...
 
@@ -69,9 +69,9 @@ class Form(NamedTuple):
         propagate: (matrix, transition, product) replaces P by F P F'; product (t, t) is working memory.
         turn: (turning, vector, matrix) transforms P by `turning`, from `manifold.by_right_jacobian`,
             along a vector.
-        mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of M Gaussians with
-            these weights, from their means `away` (M, t), their matrices `carried` (M, t, t) and the
-            mean `shift` (t,) of the mixture.
+        mix: (weights, away, shift, carried, matrix) fills the matrix of a mixture of M Gaussians, from
+            their weights, their means `away` (M, t), their matrices `carried` (M, t, t) and the mean
+            `shift` (t,) of the mixture.
         retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. From the
             matrices before and after a prediction and its values in the workspace, it fills `turned`
             with G', and `before` with P - G D'; see `fuselog.replay.inference.smoothing.backward_pass`.

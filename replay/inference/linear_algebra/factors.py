@@ -106,7 +106,7 @@ def retriangulate(rows: Floats, factor: Floats) -> None:
 
 
 def _start(covariances: Floats) -> Floats:
-    """Factor covariances; NaN if one is not positive definite, so that its run cannot start."""
+    """Factor covariances; if one is not positive definite, return NaN, so that its run cannot start."""
     factors, whole = np.full_like(covariances, np.nan), is_positive_definite(covariances)
     factors[whole] = np.linalg.cholesky(covariances[whole])
     return factors

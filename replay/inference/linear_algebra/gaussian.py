@@ -116,8 +116,8 @@ def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
 def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
     """Solve A X = B in place by the Cholesky factor of A.
 
-    A zero pivot, up to rounding, is a component without variance: its row of X is set to zero, which is
-    a solution if B is in the range of A.
+    A pivot that is zero up to rounding means a component without variance; the row of X for this
+    component is set to zero, which gives a solution if B is in the range of A.
 
     Args:
         matrix: A (n, n), symmetric.
@@ -173,7 +173,7 @@ def drop_missing(innovation: Innovation) -> int:
 def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     """Replace v by L^-1 v and S by L, S = L L', and return v' S^-1 v and log det S.
 
-    The first is NaN if S is not positive definite.
+    The value of v' S^-1 v is NaN if S is not positive definite.
 
     Args:
         innovation: v (m,) and S (m, m), changed in place.
@@ -186,14 +186,14 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
 
 
 def whiten_kept(innovation: Innovation, size: int, components: int) -> tuple[float, float]:
-    """Call `whiten`, without loops if all components are measured, whose number a kernel knows."""
+    """Call `whiten`; if all components are measured, a kernel knows their number and needs no loops."""
     if size == components:
         return whiten(innovation, components)
     return whiten(innovation, size)
 
 
 def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, float]:
-    """Replace v by L^-1 v, and return its square and log det L L'.
+    """Replace v by L^-1 v, and return the new v' v, and log det L L'.
 
     Args:
         factor: L, lower triangular; its first `size` rows and columns are used.
@@ -346,9 +346,9 @@ def predict_constant_velocity(
 ) -> None:
     """Predict positions and velocities at constant velocity, in place.
 
-    The index of the position of axis a is a * layout[0]; that of its velocity is layout[1] higher. The
-    noise adds a variance of the position, a covariance of both, and a variance of the velocity to each
-    axis.
+    The index of the position along axis a is a * layout[0]; its velocity is layout[1] further. The noise
+    adds a variance of the position, a covariance of position and velocity, and a variance of the
+    velocity to each axis.
 
     Args:
         mean: (n,).
@@ -379,7 +379,7 @@ def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
     Args:
         covariance: P (t, t).
         gain: G (t, k).
-        variances: (k,) variances of its columns.
+        variances: (k,), the variance that belongs to each column of G.
     """
     for row in range(len(covariance)):
         for column in range(row + 1):

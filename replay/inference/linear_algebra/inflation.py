@@ -10,13 +10,13 @@ def inflation(squared: float, size: int, parameters: Settings) -> float:
     """Compute the factor by which the covariance of an innovation is inflated, from its NIS.
 
     The added covariance is treated as measurement noise, so the update remains a Kalman update. The
-    factor is the largest of the factors of all given options, which are in
+    factor is the largest of the factors of all given options, which are described in
     `fuselog.replay.inference.model.parameters.ModelParameters`. Options that are not given are NaN;
     without any option, the factor is 1:
 
     - `inflate_nis` = b: NIS / b if the NIS exceeds b, which reduces the NIS to b;
     - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's t-distribution; Roth, Ozkan,
-      Gustafsson, ICASSP 2013. It is at least 1, so a small innovation does not reduce the noise;
+      Gustafsson, ICASSP 2013. The factor is at least 1, so a small innovation does not reduce the noise;
     - `switch_nis` = b: ((b + NIS) / 2 b)^2 if the NIS exceeds b; Agarwal et al., ICRA 2013, (15) with
       s^-2.
 

@@ -31,7 +31,7 @@ Place = tuple[str, int, int]  # an array of the workspace, row and column
 
 
 class Input(NamedTuple):
-    """Argument to differentiate by: its name, its kinds, and the destination of its Jacobian.
+    """Input for which derivatives are computed: its name, its kinds, and where its Jacobian is stored.
 
     `into` is the name of an array in the workspace; it is empty if the derivative is not requested. An
     argument with `zero` is not passed, because it is noise with mean zero.

@@ -169,10 +169,11 @@ def _moments_of_some(states: int, places: tuple[int, ...], chosen: tuple[int, ..
 def axis_moments_of(states: int, values: int, kept: tuple[int, ...]) -> AxisMoments:
     """Make `moments`, which fills weighted covariances of values at samples that are on axes.
 
-    With the points (L, N), of which number k is on axis `axes[k]`, and the lower factor (N, N) of their
+    With the points (L, N), the k-th of which is on axis `axes[k]`, and the lower factor (N, N) of their
     covariance, the covariance of states and values is the product of the factor with `joint` (N, v), the
     covariance of points and values. Values that are `kept` are components of the state that the function
-    does not change, so that both covariances are the same.
+    does not change; their covariance with all values is therefore the covariance of these states with
+    the values.
     """
     spread_out = moments_of(0, tuple(each for each in range(values) if each not in kept))
 

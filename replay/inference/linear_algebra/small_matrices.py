@@ -1,4 +1,4 @@
-"""Linear algebra with a few components for users' own estimators, as in-place scalar loops.
+"""In-place linear algebra with small matrices for users' own estimators, written as scalar loops.
 
 The functions are called from a compiled `follow` (see `fuselog.replay.engine.api.functions.recursive`)
 and allocate no arrays: `follow` allocates working memory once, before the loop over the messages.
@@ -107,7 +107,7 @@ def update(
         mean: x (n,).
         covariance: P (n, n).
         difference: v = z - h(x) (m,), NaN for missing components.
-        rows: H (m, n), the derivative of the measurement by the state.
+        rows: H (m, n), the derivative of the measurement with respect to the state.
         noise: R (m, m).
         memory: working memory from `update_memory`.
         gate: largest NIS; if it is exceeded, nothing is updated.

@@ -67,8 +67,8 @@ def total(numbers: Sequence[float]) -> float:
 def adding_noise(size: int, block: int = 0) -> AddNoise:
     """Make `add(covariance, noise)`, which adds a tuple of variances or of a lower triangle.
 
-    The triangle is that of the first `block` components (of all by default), followed by the variances
-    of the other components.
+    The triangle covers the first `block` components (all by default), followed by the variances of the
+    other components.
     """
     corner = block or size
     triangle = tuple((row, column) for row in range(corner) for column in range(row + 1))

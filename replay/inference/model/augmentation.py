@@ -66,7 +66,7 @@ def estimated(label: str, model: Model, parameters: CombinedParameters) -> Added
     """Return the components that the settings add to the state.
 
     Args:
-        label: label of the estimator, for errors.
+        label: label of the estimator, for error messages.
         model: the model whose parameters are requested.
         parameters: settings with `estimate` and its options.
 
@@ -184,7 +184,7 @@ def begin(
     """Make the function that extends the prior on `topic` to the augmented state.
 
     Args:
-        label: label of the estimator, for errors.
+        label: label of the estimator, for error messages.
         topic: topic of the prior.
         bound_model: the bound model before augmentation.
         added: components that are added to its state.

@@ -217,7 +217,7 @@ def _one_thing(
 
 
 def _serves(model: Model, name: str, topic: Topic) -> bool:
-    """Test whether a topic belongs to the system of the model or, for a prior, to its state."""
+    """Test whether a topic belongs to the model's system or, for a prior, has the model's components."""
     if name == model.prior:
         return model.state.keys() <= set(topic.metadata.get("components", "").split(","))
     return topic.metadata.get("system", model.system) == model.system
@@ -321,7 +321,7 @@ def _suffices(
 
 
 def measures_state(model: Model, sensor: Sensor) -> bool:
-    """Test whether a sensor measures components of the state by name, with their covariance."""
+    """Test whether a sensor measures only components of the state, and states their covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
 
 

@@ -35,8 +35,8 @@ def bound_model_of(
 ) -> BoundModel:
     """Make a bound model of a motion, some sensors and optionally all modes, with traced functions.
 
-    `names` are the parameters that functions may read, by default those of the model. Unchanged parts
-    are the same objects in every call.
+    `names` are the parameters that functions may read, by default the model's. Equal parts are the same
+    objects in every call.
 
     Raises BadInput if a function cannot be traced.
     """
@@ -50,7 +50,7 @@ def bound_model_of(
 
 
 def title_of(model: Model, summary: str) -> str:
-    """Name the kernel of a method with this summary, for messages while it is compiled.
+    """Return the name of a method's kernel, for messages while the kernel is compiled.
 
     The model's registered name is used if its module is already loaded; nothing is imported.
 

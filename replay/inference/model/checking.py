@@ -58,8 +58,8 @@ class _Call(NamedTuple):
         function: the function.
         state: names and kinds of the state's components.
         outputs: names and kinds of the returned components.
-        inputs: further arguments to differentiate by: for each name, the number of components, and
-            whether it is zero.
+        inputs: further arguments with respect to which to differentiate: for each name, the number of
+            components, and whether the argument is zero.
         rest: the remaining arguments.
     """
 
@@ -90,7 +90,8 @@ def check_model(
 
     Args:
         model: the model.
-        parameters: values of its parameters; a parameter without a value and without a default is 1.
+        parameters: values of the model's parameters; a parameter without a value and without a default
+            is 1.
         states: states (n, components) at which the functions are called; by default, random states of
             order one.
         seed: seed of the random states, controls and points of a map.
@@ -221,7 +222,7 @@ def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
 
 
 def _derivatives_of(call: _Call) -> Derivatives:
-    """Make a function that returns the exact Jacobians by the state and by other inputs."""
+    """Make a function that returns the exact Jacobians with respect to the state and other inputs."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
     counts = {name: n for name, (n, _) in call.inputs.items()}
     inputs = [Input("state", kinds, "state")]
@@ -245,7 +246,7 @@ def _derivatives_of(call: _Call) -> Derivatives:
 def _check_derivatives(
     call: _Call, exact: Derivatives, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
-    """Compare derivatives with central differences and handwritten ones; return those by the state."""
+    """Compare derivatives with central differences and handwritten ones; return the state's Jacobian."""
     jacobians = exact(state, others)
     for index, (name, jacobian) in enumerate(jacobians.items()):
         for column, slopes in enumerate(_slopes(call, [state, *others], index).T):
@@ -255,7 +256,7 @@ def _check_derivatives(
 
 
 def _slopes(call: _Call, arguments: Sequence[Floats], index: int) -> Floats:
-    """Compute the Jacobian (outputs, size) by one argument by central differences."""
+    """Compute the Jacobian (outputs, size) for one argument, by central differences."""
     outputs = tuple(call.outputs.values())
     kinds = tuple(call.state.values()) if index == 0 else ("linear",) * len(arguments[index])
     add, size = boxplus(kinds), tangent_size(kinds)
@@ -349,7 +350,7 @@ def _check_linear(call: _Call, is_linear: bool, by_state: list[Floats]) -> None:
 
 
 def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """Check that an angle plus a full turn, and the negative of a unit vector, give the same values."""
+    """Check that values do not change if an angle grows by a full turn or a unit vector is negated."""
     names, outputs = list(call.state), tuple(call.outputs.values())
     for kind, first, *_ in manifold_blocks(tuple(call.state.values())):
         if kind == "linear":
@@ -384,7 +385,7 @@ def _check_length(call: _Call, value: Floats) -> None:
 
 
 def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """Find components that are declared linear but jump by a turn along a path, as angles do."""
+    """Find components that are declared linear but jump by a full turn along a path, as angles do."""
     kinds = tuple(call.state.values())
     add, scales = boxplus(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
     linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]

@@ -1,9 +1,9 @@
 """Corrections of a state and its covariance by a step of the tangent space, in updates and smoothers.
 
 Each component is corrected separately (`manifold.boxplus`), unless a model defines a correction along a
-curve (`model.Correction`). In both cases, the covariance is transformed from the tangent space of the
-old mean to that of the new mean by the derivative of the moved state with respect to the step, and in
-the other direction by the derivative of the step with respect to the moved state.
+curve (`model.Correction`). In both cases, the covariance is transformed between the tangent spaces of
+the old and the new mean: to the new mean by the derivative of the moved state with respect to the step,
+and back by the derivative of the step with respect to the moved state.
 """
 
 from typing import Protocol
@@ -86,7 +86,7 @@ class StepTo(Protocol):
 
 
 class Chain(Protocol):
-    """Function that converts a Jacobian (m, t) at the moved state to one by the step, in place."""
+    """Function that converts a Jacobian at the moved state, (m, t), to the Jacobian for the step."""
 
     def __call__(self, rows: Floats, work: RelinearisingWork, /) -> None: ...
 
@@ -158,8 +158,8 @@ def correcting(
 def comparing(kinds: Kinds, correct: Correction | None) -> Compare:
     """Make `compare(origin, mean, covariance, work)`, which finds the step between two states.
 
-    It fills `work.change[0]` with the step from the origin (n,) to the mean, the inverse of
-    `correcting`, and transforms the covariance from the tangent space of the mean to that of the origin.
+    It is the inverse of `correcting`: it fills `work.change[0]` with the step from the origin (n,) to
+    the mean, and transforms the covariance from the mean's tangent space to the origin's.
 
     Args:
         kinds: kinds of the state's components.
@@ -205,7 +205,7 @@ def relinearising(model: Model) -> tuple[StepTo, Chain]:
     """Make the functions for the linearisation point and the chain rule of an iterated update.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`. After that, `chain(rows,
-    work)` converts a Jacobian (m, t) at that state to one by the step.
+    work)` converts a Jacobian (m, t) at that state to the Jacobian with respect to the step.
     """
     t = model.tangent
     if model.correct is not None:

@@ -34,7 +34,7 @@ class ControlNoise(Protocol):
 
 
 class MotionJacobians(Protocol):
-    """Function that fills the derivatives of the moved state by the state and by the control."""
+    """Function that fills the derivatives of the moved state with respect to state and control."""
 
     def __call__(
         self,
@@ -69,7 +69,7 @@ class OfParameters(Protocol):
 
 
 class MeasurementJacobian(Protocol):
-    """Function that fills the derivative (m, t) of a measurement by the state."""
+    """Function that fills the derivative (m, t) of a measurement with respect to the state."""
 
     def __call__(
         self, state: Numbers, reference: Numbers, parameters: Settings, by_state: Floats, /
@@ -79,7 +79,7 @@ class MeasurementJacobian(Protocol):
 class MeasurementMoments(Protocol):
     """Function that fills a measurement's mean (m,), covariance (m, m) and covariance with the state.
 
-    The last is (t, m); the state has the given mean (n,) and covariance (t, t).
+    This covariance with the state is (t, m); the state has the given mean (n,) and covariance (t, t).
     """
 
     def __call__(

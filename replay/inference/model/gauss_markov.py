@@ -1,4 +1,4 @@
-"""Processes of added components: random walks and first-order Gauss-Markov processes.
+"""Processes of components that are added to a state: random walks and Gauss-Markov processes.
 
 For Gauss-Markov processes, see Gelb, Applied Optimal Estimation, 1974, section 3.6.
 """
@@ -19,7 +19,7 @@ class GaussMarkov(NamedTuple):
     Attributes:
         sigma: standard deviation at the start.
         drift: density of the random walk, per square root of a second.
-        time_s: time constant of the return to the mean, with noise that maintains sigma; infinite for a
+        time_s: time constant of the return to the mean, while noise maintains sigma; infinite for a
             random walk.
     """
 
@@ -31,7 +31,7 @@ class GaussMarkov(NamedTuple):
 def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
-    """Add the parameters of the processes of components to the parameters of a model."""
+    """Add the parameters of the components' processes to the parameters of a model."""
     processes: dict[str, AnyArgument] = {
         f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
@@ -39,7 +39,7 @@ def with_gauss_markov_parameters(
 
 
 def remaining_share(name: str, duration_s: float, parameters: Settings) -> float:
-    """Compute the share of a component's deviation from its mean that remains after a step."""
+    """Compute the fraction of a component's deviation from the mean that remains after a step."""
     share: float = np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
     return share
 

@@ -36,7 +36,7 @@ FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Map of fixed points on a topic; measurements refer to the points by number.
+    """Map of fixed points, published on a topic; measurements refer to the points by number.
 
     Attributes:
         topic: topic of the map.
@@ -44,8 +44,8 @@ class Map:
         number: field with the number of a point.
         point: vector field with the position of a point.
         components: components of the point, by name.
-        of: field of the measurement with the number of the point; a measurement whose number is not on
-            the map has no information about the state.
+        of: field of the measurement with the number of the point; if the map has no such point, the
+            measurement contains no information about the state.
     """
 
     topic: str
@@ -74,15 +74,16 @@ class Control:
         interpolated: whether the control is linear between two messages, so that the motion uses the
             mean of its values at both ends of a step; otherwise, a message applies until the next one.
         initial: control before the first message; zeros by default.
-        gap: parameter with the longest time, in s, without messages of an interpolated control. In a
-            longer gap the estimate ends, or is unknown until messages resume; see `Motion.gap_noise`.
-        delay: parameter with the time, in s, from a measurement to the stamp of its message.
-        estimates: whether estimates are made at the stamps of the control, and not only at those of
+        gap: parameter with the longest time, in s, for which an interpolated control may lack messages.
+            In a longer gap the estimate ends, or is unknown until messages resume; see
+            `Motion.gap_noise`.
+        delay: parameter with the delay, in s, from a measurement to the stamp of its message.
+        estimates: whether estimates are also made at the stamps of the control, in addition to those of
             sensors.
-        fallbacks: other topics that replace the components of the same names if the log has them, such
-            as the turn rate of a gyro in place of that of the wheels.
-        noise: for a fallback, the names under which its channel may state the noise of the control, by
-            parameter; while the fallback is used, only its channel can state these parameters.
+        fallbacks: other topics that replace the components of the same names if the log has these
+            topics, such as the gyro's turn rate in place of the wheels'.
+        noise: for a fallback, the names under which its channel may state the control's noise, by
+            parameter; while the fallback is used, these parameters are read only from its channel.
     """
 
     topic: str
@@ -110,16 +111,16 @@ class Motion:
             or the rows of the lower triangle of its covariance; with `noises`, the variances of the
             noise components.
         noises: number of noise components that are arguments of `move` instead of being added.
-        noise_block: number of components in the lower triangle, if variances of the other components
-            follow it; zero for all components.
+        noise_block: number of components in the lower triangle, which is followed by the variances of
+            the other components; zero means that the triangle contains all components.
         control_noise: (duration_s, parameters) -> variances of the control's error over the duration;
-            the derivative by the control propagates them to the state.
+            the derivative with respect to the control propagates them to the state.
         gap_noise: (state, duration_s, parameters) -> variances in the tangent space that are added after
             the control was missing for longer than its `gap`. The state is not changed, so the variances
             must cover any motion in the meantime; there are no estimates during the gap.
         linear: whether `move` is linear in the state; sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both Jacobians;
-            only for handwritten Jacobians, because they are otherwise derived from `move`.
+            needed only for handwritten Jacobians, because they are otherwise derived from `move`.
         moments: (mean, covariance, control, duration_s, parameters) moves mean and covariance exactly,
             in place, without the additive noise; for the method `analytic`.
     """
@@ -135,7 +136,7 @@ class Motion:
     moments: MotionMoments | None = None
 
     def triangle(self, tangent: int) -> int:
-        """Return the number of entries of `noise` if it is a triangle; `tangent` is the tangent size."""
+        """Return the size of `noise` if it is a triangle; `tangent` is the tangent space's size."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
@@ -162,32 +163,33 @@ class Sensor:
     Attributes:
         topic: name of its topic, under the prefix of the estimated object; a leading slash makes it a
             full name.
-        schema: schema of its messages. A GeodeticFix is accepted as a PositionFix; it is converted with
+        schema: schema of its messages. A GeodeticFix is accepted as a PositionFix; it is converted using
             the origin of the log's local tangent plane.
         measured: names of the measured components, with their kinds ("linear" or "angle").
         measure: (state, reference, parameters) -> measurement; with `noises`, (state, noise, reference,
             parameters). `reference` is the point of the map, or empty. A component that is undefined at
             this state, or has no derivative, is NaN, as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of the noise components. With `covariance`, it applies to
-            messages without a covariance; a message with neither is skipped and counted.
-        vector: field with the measured components as a vector. The channel's metadata name its entries
-            in `components`, in any order; the components of a position need no names. By default, every
-            component is a separate field.
+            with `noises`, the variances of the noise components. If `covariance` is given, this noise
+            applies only to messages that lack a covariance; if the noise is also missing, the message is
+            skipped and counted.
+        vector: field with the measured components as a vector. The channel's metadata list the names of
+            its entries in `components`, in any order; the components of a position need no names. By
+            default, every component is a separate field.
         noises: number of noise components that are arguments of `measure` instead of being added.
         covariance: field with the covariance of the vector; with `read`, stream -> (n, m, m), NaN if
             unknown.
-        reference: map whose points the messages refer to; or several maps, with a point of each in every
-            message.
-        fields: values that a message contains in addition to the measurement, such as the pose of a
-            moving sensor: fields of the schema, with their numbers of components. They follow the points
-            and the control in `reference`.
+        reference: map to whose points the messages refer, or several maps; every message then refers to
+            one point of each.
+        fields: fields of the schema with values in addition to the measurement, such as the pose of a
+            moving sensor, each with its number of components. In `reference`, these values follow the
+            points and the control.
         is_numbered: whether `reference` ends with the numbers of the points.
-        control: the model's control, if the measurement depends on it; `reference` then contains its
-            components at the stamp, after the points. It must be `interpolated`.
+        control: the model's control, if the measurement depends on it; `reference` then contains the
+            control at the stamp, after the points. It must be `interpolated`.
         read: stream -> (n, measured), for values that are computed from a message, such as a
             pseudo-measurement; NaN for missing components.
-        delay: parameter with the time, in s, from a measurement to the stamp of its message.
+        delay: parameter with the delay, in s, from a measurement to the stamp of its message.
         linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
             moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
             the measurement (m,), its covariance (m, m) including noise, and its covariance with the
@@ -220,7 +222,7 @@ class Sensor:
 
     @property
     def maps(self) -> tuple[Map, ...]:
-        """The maps of the points that a message refers to."""
+        """Maps of the points to which a message refers."""
         return (
             self.reference
             if isinstance(self.reference, tuple)
@@ -231,7 +233,7 @@ class Sensor:
 
     @property
     def control_start(self) -> int:
-        """Number of entries of `reference` before the control, that is, those of the points."""
+        """Number of entries of `reference` before the control, which are the entries of the points."""
         return sum(each.size for each in self.maps)
 
     @property
@@ -266,13 +268,13 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Correction of a state along a curve, such as the circle on which it moves with its heading.
+    """Correction of a state along a curve, such as the circle that a position follows with the heading.
 
     If the state is very uncertain in one direction of its error, such as the heading, its distribution
     is not an ellipsoid: as a function of the error in this direction, the mean of the other components
     follows a curve. `slope` (t,) is the tangent of the curve, P d / d' P d with the covariance P and the
-    direction d. At a step of zero, the derivative of the moved state by the step must be the identity
-    matrix, so that small steps move every component separately.
+    direction d. At a step of zero, the derivative of the moved state with respect to the step must be
+    the identity matrix, so that small steps move every component separately.
 
     Attributes:
         along: state -> d (t,).
@@ -296,28 +298,29 @@ class Model:
         summary: description in one line.
         state: components by name, with their kinds; the four components of a quaternion are adjacent.
         parameters: type of its parameters.
-        sensors: all sensors that it can use; a log fits if it has any of them. A model with a position
-            (linear `x_m` and `y_m`, perhaps `z_m`) also uses position fixes; see `all_sensors`.
+        sensors: all sensors that the model can use; a log fits if it has any of them. A model with a
+            position (linear `x_m` and `y_m`, perhaps `z_m`) also uses position fixes; see `all_sensors`.
         motion: motion of the state.
-        modes: other motions by name, for methods with several modes; `motion` is then one of them.
+        modes: motions by name, including `motion`, for methods with several modes.
         switching: changes of the object between its modes.
         control: input that drives the motion; a log without this topic does not fit.
         prior, truth: topics of the prior and of the true states, under the prefix.
         output: last part of the name of the estimates' topic.
         system: the `system` that a channel's metadata must name, if any.
-        needs_sensor: whether a log must have at least one of its sensors.
-        start: assumptions for a log without the prior; None if such a log does not fit.
-        takes_fixes: whether it can use position fixes.
-        correct: correction of the state by an update, unless every component moves separately.
-        by_name: whether it is only used if it is named, because it also fits logs of other models.
+        needs_sensor: whether a log must have at least one of the model's sensors.
+        start: assumptions for a log without a prior; None if the model does not fit such a log.
+        takes_fixes: whether the model can use position fixes.
+        correct: correction of the state by an update; None if every component moves separately.
+        by_name: whether the model is used only if the user names it, because it also fits logs of other
+            models.
         augmentable: parameters that can be added to the state, with their kinds (linear or angle): those
             that motion and sensors read, except noise. See
             `fuselog.replay.inference.model.augmentation`.
         calibration: parameters of the mounting, scale, bias and delay of sensors, each with the largest
             standard deviation of a useful estimate; an estimate with a larger one counts as
             undetermined.
-        owned: parameters that belong to single topics, by name: the topic, and the general name of the
-            parameter. See `fuselog.replay.inference.model.own_parameters`.
+        owned: topic and general name of each parameter that belongs to a single topic, by the name of
+            the parameter. See `fuselog.replay.inference.model.own_parameters`.
 
     An object that moves on a line; its distance from the origin is measured:
 
@@ -376,7 +379,7 @@ class Model:
 
     @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """Sensors, including that of position fixes unless the model defines its own."""
+        """All sensors, including a sensor of position fixes unless the model defines its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
         has_position = names[:2] == list(POSITION[:2])
         has_own = any(sensor.topic == FIX for sensor in self.sensors)
@@ -394,7 +397,7 @@ class Model:
         return ".".join(self.owned[name]) if name in self.owned else name
 
     def kind_of(self, name: str) -> str:
-        """Return the general parameter that a parameter of a topic replaces; otherwise, the name itself.
+        """Return the general parameter that a topic's parameter replaces; other names are unchanged.
 
         Args:
             name: name of the parameter.
@@ -418,7 +421,7 @@ class Model:
 
     @cached_property
     def tangent(self) -> int:
-        """Number of components of the tangent space: an orientation has three, but four in the state."""
+        """Number of tangent components: an orientation has three, although it has four in the state."""
         return tangent_size(self.kinds)
 
     @property

@@ -1,9 +1,8 @@
 """Parameters of single topics, such as the lever arms of two receivers.
 
-This is a transformation of models: the sensor of a topic reads the parameter of the topic in place of
-the general one. An example of a name is `/gps2/fix.lever_x_m`; the parameter has the value of
-`lever_x_m` unless it is set. Methods, augmented states and exported C code treat it like any other
-parameter.
+This is a transformation of models: a topic's sensor reads the topic's parameter in place of the general
+one. An example of a name is `/gps2/fix.lever_x_m`; the parameter has the value of `lever_x_m` unless it
+is set. Methods, augmented states and exported C code treat this parameter like any other.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +31,7 @@ Tables = Mapping[str, Mapping[str, object]]
 def with_own_parameters(
     model: Model, found: Found, tables: Tables, parameters: Parameters
 ) -> tuple[Model, Found, CombinedParameters]:
-    """Return a model with separate parameters for topics, its topics, and the parameters.
+    """Return a model whose topics have separate parameters, with its topics and parameter values.
 
     A topic gets its own parameters if some are set for it, or if several topics serve the same sensor.
 
@@ -64,7 +63,7 @@ def with_own_parameters(
 
 
 def check_tables(label: str, model: Model, found: Sequence[Found], tables: Tables) -> None:
-    """Raise BadInput if a topic in `tables` is not used or its sensor does not read a parameter."""
+    """Raise BadInput if a topic in `tables` is unused or its sensor ignores a parameter given there."""
     for topic, table in tables.items():
         sensors = [sensor for each in found for sensor, own in each.sensors if own.name == topic]
         if not sensors:
@@ -85,7 +84,7 @@ def check_tables(label: str, model: Model, found: Sequence[Found], tables: Table
 
 @lru_cache(maxsize=256)
 def read_by(model: Model, sensor: Sensor) -> tuple[str, ...]:
-    """List the parameters that a sensor reads and the motion does not."""
+    """List the parameters that a sensor reads, but the motion does not."""
     names, state = number_fields(model.parameters), trial_state(model.kinds)
     read, moving = (TracedParameters(dict.fromkeys(names)) for _ in range(2))
     with np.errstate(all="ignore"):
@@ -101,7 +100,7 @@ def read_by(model: Model, sensor: Sensor) -> tuple[str, ...]:
 
 
 def _uses(model: Model, sensor: Sensor) -> list[Sensor]:
-    """List the model's sensors that read one topic of this kind."""
+    """List the model's sensors that read the same kind of topic as this sensor."""
     return [each for each in model.all_sensors if each.topic == sensor.topic]
 
 
@@ -183,7 +182,7 @@ def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
 
 @pure
 class _Own:
-    """Parameters, some of which are replaced by those of a topic."""
+    """Parameters, some of which are replaced by a topic's own parameters."""
 
     def __init__(self, parameters: Settings, fields: tuple[tuple[str, str], ...]) -> None:
         self._parameters, self._fields = parameters, dict(fields)
@@ -194,7 +193,7 @@ class _Own:
 
 
 def _reading(function: OfModel, place: int, fields: Mapping[str, str]) -> OfModel:
-    """Wrap a function so that its argument `place`, the parameters, is replaced by a topic's parameters.
+    """Wrap a function so that the parameters, its argument number `place`, become those of a topic.
 
     The wrapper counts as unchanged as long as the wrapped function is unchanged; see
     `fuselog.replay.tracing.reads`.

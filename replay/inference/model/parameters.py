@@ -17,7 +17,7 @@ CombinedParameters = Any  # type: ignore[explicit-any]
 
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """List the parameters that the functions of a model can read, that is, all numbers."""
+    """List the parameters that a model's functions can read: all parameters that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")
     return tuple(
@@ -37,7 +37,7 @@ class ModelParameters(Parameters):  # type: ignore[explicit-any]
     """Options of every model.
 
     A parameter that is not set is read from the channels of the log: first from the sensor's own
-    channel, then from those of the control, the prior and the other sensors.
+    channel, then from the channels of the control, the prior and the other sensors.
 
     Attributes:
         gate_probability: measurements whose NIS exceeds this quantile of the chi-square distribution are

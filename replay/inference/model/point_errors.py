@@ -2,9 +2,9 @@
 
 The errors model measurement noise that is not white: for example, the error of ranges to one anchor, or
 between an anchor and a tag, may stay the same for seconds. This is a transformation of models: each
-point or pair of points gets a component of the state, which is added to its measurements. The component
-is a random walk or a first-order Gauss-Markov process with mean zero. Bar-Shalom, Li and Kirubarajan,
-Estimation with Applications to Tracking and Navigation, 2001, section 8.2.
+point or pair of points gets a component of the state, which is added to the measurements of the point or
+pair. The component is a random walk or a first-order Gauss-Markov process with mean zero. Bar-Shalom, Li
+and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.2.
 """
 
 import re
@@ -30,14 +30,14 @@ Names = tuple[str, ...]
 
 
 class PointError(NamedTuple):
-    """Error of the `measured` component for the points with these numbers, one per map."""
+    """Error of the `measured` component for the points with these numbers, one point per map."""
 
     measured: str
     numbers: tuple[int, ...]
 
     @property
     def name(self) -> str:
-        """Name of its component of the state."""
+        """Name of the state component for this error."""
         return "_".join(["error", self.measured, *map(str, self.numbers)])
 
 
@@ -45,13 +45,13 @@ Errors = tuple[PointError, ...]
 
 
 def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
-    """Return the errors that an entry of `estimate` names; empty if it names a parameter.
+    """Return the errors that an entry of `estimate` names; empty if the entry names a parameter.
 
     `range_m[3]` is the error of range_m for point 3; `range_m[0:8]` are the errors for points 0 to 7;
-    `range_m[0:8,0:3]` are those for all pairs with points 0 to 2 of the second map.
+    `range_m[0:8,0:3]` are the errors for all pairs of these points with points 0 to 2 of the second map.
 
     Args:
-        where: the estimator and option, for errors.
+        where: the estimator and option, for error messages.
         model: model with the sensors that have these errors.
         asks: the entry, such as `range_m[0:8]`.
 

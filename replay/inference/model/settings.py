@@ -40,7 +40,7 @@ def reading_settings(names: tuple[str, ...]) -> ReadSettings:
 
 
 def trial_parameters(model: Model) -> Settings:
-    """Make parameters for trial calls of functions, in which every number is 1."""
+    """Make parameters with the value 1 for trial calls of functions."""
     names = number_fields(model.parameters)
     return settings_type(names)(*(1.0,) * len(names))
 
@@ -67,10 +67,10 @@ def settings_of(
     """Collect the numbers (1 + sensors, fields) of motion and sensors from parameters and channels.
 
     A number that is not given is read from the channels of the control, the prior and the sensors; for a
-    sensor, its own channel is first.
+    sensor, its own channel is read first.
 
     Args:
-        label: label of the estimator, for errors.
+        label: label of the estimator, for error messages.
         bound_model: the bound model, with the sensors of the log.
         found: its topics.
         parameters: parameters given by the user.
@@ -130,7 +130,7 @@ def settings_of(
 def _stated(
     found: Found, topics: Sequence[Topic], name: str, parameters: type[ModelParameters]
 ) -> float:
-    """Return the value that channels state for a parameter; NaN if none states it.
+    """Return the value that channels state for a parameter; NaN if no channel states it.
 
     If a fallback replaces the control, the noise is read from the topic of the fallback.
     """
@@ -146,8 +146,8 @@ def _stated(
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
     """List the coordinates of the tangent plane's origin that are neither given nor stated by channels.
 
-    The origin of the tangent plane into which fixes are projected then provides them, so that, for
-    example, gravity matches the position.
+    The coordinates are then taken from the origin of the tangent plane into which fixes are projected,
+    so that, for example, gravity matches the position.
     """
     stating = _stating(found)
     return tuple(
@@ -161,7 +161,7 @@ def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, .
 
 
 def _of_origin(bound_model: BoundModel, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """Return the coordinates that `origin_parameters` lists; typical values until the first fix."""
+    """Return the coordinates that `origin_parameters` lists, or typical values before the first fix."""
     start = bound_model.model.start
     usual = start.parameters if start is not None else {}
     return {
@@ -185,8 +185,8 @@ def placed_settings(
         names: names of the columns.
         found: topics of the model.
         parameters: parameters given by the user.
-        origins: (runs, 3) origin of each run's tangent plane, which is its first fix if none is stated;
-            None without fixes.
+        origins: (runs, 3) origin of each run's tangent plane, which is the run's first fix if no origin
+            is stated; None without fixes.
         runs: number of runs.
     """
     placed = np.empty((runs, *settings.shape[-2:]))
@@ -212,7 +212,7 @@ def assumed_of(
     """Return the parameters that are assumed because a log without a prior does not state them.
 
     Args:
-        label: label of the estimator, for errors.
+        label: label of the estimator, for error messages.
         bound_model: the bound model, with the sensors of the log.
         found: its topics.
         parameters: parameters given by the user.
@@ -255,7 +255,7 @@ def _needed(
 
 
 def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
-    """Explain why a message was skipped, and what to do; empty if its covariance cannot be missing."""
+    """Explain why a message was skipped and how to use it; empty if no covariance can be missing."""
     if not sensor.covariance:
         return ""
     parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))

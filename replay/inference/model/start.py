@@ -22,23 +22,23 @@ class Align(Protocol):
 class Start:
     """Assumptions about the start in a log without a prior, such as a log recorded for other purposes.
 
-    The estimate starts at the first message that measures components of the state by name, with their
+    The estimate starts at the first message that measures named components of the state and states their
     covariance, such as a fix or a pose. Other components are zero, with the uncertainty given here.
     Without sensors, the estimate starts at zero, which defines the origin of its frame. Sensors that do
     not measure the state itself need a prior.
 
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
-        parameters: numbers that no channel of such a log states.
+        parameters: values of parameters that no channel of such a log states.
         align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state at the
-            last of k fixes, or None if they do not determine the state yet. The path (k, n) starts at
-            zero and follows from the control only; the fixes (k, 2) have covariances (k, 2, 2) and span
-            `span_s`. The estimate starts just after the last fix, so that no fix is used twice. `align`
-            is needed for a state that a single position does not determine.
-        find: (streams, parameters) -> `Started`, used instead of a start at one message or by `align`,
-            for a state that is found from several messages. The streams are the first messages of a run
-            and the maps, by the names of their topics in the model. It raises BadInput if these messages
-            do not determine the state. A model with `find` needs a sensor.
+            last of k fixes, or None if the fixes do not determine the state yet. The path (k, n) starts
+            at zero and is computed only from the control; the fixes (k, 2) have covariances (k, 2, 2)
+            and span `span_s`. The estimate starts just after the last fix, so that no fix is used twice.
+            `align` is needed for a state that a single position does not determine.
+        find: (streams, parameters) -> `Started`, for a state that must be found from several messages;
+            it is used instead of `align` or a start at one message. The streams are the first messages
+            of a run and the maps, by the topic names that the model uses. It raises BadInput if these
+            messages do not determine the state. A model with `find` needs a sensor.
         check_prior: (streams, parameters) -> sentences on contradictions between the prior and the first
             messages, if the log has a prior. The sentences are reported, but do not end the replay.
     """

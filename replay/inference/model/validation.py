@@ -25,10 +25,10 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Settings)
     """Call the functions of a motion once, uncompiled.
 
     Args:
-        where: the estimator, for errors.
+        where: name of the estimator, for error messages.
         model: model of the motion.
         motion: one of the motions of the model.
-        parameters: a number for every parameter, in an object that records the names read.
+        parameters: a number for every parameter, in an object that records which names are read.
 
     Raises BadInput if a function fails or contradicts the model's declarations.
     """
@@ -75,9 +75,9 @@ def switching_of(where: str, model: Model, parameters: Settings) -> tuple[Floats
     """Return the rates (M (M - 1),) between the modes of a model and the initial probabilities (M,).
 
     Args:
-        where: the estimator, for errors.
+        where: name of the estimator, for error messages.
         model: model with M modes.
-        parameters: parameters of its functions.
+        parameters: parameters of the model's functions.
 
     Raises BadInput if a rate is negative or the probabilities are invalid.
     """
@@ -107,10 +107,10 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
     """Call the functions of a sensor once, uncompiled; see `check_motion`.
 
     Args:
-        where: the estimator, for errors.
+        where: name of the estimator, for error messages.
         model: model of the sensor.
         sensor: one of the sensors of the model.
-        parameters: a number for every parameter, in an object that records the names read.
+        parameters: a number for every parameter, in an object that records which names are read.
     """
     where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
@@ -139,7 +139,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Settings)
 
 
 def _check_interpolated(where: str, model: Model, control: Control) -> None:
-    """Raise BadInput if the control of a sensor is not interpolated: measurements would be NaN."""
+    """Raise BadInput if a sensor's control is not interpolated, because measurements would be NaN."""
     driving = model.control
     if driving is None or driving.components != control.components:
         asked, given = (

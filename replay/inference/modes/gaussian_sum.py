@@ -1,9 +1,9 @@
 """Gaussian-sum filter (`bank`), which splits a prior that is too wide in an angle.
 
 The prior is split along the widest direction of its angles, such as an unknown heading, into adjacent
-Gaussians. Each Gaussian is filtered separately; every message weights them by its likelihood, and the
-estimate is their mixture. Members with negligible probability are removed, and the remaining ones are
-merged when they agree; eventually, the sum costs as much as one filter.
+Gaussians. Each Gaussian is filtered separately; every message weights the Gaussians by its likelihood,
+and the estimate is the mixture of all Gaussians. Members with negligible probability are removed, and
+the remaining ones are merged when they agree, so the sum eventually costs no more than one filter.
 
 Magill, Optimal Adaptive Estimation of Sampled Stochastic Processes, IEEE TAC 10(4), 1965.
 """
@@ -53,7 +53,7 @@ AGREED = 0.1  # mean squared distance below which the members are merged
 
 
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
-    """Filter of every member, and number of members.
+    """The filter that every member uses, and the number of members.
 
     Members are adjacent, with a standard deviation of half their distance, so that their sum is smooth.
     A narrower prior has fewer members; a prior that is no wider than a member is not split. The number
@@ -79,7 +79,7 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 class GaussianSumBelief(NamedTuple):
-    """Gaussians of all runs (the first axis); of the M members, the remaining ones come first.
+    """Gaussians of all runs (the first axis); the remaining ones of the M members come first.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
@@ -97,7 +97,7 @@ class GaussianSumBelief(NamedTuple):
 
 
 class GaussianSumMemory(NamedTuple):
-    """Working memory of one core: for the filter of members, their mixture, and `factor` (t, t)."""
+    """Working memory of one core: for the members' filter, for their mixture, and `factor` (t, t)."""
 
     filters: tuple[CoreMemory]
     mixture: MixtureMemory
@@ -217,10 +217,10 @@ def gaussian_sum_steps(bound_model: BoundModel, inner: Steps, members: int) -> S
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
-    """Find the direction (t,) among all angles in which a covariance is widest, and its variance.
+    """Find the direction (t,) in the angles along which the variance is largest, and that variance.
 
-    If several directions are equally wide, the result is that of the first angle or orientation, as
-    close as possible to the first of its axes.
+    If several directions have the same variance, the first angle or orientation is used, with a
+    direction as close as possible to its first axis.
 
     Args:
         kinds: kinds of the state's components.
@@ -274,7 +274,7 @@ class GaussianSumFilter(MixtureFilter):
 
     @property
     def names(self) -> Sequence[str]:
-        """Names of the members, by their angle from the prior's mean."""
+        """Names of the members, which state the angle from the prior's mean."""
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 

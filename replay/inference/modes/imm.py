@@ -1,14 +1,14 @@
 """Interacting multiple models (IMM): one filter per mode, and probabilities of the modes.
 
-Within dt seconds, an object changes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt).
-Before a prediction, the Gaussians of the modes are mixed,
+Within dt seconds, an object changes from mode i to mode j with probability Pi_ij, where Pi = expm(rates
+dt). Before a prediction, the Gaussians of the modes are mixed,
 
     c_j = sum_i mu_i Pi_ij,  mu_(i|j) = mu_i Pi_ij / c_j,
 
 each mode predicts its own mixture, and every message makes mu_j proportional to mu_j N(v_j; 0, S_j).
 Mixtures are computed in the tangent space of the most probable mode; the right Jacobian transforms
-covariances to this space, and from there to that of the mean of the mixture. Probabilities are also
-stored as logarithms, because the probability of a mode that fits badly can be below the smallest
+covariances to this space, and from there to the tangent space of the mixture's mean. Probabilities are
+also stored as logarithms, because the probability of a mode that fits badly can be below the smallest
 floating-point number.
 
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
@@ -72,8 +72,8 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
 
     Attributes:
         filter: the filter that every mode uses: ekf, iekf, ukf, lrkf, analytic or sqrt.
-        smoothed_modes: whether to output, at the end of the run and on a separate topic, also the
-            probabilities of the modes given all data; the state is not smoothed.
+        smoothed_modes: whether to also output the mode probabilities given all data, on a separate topic
+            at the end of the run; the state is not smoothed.
     """
 
     filter: str = "ekf"
@@ -92,7 +92,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 def interacting_steps(bound_model: BoundModel, filters: Sequence[Steps]) -> Steps:
-    """Make the steps of an interacting multiple model filter with these filters of the modes.
+    """Make the steps of an interacting multiple model filter from the steps of the modes' filters.
 
     Args:
         bound_model: the bound model with all its modes and the sensors of the log.

@@ -81,7 +81,7 @@ class InteractingMemory(NamedTuple):
 
 
 class FillTransition(Protocol):
-    """Function that fills Pi (M, M) from the rates (M (M - 1),) between modes over a duration."""
+    """Function that fills Pi (M, M) for a duration from the rates between modes (M (M - 1),)."""
 
     def __call__(self, rates: Floats, duration_s: float, transition: Floats, /) -> None: ...
 
@@ -119,8 +119,8 @@ def transition_matrix(modes: int) -> FillTransition:
 
     The method is uniformisation: with L dt added to the diagonal, where L is the fastest rate of leaving
     a mode, the matrix has no negative entries, so no digits cancel; the factor exp(-L dt) compensates
-    for this. The duration is halved until the series is short, and the result is squared as many times;
-    finally, the rows are normalised to a sum of one.
+    for this. The duration is halved until the series is short, and the result is squared once per
+    halving; finally, the rows are normalised to a sum of one.
     """
     changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
     rate_of = tuple(
@@ -259,7 +259,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[ToCommonTa
 
 
 def likeliest_of(probability: Floats) -> int:
-    """Return the index of the most probable mode; if several are equal, the first."""
+    """Return the index of the most probable mode, the first of several with the same probability."""
     likeliest = 0
     for mode in range(1, len(probability)):
         if probability[mode] > probability[likeliest]:

@@ -87,11 +87,11 @@ class UpdateMixture(Protocol):
 
 
 def predicting(filters: Sequence[Steps]) -> PredictModes:
-    """Make `predict(belief, ...)`, which predicts the Gaussians of all modes; False means failure.
+    """Make `predict(belief, ...)`, which predicts all modes' Gaussians and returns False on failure.
 
     Steps of a filter are called with the number of a run, and with Gaussians whose first axis is the
     run. Here and in `mixture_update`, the first axis is the mode of one run, and the number of the mode
-    replaces that of the run.
+    replaces the number of the run.
     """
     predictions = tuple(each.predict for each in filters)
 
@@ -110,9 +110,9 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
 
     It is called as `update(gaussians, (probability, log_probability), ...)` and works in place; see
     `Steps.updates`. A measurement within the gate of one mode is accepted by all modes, because
-    likelihoods of different measurements cannot be compared. The recorded innovation is that of the
-    mixture; its covariance includes the spread between the innovations of the modes; the log-likelihood
-    is log sum_j mu_j N(v_j; 0, S_j).
+    likelihoods of different measurements cannot be compared. The recorded innovation is the mixture's;
+    its covariance includes the spread between the innovations of the modes; the log-likelihood is log
+    sum_j mu_j N(v_j; 0, S_j).
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -205,7 +205,7 @@ def mixture_update(bound_model: BoundModel, number: int, update_mode: UpdateRun)
 
 
 class MixtureFilter(Filter, ABC):
-    """Filter whose belief is several Gaussians; their probabilities are a further output."""
+    """Filter whose belief consists of several Gaussians; it also outputs their probabilities."""
 
     @property
     @abstractmethod

@@ -33,7 +33,7 @@ def smoothing_over_runs(modes: int) -> OverRuns:
 
 
 def smoothing(modes: int) -> RunOnce:
-    """Make `smooth(run, ...)`, which replaces probabilities (n, M) by those given all data of a run.
+    """Make `smooth(run, ...)`, which conditions the probabilities (n, M) on all data of a run.
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
     """

@@ -1,4 +1,4 @@
-"""Particle filter: its method, and the filter that seeds each run by its first measurement."""
+"""The method of the particle filter, and the filter, which seeds each run by its first measurement."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -83,7 +83,7 @@ def particle_steps(
     Args:
         bound_model: the bound model.
         particles: number of particles.
-        resample_below: fraction of effective particles below which they are resampled.
+        resample_below: fraction of effective particles below which the particles are resampled.
         progressive: see `ParticleParameters`.
     """
     model, motion, sensors = bound_model.model, bound_model.motion, bound_model.sensors
@@ -174,7 +174,7 @@ class ParticleFilter(Filter):
         return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
-        """Report, on the topic `started`, estimated parameters that cannot change in new runs."""
+        """Report the constant estimated parameters of starting runs on the topic `started`."""
         options = self.parameters
         moving = {*(options.estimate_time_s or ())}
         moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
@@ -207,7 +207,7 @@ class ParticleFilter(Filter):
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
     def begun(self, state: FilterState, seeds: Mapping[int, list[Columns]]) -> FilterState:
-        """Draw particles from the priors of some runs, each with a generator seeded by its data."""
+        """Draw particles from the priors of some runs, with a generator seeded by each run's data."""
         if not seeds:
             return state
         carried = state.carried
@@ -293,7 +293,7 @@ def _made_for(parameters: ParticleParameters) -> Method:
 
 
 def _lacks_likelihood(model: Model) -> str:
-    """Name a sensor whose noise is not additive and that has no likelihood function."""
+    """Return the name of a sensor with non-additive noise and no likelihood function."""
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:

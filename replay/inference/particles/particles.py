@@ -76,8 +76,8 @@ class SensorMemory(NamedTuple):
     Attributes:
         innovation: innovation of the cloud as a whole.
         differences: (N, m) measured minus predicted.
-        noise: (1 or N, m, m) covariance of the noise, later its factor; N if it differs between
-            particles.
+        noise: (1 or N, m, m) covariance of the noise, later replaced by its factor; the first axis has N
+            entries if the noise differs between particles.
         determinant: (1 or N,) log det of the covariance.
         kept: (m,) indices of the components that are used.
     """
@@ -94,7 +94,8 @@ class Kernel(NamedTuple):
 
     Attributes:
         width: width of the Gaussian kernel, relative to the standard deviation of the cloud.
-        numbers, words, drawn: normal random numbers, their random words, and the numbers as (N, t).
+        numbers, words, drawn: normal random numbers, the random words from which they are made, and the
+            numbers as (N, t).
         mean, covariance: (n,), (t, t) mean and covariance of the cloud; the covariance is later replaced
             by its factor.
         trial: (N,) weights.
@@ -114,15 +115,15 @@ class ParticleMemory(NamedTuple):
 
     Attributes:
         least_effective: effective number below which particles are resampled.
-        numbers, words, drawn: normal random numbers, their random words, and the numbers as (N, noises
-            of the motion).
-        control, noise: (controls,), (noises of the motion,) drawn for one particle.
+        numbers, words, drawn: normal random numbers, the random words from which they are made, and the
+            numbers as (N, noises of the motion).
+        control, noise: (controls,), (noises of the motion,) samples for one particle.
         lower: (t, t) factor of the covariance of additive noise.
         chosen, spare: (N,), (N, n) for resampling.
         likelihood: (N,) logarithms.
         sensors: memory of each sensor.
-        work: workspace for derivatives by noise.
-        kernel: memory to spread the particles, which is empty if it is not used.
+        work: workspace for derivatives with respect to noise.
+        kernel: memory to spread the particles; empty if they are not spread.
     """
 
     least_effective: float
@@ -182,7 +183,7 @@ def moving(bound_model: BoundModel, by_control: int, renew: Renew) -> PredictRun
 
     Args:
         bound_model: the bound model.
-        by_control: number of random numbers of a particle that are errors of the control; they come
+        by_control: number of a particle's random numbers that are errors of the control; these come
             first.
         renew: `renew(run, cloud, memory)` resamples and returns whether it succeeded.
     """
@@ -246,9 +247,9 @@ def effective_number(weight: Floats) -> float:
 
 
 def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
-    """Multiply weights of sum 1 by a power of likelihoods, and normalise them.
+    """Multiply weights, which sum to 1, by a power of likelihoods, and normalise them.
 
-    A particle whose likelihood is NaN gets the mean likelihood of the others.
+    A particle whose likelihood is NaN gets the mean likelihood of all other particles.
 
     Args:
         weight: (N,), changed in place.
@@ -331,9 +332,9 @@ def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: Parti
 def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
     """Make `spread(states, offsets, interval, memory)`, which draws the additive noise.
 
-    The samples are tangent vectors at the states before the motion. The noise is factored only if it
-    differs from that of the previous particle. The function returns False if a covariance is not
-    positive semidefinite.
+    The samples are tangent vectors at the states before the motion. The covariance of the noise is
+    factored only if it differs from that of the previous particle. The function returns False if a
+    covariance is not positive semidefinite.
     """
     t, noise = bound_model.model.tangent, bound_model.motion.noise
     assert noise is not None
@@ -366,7 +367,7 @@ def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
 
 
 def summing_up(model: Model) -> EstimateRun:
-    """Make the estimate: intrinsic mean and covariance, and particles if they are requested."""
+    """Make the estimate: the intrinsic mean and covariance, and the particles if requested."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, range_of(t))
     weighted_mean, straight = weighted_mean_of(range_of(n)), set(model.kinds) <= {"linear"}

@@ -1,10 +1,10 @@
 """Progressive particle updates, which process a measurement in parts and spread resampled particles.
 
-If a measurement is much more accurate than the cloud, only a few particles keep weight; without noise of
-the motion, all later particles are copies of these. Therefore, the particles are first weighted by a
-power of the likelihood for which enough of them stay effective; after they have been resampled, the rest
-of the likelihood is applied in the same way. Resampled particles are spread by a Gaussian kernel and
-shrunk towards their mean, which preserves mean and covariance.
+If a measurement is much more accurate than the cloud, only a few particles keep a significant weight;
+without noise of the motion, all later particles are copies of these few. Therefore, the particles are
+first weighted by a power of the likelihood, chosen so that enough particles stay effective. After
+resampling, the rest of the likelihood is applied in the same way. Resampled particles are spread by a
+Gaussian kernel and shrunk towards their mean, which preserves mean and covariance.
 
 Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised particle filters", 2001, in
 Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
@@ -172,7 +172,7 @@ def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
 
 
 def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemory) -> float:
-    """Find the largest power, at most `left`, for which enough particles stay effective."""
+    """Find the largest power, at most `left`, at which enough particles remain effective."""
     least = memory.least_effective
     if not effective_after(weight, likelihood, left, memory.kernel.trial) < least:
         return left

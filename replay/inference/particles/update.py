@@ -49,8 +49,9 @@ def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> Upda
     """Make the update by sensor `number`, which weights particles by the likelihood of the measurement.
 
     The recorded innovation, its NIS and the gate use the first two moments of the cloud; the
-    log-likelihood is that of the weighted particles. A component that no particle can predict is left
-    out, and a particle that cannot predict one of the other components keeps its share of the weight.
+    log-likelihood is computed from the weighted particles. A component that no particle can predict is
+    left out, and a particle that cannot predict one of the other components keeps its share of the
+    weight.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -261,8 +262,8 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 def _likelihood(bound_model: BoundModel, number: int) -> Likelihood:
     """Make `likelihood(states, i, data, parameters, own, size)`, the log-likelihood at particle i.
 
-    It uses the likelihood function of the model, otherwise Gaussian noise. The result is NaN if the
-    particle cannot predict the measurement.
+    It uses the model's likelihood function if there is one; otherwise, it assumes Gaussian noise. The
+    result is NaN if the particle cannot predict the measurement.
     """
     sensor = bound_model.sensors[number]
     if sensor.log_likelihood is None:

@@ -65,7 +65,7 @@ class Points:
         return np.where(self.keys[rows] == keys, rows, -1)
 
     def at(self, rows: Integers) -> Floats:
-        """Return the positions (m, d) in rows that `rows` returned; NaN for -1."""
+        """Return the positions (m, d) at rows that `rows` returned; NaN for row -1."""
         return self._places.take(rows, axis=0)
 
 
@@ -184,7 +184,7 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """Messages of one topic: data (n, width), source, target, and whether each is skipped.
+    """Messages of one topic: data (n, width), source, target, and whether each message is skipped.
 
     `rows` (n,) are their numbers in the topic; None for all messages.
     """
@@ -197,7 +197,7 @@ class Table(NamedTuple):
 
 
 def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
-    """Convert the messages of a topic to measurements of a further sensor, with indices of events.
+    """Convert messages of a topic to measurements of a further sensor; also return event indices.
 
     Messages without a measurement for the sensor are left out.
     """
@@ -319,7 +319,7 @@ def sensor_table(
 
 
 def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:
-    """Compute the variances of a sensor for messages without a covariance; NaN if there are none.
+    """Compute a sensor's variances for messages without a covariance; NaN if it defines none.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -341,7 +341,7 @@ def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
 
 
 def with_covariance(sensor: Sensor, ragged: Ragged) -> MeasuredVectors:
-    """Read measurements, their covariances, and whether the covariance is missing."""
+    """Read measurements, their covariances, and whether each message lacks a covariance."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
     assert sensor.read is not None
@@ -356,7 +356,7 @@ def _fields(stream: Stream, names: Sequence[str]) -> Floats:
 
 
 def _field(stream: Stream, name: str, size: int) -> Floats:
-    """Read a field of numbers or vectors (n, size); raise BadInput if it has another width."""
+    """Read a field of numbers or vectors (n, size); raise BadInput if its width differs."""
     if not len(stream):  # the width of vectors is unknown here
         return np.empty((0, size))
     numbers = np.asarray(stream[name], float).reshape(len(stream), -1)
@@ -381,7 +381,7 @@ def _computed(read: Callable[[Stream], Floats], ragged: Ragged, components: int)
 
 
 def not_driven(name: str, control: Control, found: Found, events: FilterEvents) -> Ragged:
-    """Report measurements that were skipped in a gap of the control.
+    """Report measurements that were skipped because the control had a gap.
 
     Args:
         name: name of the filter.
@@ -408,7 +408,7 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
 def passed_over(
     name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
-    """Report skipped messages, which lack a covariance or a finite control; [] if none can be skipped.
+    """Report messages skipped for lack of a covariance or a finite control; [] if none can be skipped.
 
     Args:
         name: name of the filter.

@@ -108,7 +108,7 @@ def _steps(bound_model: BoundModel, method: Method) -> Steps:
 
 @lru_cache(maxsize=64)
 def _compiled(bound_model: BoundModel, method: Method) -> tuple[OverRuns, Steps]:
-    """Make the loop over the runs, which is compiled when first called, and its steps."""
+    """Make the loop over the runs, which is compiled at its first call, and the steps that it calls."""
     steps = _steps(bound_model, method)
     names = number_fields(bound_model.model.parameters)
     loop = recursion(bound_model, steps, reading_settings(names))
@@ -139,7 +139,7 @@ class Filter:
     """Bound filter, with the functions `start`, `run` and `finish` of an `estimator.Recursive`.
 
     Attributes:
-        name: part of the names of its output topics after `/estimates/`.
+        name: the part after `/estimates/` in the names of its output topics.
         found: its topics.
         bound_model, method, parameters: the bound model, the method and its parameters.
         settings: (1 + sensors, fields); see `settings_of`.
@@ -285,7 +285,7 @@ class Filter:
 
     @cached_property
     def beside_settings(self) -> Hashable:
-        """Key of the filter's definition, except settings that only the loop over the runs reads."""
+        """Key of the filter's definition, without settings that only the loop over the runs reads."""
         names = {*number_fields(self.bound_model.model.parameters)} - {"gate_probability"} | {
             "of_topics"
         }
@@ -391,7 +391,7 @@ class Filter:
     def gates(self) -> Floats:
         """Bounds of the NIS (sensors + 1, largest measurement + 1), by number of components.
 
-        The last row is that of an open gate.
+        The last row is an open gate.
         """
         largest = max((len(sensor.measured) for sensor in self.bound_model.sensors), default=0)
         bounds = _nis_bounds(self.parameters.gate_probability, largest)

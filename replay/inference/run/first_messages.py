@@ -1,4 +1,4 @@
-"""First messages of every run, and states that they determine."""
+"""First messages of every run, and the states that these messages determine."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -18,7 +18,7 @@ WIDER = 30.0  # times a message's sigma: such a prior has a thousandth of its we
 
 
 class Begun(NamedTuple):
-    """Starts of runs, to be filled: stamps (runs,), FOREVER_NS if unknown, means and covariances."""
+    """Starts of runs, to be filled: stamps (runs,), FOREVER_NS if not known; means; covariances."""
 
     time_ns: Integers
     mean: Floats
@@ -26,7 +26,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """Sentence to report, its stamp in each run (runs,), and whether it applies to the run (runs,)."""
+    """Sentence to report, its stamp in each run (runs,), and whether it applies to each run (runs,)."""
 
     text: str
     time_ns: Integers
@@ -81,7 +81,7 @@ def state_by_message(bound_model: BoundModel, number: int, data: Floats) -> tupl
 def first_of_runs(
     ragged: Ragged, clock: Clock, usable: Booleans | None
 ) -> tuple[Integers, Booleans, Integers]:
-    """Find stamp, existence and row (runs,) of the first usable message of every run.
+    """Find the first usable message of every run: its stamp, whether it exists, and its row.
 
     Args:
         ragged: messages of a topic, in all runs.

@@ -1,4 +1,4 @@
-"""History of the latest messages of every run, with the belief after each."""
+"""History of the latest messages of every run, with the belief after each message."""
 
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -20,7 +20,7 @@ Structure = tuple[tuple[str, "int | Structure"], ...]
 
 
 class KeptMessages(NamedTuple):
-    """Messages in order, and the belief after each; the first axis is the message, run by run.
+    """Messages in order, each with the belief after it; the first axis is the message, run by run.
 
     Attributes:
         time_ns, source, data, target_id: see `recursion.FilterEvents`; `target_id` is stored as uint32.
@@ -122,7 +122,7 @@ def no_history(bound_model: BoundModel, carried: RecursionState) -> History:
 
 
 def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """Count the most messages of any run within a window, among stored and new messages.
+    """Return the largest number of messages, stored and new, of any run within a window.
 
     Args:
         history: history of all runs.

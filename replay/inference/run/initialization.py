@@ -1,4 +1,4 @@
-"""Initialization of a filter in a log without a prior, and of its tangent plane.
+"""Initialization of a filter in a log without a prior, and of the filter's tangent plane.
 
 Such a log gets a prior at the first message that measures the state; see `start.Start`. The prior is
 much wider than the message, so that the message itself, which is also processed as a measurement,
@@ -51,7 +51,7 @@ class Initializer:
     """Search for the start of a filter in the first messages of a log.
 
     Attributes:
-        name: part of the names of its output topics after `/estimates/`.
+        name: the part after `/estimates/` in the names of its output topics.
         found: its topics.
         bound_model: the bound model, with the sensors of the log.
         settings: (1 + sensors, fields), parameters of motion and sensors.
@@ -66,7 +66,7 @@ class Initializer:
 
     @property
     def initialization(self) -> Initialization | None:
-        """Method of finding the start; None if the log states everything."""
+        """Method of finding the start in messages; None if no messages are needed for the start."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
@@ -102,7 +102,7 @@ class Initializer:
 
     @property
     def _aligns(self) -> bool:
-        """Whether the whole state must be determined from several fixes, and can be."""
+        """Whether the whole state can and must be determined from several fixes."""
         model = self.bound_model.model
         kinds = {sensor.topic: len(sensor.measured) for _, sensor, _ in self._measuring}
         can_align = bool(model.start and model.start.align)
@@ -278,7 +278,7 @@ class Initializer:
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Settings]:
-        """Return first messages and maps, by the names of topics in the model, and the parameters."""
+        """Return first messages and maps by the model's names of their topics, and the parameters."""
         model, control = self.bound_model.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -342,7 +342,7 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Start runs just after the first fixes that determine the state, with the path between them.
+        """Start runs just after the first fixes that, with the path between them, determine the state.
 
         If several topics serve the same sensor, the fixes of the first topic are used.
         """
@@ -374,7 +374,7 @@ class Initializer:
     def _align(
         self, events: FilterEvents, run: int, bound_model: BoundModel
     ) -> tuple[int, Floats, Floats] | None:
-        """Align a run; return stamp, mean and covariance at one of its first fixes, or None."""
+        """Align a run with its first fixes; return stamp, mean, covariance at one of them, or None."""
         model = bound_model.model
         assert model.start is not None
         assert model.start.align is not None
@@ -410,7 +410,7 @@ class Initializer:
         return None
 
     def _parameters(self) -> Settings:
-        """Return the parameters; for each sensor, use those of its first topic."""
+        """Return the parameters; for each sensor, use the parameters of its first topic."""
         model = self.bound_model.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
         for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):

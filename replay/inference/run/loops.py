@@ -1,7 +1,8 @@
 """Loops over the events of a run, shared by filters, trackers and networks.
 
 Events may be messages, scans of detections, or measurements and transmissions of a network's nodes. All
-have `offsets` (runs + 1,) and `time_ns` (n,); they are the field `events` in the inputs of a recursion.
+events have `offsets` (runs + 1,) and `time_ns` (n,); they are the field `events` in the inputs of a
+recursion.
 """
 
 from typing import Protocol
@@ -13,7 +14,7 @@ from fuselog.replay.engine.streams.results import ALL_WELL
 class OnEvent(Protocol):
     """Function that is called for an event of a run; it returns ALL_WELL or the number of a failure.
 
-    Inputs, state, results and memory are those of the recursion; see `over_events`.
+    Inputs, state, results and memory belong to the recursion; see `over_events`.
     """
 
     def __call__(
@@ -70,7 +71,8 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
         process: `process(run, event, inputs, state, results, memory)` updates the state by an event and
             returns ALL_WELL or the number of a failure. A negative number does not end the run, but
             nothing is recorded for the event.
-        record: function that is called in the same way after ALL_WELL; it fills the requested results.
+        record: function with the same arguments, which is called if `process` returned ALL_WELL; it
+            fills the requested results.
         fails: whether a run may fail; if not, the state needs no `failure`, and all events are
             processed.
 

@@ -1,4 +1,4 @@
-"""Reprocessing of out-of-sequence messages, with the same final belief as processing in order.
+"""Reprocessing of out-of-sequence messages; the final belief is the same as with messages in order.
 
 For every message within a window, the filter stores the message, the state after it, and its innovation.
 An out-of-sequence message is inserted at its stamp and position in the file, and all messages after it
@@ -60,8 +60,8 @@ class LateState(NamedTuple):
         carried: state after all messages so far.
         failure: failures of the runs.
         history: the stored messages.
-        window_ns: largest delay of a message that is reprocessed.
-        repeated: (n,) number of updates that each event caused to be repeated.
+        window_ns: largest delay up to which a message is reprocessed.
+        repeated: (n,) number of updates that were repeated because of each event.
         row: (runs,) row of the stored message that each run is processing.
     """
 
@@ -118,7 +118,7 @@ def reprocessing(
     def process_again(
         run: int, row: int, inputs: RunInputs, state: LateState, memory: CoreMemory
     ) -> int:
-        """Predict to a stored message and update by it; return a failure or ALL_WELL."""
+        """Predict to the time of a stored message and update by it; return a failure or ALL_WELL."""
         events, carried, kept, at = inputs.events, state.carried, state.history.kept, state.row
         stored = FilterEvents(
             events.offsets,
@@ -152,7 +152,7 @@ def reprocessing(
             innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: KeptMessages) -> int:
-        """Return the row of the last message at the newest stamp that has an estimate."""
+        """Find the newest stamp with an estimate, and return the row of its last message."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
             row -= 1
@@ -226,7 +226,7 @@ AnyFilterState = Any  # type: ignore[explicit-any]
 
 @dataclass(frozen=True)
 class OutOfSequenceFilter:
-    """Filter that reprocesses messages with delays of up to `window_ns`; same methods as `Filter`.
+    """Filter that reprocesses messages with delays of up to `window_ns`, with the methods of `Filter`.
 
     `inner` is a `filtering.Filter`, and the states are of its type.
     """
@@ -277,7 +277,7 @@ class OutOfSequenceFilter:
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: AnyFilterState) -> list[Ragged]:
-        """Return the innovations that further messages could have changed."""
+        """Return the innovations that waited because further messages could have changed them."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
@@ -311,7 +311,7 @@ def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
     """Set the log times of estimates to the arrival times of the events that requested them.
 
-    Each run has one estimate for each of these events after its prior, or only for the first of them.
+    Each run has estimates for all of these events after its prior, or only for the earliest of them.
 
     Args:
         estimates: estimates of the filter.

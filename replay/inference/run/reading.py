@@ -216,7 +216,7 @@ def _control_noise(
 
 
 def _driving(bound_model: BoundModel, found: Found) -> list[tuple[str, int]]:
-    """List the topic, and the index in its messages, of each component of the control."""
+    """For each component of the control, list its topic and its index in the topic's messages."""
     control = bound_model.model.control
     if control is None or found.control is None:
         return []

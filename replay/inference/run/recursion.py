@@ -113,7 +113,7 @@ class RunInputs(NamedTuple):
     Attributes:
         events: events in the order of processing.
         settings: (runs, 1 + sensors, fields); see `settings_of`.
-        gates: (sensors + 1, m + 1) bounds of the NIS by sensor; the last row is that of an open gate.
+        gates: (sensors + 1, m + 1) bounds of the NIS by sensor; the last row is an open gate.
     """
 
     events: FilterEvents
@@ -161,7 +161,7 @@ ResultsType = TypeVar("ResultsType", bound=tuple[AnyArgument, ...])
 def no_results(
     due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[EstimateRows, InnovationRows]:
-    """Allocate results; the rows of run r begin at due[r] and recorded[r].
+    """Allocate results; for run r, estimates begin at row due[r], innovations at row recorded[r].
 
     All columns share one array. With many arrays, the operating system would map the pages of each array
     separately, which takes half as long as running a small filter.
@@ -170,7 +170,7 @@ def no_results(
         due: (runs + 1,) offsets of the estimates.
         recorded: (runs + 1,) offsets of the innovations.
         model: the model, for the sizes of state and tangent space.
-        innovation_size: number of components that all sensors measure.
+        innovation_size: number of distinct components that the sensors measure.
     """
     places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
     memory = np.empty(places[-1][0].stop)
@@ -214,7 +214,7 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
 
 
 class ProcessEvent(Protocol):
-    """Function that predicts a run to an event and updates by it; see `processing`."""
+    """Function that predicts a run to the time of an event and updates by it; see `processing`."""
 
     def __call__(
         self,
@@ -251,7 +251,7 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
 
     Args:
         bound_model: the bound model.
-        steps: steps of the method for it.
+        steps: steps of the method for the bound model.
         settings_of: `settings_of(settings, row)` makes the parameters of a row.
 
     Returns:
@@ -265,7 +265,7 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
     controls = bound_model.model.controls
 
     def drive(run: int, data: Floats, carried: RecursionState) -> None:
-        """Set the control to that of an event; an interpolated control is at the end of its data."""
+        """Set the control to that of an event; if interpolated, it is at the end of the event's data."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
             if not np.isnan(data[first + k]):
@@ -295,7 +295,7 @@ def processing(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings)
         results: RunResults,
         memory: CoreMemory,
     ) -> int:
-        """Predict to one event and update by it; return a failure or ALL_WELL.
+        """Predict to the time of an event and update by it; return a failure or ALL_WELL.
 
         In a gap of the control after which the filter continues, the result is UNKNOWN.
         """
@@ -344,9 +344,9 @@ def recursion(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) 
 
     Args:
         bound_model: the bound model.
-        steps: steps of the method for it.
-        settings_of: `settings_of(settings, row)` makes the parameters of a row: row 0 is the motion, the
-            others are the sensors.
+        steps: steps of the method for the bound model.
+        settings_of: `settings_of(settings, row)` makes the parameters of a row: row 0 is the motion, and
+            all other rows are sensors.
 
     Returns:
         `follow(run, inputs, carried, results, memory)`, which changes `carried` in place.

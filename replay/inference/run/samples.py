@@ -32,10 +32,10 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Generators, ...], offsets: Integers
 ) -> Iterator[tuple[RowSlice, tuple[SampleSets, ...]]]:
-    """Yield slices of runs with their samples; the largest sampled function limits the slices.
+    """Yield slices of runs with their samples; the largest sampled function limits the slice size.
 
     Args:
-        samplers: one for each sampled function.
+        samplers: one sampler for each sampled function.
         generators: random generators by function and run; see `seeded_generators`.
         offsets: (runs + 1,) offsets of the events.
     """

@@ -15,7 +15,7 @@ EARLY = 1000  # intervals of output: a prior that is older than this does not st
 
 
 def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
-    """Test whether each event (n,) requests an estimate; at stamps of only the control, it may not."""
+    """Test whether each event (n,) requests an estimate; a stamp with only control messages may not."""
     control = bound_model.model.control
     if control is None or control.estimates or not bound_model.sensors:
         return events.wants_estimate
@@ -23,7 +23,7 @@ def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
 
 
 def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
-    """Test whether each event (n,) is the last of a stamp that has a chosen event.
+    """Test whether each event (n,) is the last of its stamp, and an event of this stamp is chosen.
 
     Args:
         is_last: (n,) whether each event is the last of its stamp.
@@ -102,7 +102,7 @@ def output_times(
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
-    """Merge two sequences of events by time, run by run; at equal stamps, the first comes first."""
+    """Merge two sequences of events by time, run by run; ties keep the order of the sequences."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
@@ -113,7 +113,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
 
 
 def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
-    """Add arrival times to events, equal to their stamps, if the other events have arrival times."""
+    """Add arrival times, equal to the stamps, to events if the other events have arrival times."""
     if events.arrival.shape[1] >= other.arrival.shape[1]:
         return events
     time_ns = events.time_ns
@@ -137,7 +137,7 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 def share_stamps(events: FilterEvents, columns: Iterable[int]) -> FilterEvents:
     """Replace control samples that have the same stamp by their mean, so that no sample is lost.
 
-    A recorder may give two samples the same stamp; otherwise, one of them would have no effect.
+    A recorder may give two samples the same stamp; without this step, one of them would have no effect.
 
     Args:
         events: events in the order of their stamps.
@@ -205,7 +205,7 @@ def fill_control(bound_model: BoundModel, events: FilterEvents) -> FilterEvents:
 
 
 def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
-    """Keep the last control for events that still wait at the end of a log, up to a gap.
+    """Use the last control for events that still wait at the end of a log, for at most `gap_ns`.
 
     Args:
         events: waiting events; the first one of a run is its last message of the control, if any.
@@ -228,8 +228,8 @@ def add_output_times(
 ) -> tuple[FilterEvents, Integers]:
     """Add events at regular output times, which request an estimate.
 
-    Output starts at the prior, or at the first event of the run if it is more than EARLY intervals
-    later.
+    Output starts at the prior, or at the run's first event if that event is more than EARLY intervals
+    after the prior.
 
     Args:
         events: events in order.

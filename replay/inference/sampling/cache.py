@@ -1,7 +1,7 @@
 """Cache of LCD sets on disk; each set is computed only once, and damaged files are ignored.
 
 A file (see `fuselog.recorders.compiling.cache`) contains a NumPy npz archive whose members are named
-after their sets. Common sets ship with the package (see `sampling.ship`); others are stored in the
+after their sets. Common sets ship with the package (see `sampling.ship`); other sets are stored in the
 user's cache.
 """
 

@@ -129,7 +129,7 @@ FAMILIES = {
 
 @lru_cache(maxsize=64)
 def parse_sampling(name: str) -> Sampling:
-    """Return the sampling of a name; see the module's docstring for the names.
+    """Return the sampling that a name denotes; see the module's docstring for the names.
 
     Raises:
         BadInput: the family is unknown, or a number or option is missing, unknown or out of bounds.

@@ -1,4 +1,4 @@
-"""Systematic resampling of the same number of particles, each in proportion to its weight.
+"""Systematic resampling to the same number of particles, chosen in proportion to their weights.
 
 Kitagawa, Journal of Computational and Graphical Statistics 5(1), 1996.
 """

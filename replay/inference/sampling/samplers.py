@@ -1,7 +1,7 @@
 """Samplers of N(0, I), with a common interface for filters.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section I.B; the randomised set is that of Dunik, Straka and Simandl, "The Development of a Randomised
+section I.B; the randomised set is from Dunik, Straka and Simandl, "The Development of a Randomised
 Unscented Kalman Filter", IFAC 2011.
 """
 
@@ -31,9 +31,9 @@ class Sampler:
     """Sampler for one dimension.
 
     `draw(generator, batch)` returns points (*batch, count, dimension) and weights (*batch, count).
-    Unless `redrawn`, they are read-only views of one set and the generator is not used. Consecutive
-    batches have the same numbers as one batch of their total size, so a log can be divided into blocks
-    anywhere.
+    Unless `redrawn` is true, points and weights are read-only views of one set, and the generator is not
+    used. Consecutive batches contain the same numbers as one batch of their total size, so a log can be
+    divided into blocks anywhere.
     """
 
     dimension: int

@@ -1,7 +1,7 @@
 """Sample sets for compiled filters: one set for all steps, or a new set for each step.
 
 A randomised sampling uses a separate generator for each run, seeded by the data of the run, so that a
-run has the same estimates alone and in an ensemble.
+run has the same estimates in an ensemble as by itself.
 """
 
 import copy
@@ -71,7 +71,7 @@ def seeded_by_data(
         data: (n, ...) of all runs; only the first row of each run is used.
         offsets: (runs + 1,) first row of each run.
         seed: seed of the estimator.
-        function: index of the sampled function, if there are several; each has separate generators.
+        function: index of the sampled function; each of several functions has separate generators.
     """
     words = np.ascontiguousarray(data).view(np.uint32).reshape(len(data), -1)
     return tuple(

@@ -1,7 +1,7 @@
 """Computation of the sample sets that ship with fuselog, in data/.
 
-Run it with `python -m fuselog.replay.inference.sampling.ship`. Another CPU may find another optimum of
-(nearly) the same D, so existing sets are not computed again.
+Run it with `python -m fuselog.replay.inference.sampling.ship`. A different CPU may find a different
+optimum with (nearly) the same D, so existing sets are not computed again.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ COMMON = (
 
 
 def main() -> None:
-    """Compute the sets that are missing in the shipped file, and replace the file."""
+    """Compute the sets that are missing from the shipped file, and replace the file."""
     found = {name: read_set(SHIPPED, name) for name in COMMON}
     sets = {
         name: compute_set(name, lambda message: print(message, flush=True)) if points is None else points

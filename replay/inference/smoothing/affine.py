@@ -6,8 +6,8 @@ d_k from these states, which are in a vector space:
     d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
 
 with the rotation E and the right Jacobian Jr, which are identities except for orientations. No inverse
-of Q is needed: if Q is singular, x_k is restricted to states that the noise can reach, and the cost is
-that of the noise. A robust loss is applied by reweighting.
+of Q is needed: if Q is singular, x_k is restricted to states that the noise can reach, and only the
+noise has a cost. A robust loss is applied by reweighting.
 
 Bell, SIAM J. Optim. 4(3), 1994.
 """
@@ -69,7 +69,7 @@ class Factors(NamedTuple):
 
 
 def no_factors(count: int, t: int) -> Factors:
-    """Allocate unknown factors for `count` steps."""
+    """Allocate factors for `count` steps, marked as unknown."""
     return Factors(np.empty((count, t, t)), np.empty((count, t), np.int64), np.full(count, -1))
 
 
@@ -83,7 +83,7 @@ class Trajectory(NamedTuple):
         kept: (nodes, n) states with the smallest cost so far.
         node: (events,) node of each event's stamp.
         scale: (nodes, t) variances of the start; damping adds pseudo-measurements of the current states,
-            whose variances are these, divided by the damping.
+            with these variances divided by the damping.
         loss: (2,) index in LOSSES, and scale of the loss.
         damping: (1,) damping of this pass.
         cost, held: (1,) costs of the trajectory with its own noise, and with the noise at `kept`.
@@ -107,7 +107,7 @@ class Trajectory(NamedTuple):
 
 
 def affine_steps(bound_model: BoundModel) -> Steps:
-    """Make the steps of the affine filter about a `Trajectory`, which `memory` gets as its only set."""
+    """Make the steps of the affine filter about a `Trajectory`, the only set that `memory` receives."""
     sensors = tuple(affine_sensor(bound_model, number) for number in range(len(bound_model.sensors)))
     steps = gaussian_filter(
         bound_model, affine_motion(bound_model), sensors, partial(workspace, bound_model)
@@ -187,7 +187,7 @@ class Carry(Protocol):
 
 
 class Reach(Protocol):
-    """Function that computes the offset of a node from its origin (n,), and whether it is defined."""
+    """Function that computes a node's offset from its origin (n,), and returns whether it is defined."""
 
     def __call__(self, trajectory: "Trajectory", node: int, origin: Floats, /) -> bool: ...
 
@@ -195,8 +195,8 @@ class Reach(Protocol):
 def carrying(kinds: tuple[str, ...]) -> Carry:
     """Make `carry(offset, rows, step)`, which multiplies rows (t, m) by E(-offset).
 
-    It transforms tangent vectors at one state to those at a state that differs by `offset`. `step` is
-    working memory.
+    It transforms tangent vectors at one state to tangent vectors at a state that differs by `offset`.
+    `step` is working memory.
     """
     turn, turn_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
 
@@ -212,9 +212,9 @@ def carrying(kinds: tuple[str, ...]) -> Carry:
 def reaching(kinds: tuple[str, ...]) -> Reach:
     """Make `reach(trajectory, node, origin)`, which computes a state's offset from its origin.
 
-    It fills `offset`, and adds the square of the offset in units of the noise to the costs. In
-    directions without noise, the state is moved so that the noise can reach it. It returns False if the
-    offset or its cost is undefined.
+    It fills `offset`, and adds the square of the offset, in units of the noise, to the costs. In
+    directions without noise, the state is changed to one that the noise can reach. It returns False if
+    the offset or its cost is undefined.
     """
     add, subtract = boxplus(kinds), boxminus(kinds)
 
@@ -253,7 +253,7 @@ def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Float
         offset: (t,).
         factors: factors of the covariances of all steps.
         step: index of the step.
-        whitened: (t,), of which the first `rank` entries are filled.
+        whitened: (t,); its first `rank` entries are filled.
     """
     factor, order, squared = factors.factor[step], factors.order[step], 0.0
     for k in range(factors.rank[step]):
@@ -273,7 +273,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
 
     Args:
         matrix: (t, t).
-        factor: (t, t), of which the first `rank` columns are filled.
+        factor: (t, t); its first `rank` columns are filled.
         order: (t,), filled: row order[k] of the factor ends in column k.
         left: (t,) working memory.
 
@@ -358,8 +358,8 @@ def robust(squared: float, loss: Floats) -> tuple[float, float]:
 
     Args:
         squared: square of the whitened residual.
-        loss: (2,) 0 for squares, 1 for Huber, 2 for Cauchy; and the length above which residuals are
-            down-weighted.
+        loss: (2,) type of loss (0 for squares, 1 for Huber, 2 for Cauchy), and the length above which
+            residuals are down-weighted.
     """
     bound = loss[1] ** 2
     if loss[0] == 1.0 and squared > bound:

@@ -6,10 +6,10 @@ the prediction (m-, P-) and D, the covariance between the states before and afte
 
     G = D P-^-1,  ms_k = m_k (+) G (ms_(k+1) (-) m-),  Ps_k = (P_k - G D') + G Ps_(k+1) G'
 
-where D is computed from the derivative for extended filters and from the samples for the others. Several
-predictions between two nodes are one step: their G are multiplied. For states that are not vectors, (+)
-and (-) and the tangent spaces of the covariances are those of
-`fuselog.replay.inference.model.corrections`.
+where D is computed from the derivative for extended filters, and from the samples for all other filters.
+Several predictions between two nodes form one step: their matrices G are multiplied. For states that are
+not vectors, `fuselog.replay.inference.model.corrections` defines (+), (-) and the tangent spaces of the
+covariances.
 
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
@@ -89,7 +89,7 @@ class Piece(NamedTuple):
 
 
 class ForwardMemory(NamedTuple):
-    """Working memory of the steps of one core: that of the filter, and four matrices (t, t)."""
+    """Working memory of the steps of one core: the filter's memory, and four matrices (t, t)."""
 
     filter: CoreMemory
     rest: Floats
@@ -224,7 +224,7 @@ def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> 
 
 
 class GoBack(Protocol):
-    """Function that smooths the nodes of a run in a piece; `later` then contains the first node."""
+    """Function that smooths the nodes of a run in a piece; afterwards, `later` has the first node."""
 
     def __call__(
         self, run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory, /

@@ -77,10 +77,10 @@ def smooth(
     covariance: Floats,
     memory: BackMemory,
 ) -> None:
-    """Replace covariances of a filter by those of its smoother along one trajectory, in place.
+    """Replace a filter's covariances by its smoother's along one trajectory, in place.
 
-    With the gain G = P F' P-^-1, each covariance becomes P + G (Ps - P-) G', where Ps is that of the
-    next node.
+    With the gain G = P F' P-^-1, each covariance becomes P + G (Ps - P-) G', where Ps is the smoothed
+    covariance of the next node.
 
     Args:
         run: index of the run.
@@ -120,7 +120,7 @@ class BoundHistory(NamedTuple):
 
 
 class BoundFilter(Filter):
-    """Filter that knows the truth; every step is a further output."""
+    """Filter that knows the truth, and also outputs every step."""
 
     is_bound = True
 
@@ -228,7 +228,7 @@ class BoundFilter(Filter):
     def begun(
         self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
     ) -> tuple[BoundHistory, Ragged]:
-        """Make the steps to the priors of runs that reach their first node.
+        """Make the steps to the priors, for runs that reach their first node.
 
         The noise of such a step is the prior's covariance. If the first node has the stamp of the prior,
         the step to the prior replaces the step to that node.

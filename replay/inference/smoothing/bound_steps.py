@@ -147,12 +147,12 @@ def bound_update(bound_model: BoundModel, number: int) -> UpdateRun:
 
 
 def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:
-    """Add H' R^-1 H of the first rows; the result is NaN if R is not positive definite.
+    """Add H' R^-1 H of the first rows of H; the result is NaN if R is not positive definite.
 
     Args:
-        information: (t, t), added to in place.
+        information: (t, t), to which the information is added in place.
         rows: H (at least size, t), overwritten.
-        noise: R, of which the first `size` rows and columns are used; it is replaced by its factor.
+        noise: R, whose first `size` rows and columns are used; it is replaced by its factor.
         size: number of measured components.
     """
     t = len(information)

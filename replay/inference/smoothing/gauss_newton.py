@@ -81,7 +81,7 @@ class SearchState(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Results of the searches: number of passes, and whether they converged (runs,).
+    """Results of the searches: the number of passes, and whether each search converged (runs,).
 
     For every pass, the cost, the damping and the largest step in standard deviations (runs, passes, 3).
     """
@@ -139,7 +139,7 @@ def search(bound_model: BoundModel, steps: Steps, settings_of: ReadSettings) -> 
     def move(
         trajectory: Trajectory, kept: Floats, steps: Floats, begin: int, end: int
     ) -> tuple[float, float, bool]:
-        """Move the trajectory from the best trajectory by the latest steps.
+        """Set the trajectory to the best trajectory, moved by the latest steps.
 
         Returns the largest step and the sum of squared steps, both in standard deviations of the start,
         and whether the steps are negligible.

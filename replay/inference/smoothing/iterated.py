@@ -121,7 +121,7 @@ class IteratedSmoother(Smoother):
         return [states, *way.made, *self._solution_streams(ended, way)]
 
     def smoothed_once(self, state: FilterState) -> "Way":
-        """Compute the states of the extended smoother at all stamps, starting with that of the prior."""
+        """Compute the extended smoother's states at all stamps, starting with the prior's stamp."""
         events = reduce(join_events, (*self._first(state), *state.kept))
         run = run_of_rows(events.offsets)
         asked, start_ns = events.wants_estimate, state.carried.time_ns
@@ -179,7 +179,7 @@ class IteratedSmoother(Smoother):
         return events._replace(source=source)
 
     def _search(self, state: FilterState, way: Way, scale: Floats) -> Ended:
-        """Search for the trajectories of all runs from the states of `way`, which are replaced."""
+        """Search for the trajectories of all runs from the states of `way`; the results replace them."""
         bound_model, asked = self.bound_model, self.parameters
         events, nodes, offsets, kept = way.events, way.nodes, way.offsets, way.states
         loop, steps = searching(bound_model)

@@ -55,15 +55,15 @@ class SmootherParameters(UnscentedParameters, RegressionParameters):  # type: ig
 
     Attributes:
         forward: the filter (ekf, iekf, ukf, lrkf, analytic or sqrt), optionally with a lag, as in
-            `ekf:lag=500ms`; or iterated. With a lag, an estimate uses messages until this time after it;
-            without a lag, it uses the whole run.
+            `ekf:lag=500ms`; or iterated. With a lag, an estimate uses messages up to this time after its
+            stamp; without a lag, it uses the whole run.
     """
 
     forward: str = "ekf"
 
 
 class Forward(NamedTuple):
-    """Name and variant of a filter, and the lag; FOREVER_NS for the whole run."""
+    """Name and variant of a filter, and the lag, which is FOREVER_NS for the whole run."""
 
     name: str
     variant: str
@@ -124,7 +124,7 @@ class Smoother(Filter):
 
     @cached_property
     def lag_ns(self) -> int:
-        """Time after an estimate up to which the estimate uses messages."""
+        """Time after an estimate's stamp up to which messages are used for it."""
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
@@ -204,7 +204,7 @@ class Smoother(Filter):
     def gone_back(
         self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
     ) -> tuple[EstimateRows, Integers]:
-        """Smooth the nodes of all pieces, or those of one piece before row stop[run].
+        """Smooth the nodes of all pieces, or the nodes of one piece before row stop[run].
 
         The results of run r have the rows offsets[r]:offsets[r + 1].
         """
@@ -242,7 +242,7 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
 
 
 def _rows_from(piece: Piece, begin: Integers) -> Piece:
-    """Return the nodes of every run from row begin[run] on."""
+    """Return the nodes of every run, starting at row begin[run]."""
     counts = piece.offsets[1:] - begin
     rows = np.arange(piece.offsets[-1]) >= np.repeat(begin, np.diff(piece.offsets))
     columns: Columns = (column[rows] for column in piece.nodes[1:])

@@ -52,7 +52,7 @@ class Bounds:
         is_smoother: whether the bound is for smoothers.
         sums: sums of the products by step, rows of 4 t^2.
         stamps: (steps,) ns since the epoch.
-        steps: number of steps of every run, by number of the run.
+        steps: number of steps of every run, by run number.
         reason: why there is no mean over the ensemble; empty if there is one.
     """
 
@@ -124,7 +124,7 @@ class Bounds:
 
     @property
     def complaint(self) -> str:
-        """Return the reason why there is no mean over the ensemble; empty if there is one."""
+        """Return the reason why there is no mean over the ensemble; empty if there is a mean."""
         if self.reason or self.sums is None:
             return self.reason
         if self.sums.width > 1:
@@ -132,7 +132,7 @@ class Bounds:
         return UNALIKE if len(set(self.steps.values())) > 1 else ""
 
     def covariances(self) -> Floats | None:
-        """Compute the bounds (steps, t, t) after the prior; None if the ensemble has none."""
+        """Compute the bounds (steps, t, t) after the prior; None without a bound over the ensemble."""
         if self.complaint or self.sums is None:
             return None
         _, count, sums = self.sums.filled()
@@ -188,7 +188,7 @@ def _add(state: Bounds, output: Output) -> Bounds:
 
 
 def root_mean_squares(state: Bounds) -> dict[str, float]:
-    """Compute the lower bounds of RMSE over all steps, under the names of the RMSE.
+    """Compute the lower bounds of RMSE over all steps, by the name of the RMSE.
 
     The bounds are returned only if the bound over the ensemble exists; `over_ensemble` is then 1.
     Otherwise, the average along the trajectories is computed in the same way as errors

@@ -26,9 +26,11 @@ class Conditioning(NamedTuple):
     Attributes:
         sampled: number of samples.
         lost: number of samples in which a pivot has lost its digits.
-        failed: number of samples that are not positive definite, beyond rounding.
+        failed: number of samples that are not positive definite, even if rounding errors are allowed
+            for.
         least: the smallest pivot.
-        run: number of the run with the smallest pivot in the ensemble, if its digits are lost.
+        run: number of the run with the smallest pivot in the ensemble, if that pivot has lost its
+            digits.
         elapsed_s: time of this pivot since the run's epoch.
     """
 
@@ -40,7 +42,7 @@ class Conditioning(NamedTuple):
     elapsed_s: float = 0.0
 
     def plus(self, other: "Conditioning") -> "Conditioning":
-        """Combine the samples with those of `other`."""
+        """Combine the samples with the samples of `other`."""
         worst = other if other.least < self.least else self
         return worst._replace(
             sampled=self.sampled + other.sampled,
@@ -50,7 +52,7 @@ class Conditioning(NamedTuple):
 
 
 def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int = 0) -> Conditioning:
-    """Compute the conditioning of samples of the covariances of a block.
+    """Compute the conditioning of a sample of a block's covariances.
 
     Args:
         rows: Gaussian estimates, or innovations.
@@ -88,7 +90,7 @@ def _sampled(count: int) -> NDArray[np.int64]:
 
 
 def _least_of_all(covariances: NDArray[np.float64]) -> float:
-    """Compute the smallest pivot of covariances (count, n, n); NaN if one has no Cholesky factor.
+    """Compute the smallest pivot of covariances (count, n, n); NaN if one of them has no factor.
 
     Every replay calls this function and precision is rarely lost, so it uses few calls of NumPy.
     """

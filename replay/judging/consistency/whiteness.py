@@ -1,4 +1,4 @@
-"""Tests of innovations for whiteness: uncorrelated in time and, when normalised, of mean square one.
+"""Tests whether innovations are white: uncorrelated in time and, if normalised, of mean square one.
 
 If the stated measurement noise is too small, successive innovations are negatively correlated; if the
 process noise is too small, they are positively correlated: Mehra, "On the identification of variances
@@ -24,7 +24,7 @@ class Whiteness(NamedTuple):
 
     Attributes:
         size: number of innovations.
-        mean_square: one if the covariances are correct; the mean is not removed.
+        mean_square: mean square, which is one if the covariances are correct; the mean is not removed.
         correlation: (lags,) the autocorrelation at lags 1, 2, ...; the mean is removed.
         ljung_box: Q = n (n + 2) sum correlation^2 / (n - lag), chi-square with one degree of freedom
             per lag.
@@ -47,7 +47,7 @@ def whitened(innovations: Stream) -> Floats:
     """Compute the normalised innovations e = L^-1 v (n, m) of a stream of innovations, with S = L L'.
 
     Each component is made independent of the components before it. A missing component is NaN and does
-    not affect the others; a row with an invalid covariance is NaN.
+    not affect the other components; a row with an invalid covariance is NaN.
     """
     difference = innovations["innovation"]
     n, m = difference.shape
@@ -70,7 +70,7 @@ def whitened(innovations: Stream) -> Floats:
 def whiteness(series: Sequence[Floats], lags: int = LAGS) -> Whiteness:
     """Compute the whiteness of normalised innovations of one component.
 
-    With fewer than `lags` + 2 innovations, everything except their number is NaN.
+    With fewer than `lags` + 2 innovations, all statistics except their number are NaN.
 
     Args:
         series: one array (n,) per run; values that are not finite are left out.

@@ -96,14 +96,14 @@ class Difference(NamedTuple):
 
 
 def target_of(quantity: str) -> Target:
-    """Return the target of a registered metric; None if it has none."""
+    """Return the target of a registered metric; None if it has no target."""
     return next((target for pattern, target in TARGETS.items() if fnmatch(quantity, pattern)), None)
 
 
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """Compute a metric of the second estimator minus that of the first, with interval and verdict.
+    """Compute the second estimator's metric minus the first estimator's, with interval and verdict.
 
     Args:
         first: (n,) the metric in every run.
@@ -161,7 +161,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
-    """Return the verdict on a difference; with a value as target, only the sign if neither is closer."""
+    """Return the verdict on a difference; if neither is closer to a target value, only its sign."""
     if target in ("low", "high"):
         return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):

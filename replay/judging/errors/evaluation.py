@@ -70,12 +70,12 @@ class Errors:
         error: (n, d) estimate minus truth.
         covariance: (n, d, d) as stated by the estimator.
         nees: (n,) normalised estimation error squared; NaN if the covariance is not positive definite.
-        without_truth: number of estimates at stamps for which the truth cannot be interpolated.
+        without_truth: number of estimates at stamps where the truth cannot be interpolated.
         components_without_truth: components of the estimate that are not judged because the truth lacks
             them.
         is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
             the smallest possible squared errors.
-        heading_rad: (n,) the true heading; None if truth and estimate have none.
+        heading_rad: (n,) the true heading; None if truth and estimate have no heading.
         position_nees: (n,) NEES of the position; None if it was not computed together with `nees`.
     """
 
@@ -145,7 +145,7 @@ class Innovations(NamedTuple):
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: name of the estimated object, such as `robot1`; may be empty.
-        run, time_ns: (n,), the number of the run and the stamp.
+        run, time_ns: (n,), the run number and the stamp.
         accepted: (n,), whether the gate accepted the measurement.
         squared: (n,), normalised innovation squared (NIS).
         degrees: (n,), number of measured components.
@@ -246,7 +246,7 @@ def errors_of(
     An axis or a quaternion is judged as a whole or not at all. The result is None if a run has no truth
     topic, if truths and estimates have no common component (see `components_without_truth`), or if their
     tangent planes cannot be compared (see `unlike`). A truth in a different tangent plane is transformed
-    to that of the estimates.
+    to the estimates' plane.
 
     Args:
         estimates: the stream, or a block of it.
@@ -328,7 +328,7 @@ def errors_of(
 
 
 def _heading_of(state: Floats, components: Components) -> Floats | None:
-    """Return the heading (n,) of a state (n, components); None if it has none."""
+    """Return the heading (n,) of a state (n, components); None if it has no heading."""
     names, kinds = list(components), list(components.values())
     if components.get(HEADING) == "angle":
         return state[:, names.index(HEADING)]
@@ -339,7 +339,7 @@ def _heading_of(state: Floats, components: Components) -> Floats | None:
 
 
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
-    """Return the components of a stream of Gaussian estimates that the truth of some run lacks.
+    """Return the components of Gaussian estimates that the truth of at least one run lacks.
 
     An axis or a quaternion is included as a whole if one of its components is missing. The result is
     empty if a run has no truth topic at all. Raises BadInput if the stream does not state its
@@ -362,7 +362,7 @@ def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tu
 
 
 def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Explain which components of Gaussian estimates are not judged, and why; empty if all are."""
+    """Explain which components of Gaussian estimates are not judged, and why, or return ""."""
     what = " ".join(filter(None, split_topic(estimates.stream.topic)))
     if why := unlike(estimates.stream, sources, first):
         return f"{what}: not judged: {why}"

@@ -1,4 +1,4 @@
-"""Transformation of true positions of targets into the frame of estimates by its true pose."""
+"""Transformation of targets' true positions into the estimates' frame, by that frame's true pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ def pose_topic(topics: Mapping[str, Topic], frame: str, into: str) -> str | None
 
 
 def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Mapping[str, Topic]) -> str:
-    """Explain why positions cannot be compared with truths in another frame; empty if they can.
+    """Explain why positions cannot be compared with truths in another frame, or return "".
 
     Args:
         stated: metadata of the estimates' channel.
@@ -57,7 +57,7 @@ def seen_in(
         frame: see `frame_of`; `not_comparable` must be empty for it.
         truths: truths of the run.
         topic: the truth of the target.
-        places: (n, axes) in the frame of this topic, x and y first; heights are not changed.
+        places: (n, axes) positions in the frame of this topic, x and y first; heights are not changed.
         time_ns: (n,), the stamps.
         gap_limit_s: longest gap in s over which poses are interpolated.
     """

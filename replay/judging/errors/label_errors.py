@@ -1,4 +1,4 @@
-"""Joint errors of several objects, with the labels of the estimator or the best labels of each step.
+"""Joint errors of several objects, with the estimator's labels or the best labels at each step.
 
 Source of the total error: Zhang et al., "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., objects, axes).
@@ -16,7 +16,7 @@ MOST_PERMUTED = 6
 
 
 def total_error(squared: Floats) -> Floats:
-    """Compute the root mean square error over objects (..., steps), (20).
+    """Compute the root mean square error (..., steps) over objects, equation (20).
 
     This is the root of a sum; the text of the paper describes a sum of roots.
     """
@@ -41,7 +41,7 @@ def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = 
 
     Args:
         estimates: (..., objects, axes).
-        truths: (..., objects, axes), with as many objects.
+        truths: (..., objects, axes), with the same number of objects.
         cutoff_m: upper limit of a distance, in m.
     """
     count = estimates.shape[-2]

@@ -16,8 +16,9 @@ class Moment(NamedTuple):
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: name of the estimated object, such as `robot1`; may be empty.
-        quantity: `nees`, or the main error: that of the position, otherwise of the orientation,
-            otherwise of all components with the unit of the first, such as `error_m` of several targets.
+        quantity: `nees`, or the main error: the error of the position, or else of the orientation, or
+            else of all components that have the first component's unit, such as `error_m` of several
+            targets.
         value: the quantity at this moment.
         run: the number of the run.
         time_ns: stamp in ns.

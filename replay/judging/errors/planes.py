@@ -25,7 +25,7 @@ FirstFixes = Mapping[str, Sequence[Origin | None]]
 
 
 def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]:
-    """Read origins that no channel states, the first fix of every run, from the outputs of a replay."""
+    """Read the first fix of every run from a replay's outputs, as the origin that no channel states."""
     return {
         topic.rpartition("/")[0]: [
             Origin(*map(float, place)) if np.isfinite(place).all() else None
@@ -47,7 +47,7 @@ def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | Non
 
 
 def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Explain why estimates cannot be compared with the truth of some run; empty if they can.
+    """Explain why estimates cannot be compared with the truth of some run, or return "".
 
     Tangent planes with known origins can be compared. A truth that states no origin is in the tangent
     plane of its log, if the log states one, unless the truth has a separate frame; estimates of a filter

@@ -24,8 +24,8 @@ UNTURNED = (
 def lacks_rotations(truth: Trajectory, estimate: Trajectory) -> bool:
     """Test whether a truth consists of positions only, with constant orientations as placeholders.
 
-    The orientations are constant although the path turns, or although the estimate turns and the path
-    does not follow their direction.
+    The test is positive if the orientations are constant and either the path turns, or the estimate
+    turns and the path does not follow the constant direction.
     """
     if truth.rotation is None or estimate.rotation is None or len(truth) < 2:
         return False

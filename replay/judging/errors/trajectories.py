@@ -1,8 +1,8 @@
 """Comparison of trajectories with the truth: absolute and relative pose errors (APE, RPE).
 
 Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems", IROS
-2012. Conventions and names are those of evo (https://github.com/MichaelGrupp/evo), and the results agree
-with those of evo.
+2012. Conventions and names follow evo (https://github.com/MichaelGrupp/evo), and the results agree with
+  evo's.
 """
 
 from collections.abc import Sequence
@@ -89,7 +89,7 @@ class Compared(NamedTuple):
         absolute_m, absolute_deg: (n,) APE; degrees are None if a trajectory has no orientations.
         last: (k,) indices of the last poses of the RPE pairs.
         relative_m, relative_deg: (k,) RPE.
-        doubts: sentences on the limits of these errors.
+        doubts: sentences about the limitations of these errors.
     """
 
     estimate: Trajectory
@@ -109,7 +109,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     """Associate and align two trajectories and compute their errors.
 
     An estimated time offset is applied only if it reduces the error. Raises BadInput if no poses can be
-    paired, if they do not determine the alignment, or if the path is shorter than the delta.
+    paired, if the pairs do not determine the alignment, or if the path is shorter than the delta.
     """
     for each in (estimate, truth):
         if not len(each):
@@ -152,7 +152,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
 def associate(
     estimate: Trajectory, truth: Trajectory, comparison: Comparison
 ) -> tuple[Trajectory, Trajectory]:
-    """Return the paired poses of both trajectories; they are paired by order if one has no stamps."""
+    """Return the paired poses of both trajectories; if one has no stamps, poses are paired in order."""
     times, true_times = estimate.time_ns, truth.time_ns
     if times is None or true_times is None:
         if len(estimate) != len(truth):
@@ -185,7 +185,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """Pair times with the nearest other times within a limit; return the indices of both."""
+    """Pair times with the nearest times in `among`, within a limit; return the indices of both."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
@@ -211,14 +211,14 @@ def _interpolated(
 
 
 def _stamps(trajectory: Trajectory) -> Integers:
-    """Return the stamps of a trajectory; raise BadInput if it has none."""
+    """Return the stamps of a trajectory; raise BadInput if it has no stamps."""
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: has no stamps; give a trajectory with stamps, such as TUM")
     return trajectory.time_ns
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
-    """Find the first and last poses of consecutive parts of the path, each at least the delta long."""
+    """Find the first and last poses of consecutive parts of the path, each at least `delta` long."""
     unit, delta = comparison.delta_unit, comparison.delta
     steps: NDArray = np.ones(len(estimate) - 1)
     if unit == "m":
@@ -242,7 +242,7 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
 
 
 def _way(trajectory: Trajectory, first: Integers, last: Integers) -> Floats:
-    """Compute the displacements (k, 3) of pairs, in the frame of the first pose if it is known."""
+    """Compute the displacements (k, 3) of pairs, in the first pose's frame if orientations are known."""
     way = trajectory.position_m[last] - trajectory.position_m[first]
     rotation = trajectory.rotation
     return way if rotation is None else np.einsum("kji,kj->ki", rotation[first], way)
@@ -298,9 +298,9 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
     """Estimate the offset, in s, of the estimate's stamps that minimises the distance to the truth.
 
     The offset is added to the stamps and minimises the RMSE of aligned positions. The local search
-    starts from the best of these offsets: those with the highest correlation of the speeds of both
-    trajectories, which no alignment changes; a grid of all offsets that leave half of the poses with
-    truth; and zero.
+    starts from the best of three kinds of offsets: those with the highest correlation between the speeds
+    of both trajectories, which no alignment changes; a grid of all offsets at which half of the poses
+    have truth; and zero.
 
     Raises BadInput if a trajectory has no stamps, or if its speed never changes.
     """

@@ -14,7 +14,7 @@ from fuselog.replay.judging.errors.trajectories import POSE_KINDS
 
 
 def trajectory_of(stream: Stream) -> Trajectory | None:
-    """Extract the poses of a truth, estimate or Pose stream; None if it has no position.
+    """Extract the poses of a truth, estimate or Pose stream; None if the stream has no position.
 
     Missing components of the position are zero, such as the height of a planar robot; a heading is a
     rotation about the vertical axis. Poses that are not finite are left out.

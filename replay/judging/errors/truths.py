@@ -1,4 +1,4 @@
-"""Reading of truths along with the estimates, with only the messages around their stamps in memory.
+"""Reading of truths along with estimates, keeping only the messages around the estimates' stamps.
 
 A truth that is stated twice, by one topic or by two, is doubtful; messages are checked for this during
 reading.
@@ -141,7 +141,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """Compute the difference of two truths by component, at stamps of the first within the other."""
+    """Subtract two truths by component, at those stamps of the first that the second spans."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

@@ -20,7 +20,7 @@ class Uninformed:
 
     Attributes:
         names: components that are linear or angles.
-        still: (names,), whether each is unchanged in all runs.
+        still: (names,), whether each component is unchanged in all runs.
         first: by run, the mean and variance (names,) of the run's first estimate.
         most: largest number of estimates of any run.
     """
@@ -59,7 +59,7 @@ class Uninformed:
         self.names, self.most = self.names or other.names, max(self.most, other.most)
 
     def found(self) -> list[str]:
-        """Return the unchanged components, if others are estimated."""
+        """Return the unchanged components, provided that other components are estimated."""
         if self.most < FEWEST or self.still.all():
             return []
         return [name for name, is_still in zip(self.names, self.still.tolist(), strict=True) if is_still]

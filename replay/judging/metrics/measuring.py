@@ -154,7 +154,7 @@ class MetricCollection:
         vars(self).update(state, _metrics=find_metrics(state["_metrics"]))
 
     def merge(self, other: "MetricCollection") -> None:
-        """Add the states of other runs, of the same metrics."""
+        """Add the states of the same metrics for other runs."""
         self._named |= other._named
         for place, theirs in other._states.items():
             ours = self._states.setdefault(place, {})
@@ -184,7 +184,7 @@ _RANKS: dict[type, int] = {Errors: 0, Innovations: 1, Output: 3}
 
 
 def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> dict[str, float]:
-    """Compute metrics of judged objects, each as one block, as `estimator.quantity[.case]`.
+    """Compute metrics of judged objects, one block each, with the keys `estimator.quantity[.case]`.
 
     Raises BadInput if a metric raises.
     """

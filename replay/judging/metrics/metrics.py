@@ -102,7 +102,7 @@ class Consistent:
         count, total: number and sum of finite NEES of the state.
         places, of_places: number and sum of finite NEES of the position.
         missing: number of estimates without a NEES because their covariance is singular.
-        by_step: NEES in one column.
+        by_step: sums of the NEES by step, in one column.
         components: number of components of the state.
     """
 
@@ -286,7 +286,7 @@ def _solved(output: Output) -> Sums:
 def solution(sums: Sums) -> dict[str, float]:
     """Compute the share of batch solutions that converged, and the largest number of iterations.
 
-    If the channel states the start, the mean final cost is included. From streams of single iterations,
+    If the channel states the start, the mean final cost is included. For streams of single iterations,
     only the mean cost at the start is computed.
     """
     if sums.get("starts"):

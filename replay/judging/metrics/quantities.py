@@ -112,7 +112,7 @@ class OfRuns(NamedTuple):
         messages, accepted: number of innovations, and number of those that a gate accepted.
         degrees, accepted_degrees: numbers of measured components of these innovations.
         squared: the sum of NIS.
-        log_likelihood: sum over accepted innovations; NaN if it is not stated for all of them.
+        log_likelihood: sum over accepted innovations; NaN unless it is stated for all of them.
     """
 
     messages: Any

@@ -50,7 +50,7 @@ class BinnedSums:
         self._sums[first : last + 1, low : high + 1] += sums
 
     def merge(self, other: "BinnedSums") -> None:
-        """Add other sums with the same columns and with no group before the first group here."""
+        """Add sums with the same columns and without groups before the first group of this object."""
         theirs = other._sums[: other._groups, : other._bins]
         while self.width < other.width:
             self._double()

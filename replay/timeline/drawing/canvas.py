@@ -113,7 +113,7 @@ class Scene:
         return WIDTH * (1.0 + 2.0 * above / max(len(self.estimators) - 1, 1))
 
     def colours(self, case: str) -> dict[str, Colour]:
-        """Return the colours of the truth of `case` and of its estimators, by name."""
+        """Return the colours, by name, of the truth and the estimators of `case`."""
         truths = [topic for topic in self._truths if _prefix(topic) == case]
         has_truth = any(self.source.topics[topic].messages for topic in truths)
         named = {"truth": TRUTH} if has_truth else {}
@@ -144,7 +144,7 @@ class Scene:
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """Return the readable sensor topics of the run below `case` or below no case."""
+        """Return the readable sensor topics of the run that belong to `case` or to no case."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -155,7 +155,7 @@ class Scene:
 
     @cached_property
     def unread(self) -> dict[str, str]:
-        """Return, by topic, why its messages (such as images) cannot be read as columns."""
+        """Return, by topic, the reason why messages, such as images, cannot be read as columns."""
         found: dict[str, str] = {}
         for topic in self.source.topics:
             try:
@@ -225,7 +225,8 @@ class Canvas:
         steps_ns: distinct times of estimates, which `step` counts.
         is_still: whether moving entities are left out because they have already been sent.
         dates: dates of stamps, if stamps are not dates.
-        is_shared: whether the layout is for other runs as well, so that titles count nothing.
+        is_shared: whether the layout is also used for other runs, so that titles must not contain
+            counts.
     """
 
     recording: rr.RecordingStream
@@ -256,7 +257,7 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log properties of `entity` in `what`, such as a style, which apply at all times."""
+        """Log the properties `what` of `entity`, such as a style, which apply at all times."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
@@ -284,7 +285,7 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:
-    """Return the panel of a case with its plots, if any, to the right, all of equal height."""
+    """Return a case's panel with its plots, if any, to the right; all strips are equally high."""
     shares = [float(strips_of(plot)) for plot in plots]
     columns = [board, rrb.Vertical(*plots, row_shares=shares)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
@@ -299,12 +300,12 @@ def strips_of(board: Board) -> int:
 
 
 def entity_path(*parts: str) -> str:
-    """Join parts to an entity path, ignoring empty parts, such as the only case of a log."""
+    """Join parts to an entity path, without empty parts, such as the name of a log's only case."""
     return "/".join(part for part in parts if part)
 
 
 def escaped(entity: str) -> str:
-    """Escape an entity path for Rerun, with any characters in its parts, such as `ukf:2`."""
+    """Escape an entity path for Rerun; its parts may contain any characters, such as `ukf:2`."""
     return "/".join(rr.escape_entity_path_part(part) for part in entity.split("/"))
 
 
@@ -347,7 +348,7 @@ def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
     """Return the rows of the minimum and maximum of every span; among equal values, the first.
 
     Args:
-        of_span: (n,), sorted index, from zero, of each value's span.
+        of_span: (n,), sorted: the index of each value's span, from zero.
         values: (n,); NaN is never an extreme.
     """
     first = np.flatnonzero(np.diff(of_span, prepend=-1))
@@ -366,10 +367,10 @@ def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
 
 
 def gap_limit_ns(time_ns: Times) -> int:
-    """Compute the longest silence of a stream with these sorted times that is not a gap.
+    """Compute the limit above which an interval between the sorted times of a stream is a gap.
 
     A stream without a rate, such as gunshots or objects seen by a camera, has bursts. Its limit is a
-    multiple of the pause length up to which pauses make up half of the total time, not counting the
+    multiple of a pause length; pauses up to this length make up half of the total time, not counting the
     longest pause.
     """
     intervals = np.sort(np.diff(np.unique(time_ns))).astype(float)

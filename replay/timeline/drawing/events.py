@@ -55,7 +55,7 @@ Draw = Callable[[Canvas, Scene, str], list[Board]]
 class Happened(NamedTuple):
     """Events of an estimator or a sensor: a text for each time, all of one level.
 
-    `part` is the entity below that of `who`, if the events have a separate entity.
+    `part` is an entity below the entity of `who`, if the events have a separate one.
     """
 
     who: str
@@ -68,7 +68,7 @@ class Happened(NamedTuple):
 def above_events(
     board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
 ) -> rrb.Container:
-    """Return a panel above events, if there are any; the panel is `share` times as high."""
+    """Return a panel above its events, if any; the panel is `share` times as high as the events."""
     return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
 
 
@@ -178,7 +178,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
-    """Describe rejected measurements by the sensors with a message of the same stamp and target."""
+    """Describe rejected measurements by naming sensors with a message of the same stamp and target."""
     sensed = {
         within(topic, case): scene.read(topic)
         for topic in scene.topics_near(case)
@@ -227,7 +227,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
-    """Yield changes of the state of the solution or body that a sensor reports; see STATES."""
+    """Yield changes of the solution's or body's state that a sensor reports; see STATES."""
     if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
         return
     for column, component in enumerate(stream.components):

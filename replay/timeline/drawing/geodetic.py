@@ -37,7 +37,8 @@ def degrees_of(stream: Stream) -> Floats:
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
     """Draw geodetic fixes as points connected by a thin line, without positions that are far off.
 
-    Points are coloured by the stated standard deviation of the fixes, otherwise with `colour`.
+    Points are coloured by the stated standard deviation of the fixes, or with `colour` if no deviation
+    is stated.
     """
     degrees = degrees_of(stream)
     rows = np.flatnonzero(are_near(degrees))
@@ -109,7 +110,7 @@ def usual(places: Floats) -> Floats:
 
 
 def are_near(places: Floats) -> NDArray[np.bool_]:
-    """Find the positions that are not outliers, which would shift the centre of a map's view."""
+    """Find the positions that are not outliers; outliers would shift the centre of a map's view."""
     low, high = usual(places)
     margin = FAR * (high - low).max()
     return ((places >= low - margin) & (places <= high + margin)).all(axis=1)

@@ -1,8 +1,8 @@
 """Scenes in the plane: paths, poses, covariance ellipses, numbered points, lines of sight.
 
 Coordinates are sent unchanged. In Rerun's 2D views, y points down, so all entities below `map` have a
-transform that makes y point up. Moving objects are logged at their time and disappear when they are no
-longer current; a path has one segment per row, and the view shows its last minute.
+transform that makes y point up. Moving objects are logged at their time, and disappear when they are no
+longer current. A path has one segment per row, and the view shows its last minute.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,7 +80,7 @@ def turn_up(canvas: Canvas, root: str = ROOT) -> None:
 def draw_points(
     canvas: Canvas, entity: str, numbers: NDArray[np.int64 | np.str_], places: Floats
 ) -> None:
-    """Draw fixed points with their numbers or names; close points share a label below the lowest.
+    """Draw fixed points with numbers or names; close points share a label below the lowest of them.
 
     Viewers draw in single precision; points that are infinite in single precision are left out.
 
@@ -125,7 +125,7 @@ def neighbours(places: Floats, extent_m: float) -> list[list[int]]:
 
 
 def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
-    """Draw a point at each time, such as a measurement.
+    """Draw a point, such as a measurement, at each time.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
@@ -305,7 +305,7 @@ def draw_lines(
 ) -> None:
     """Draw all lines of one stamp together, as a scan.
 
-    The next scan replaces them; they disappear if it is later than usual.
+    The next scan replaces the lines; they disappear if the next scan is later than usual.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.
@@ -332,7 +332,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Return times and the number of objects at each; it is zero `shown_ns` after the last object."""
+    """Return times and the number of objects at each, zero from `shown_ns` after the last object."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])
@@ -350,7 +350,7 @@ def plane_view(
     *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
-    """Make a view with a grid that contains the given positions.
+    """Make a view with a grid; the view contains the given positions.
 
     Args:
         canvas: the canvas.
@@ -384,7 +384,7 @@ def bounds_of(places: Floats) -> tuple[Floats, Floats]:
 
 
 def with_legend(canvas: Canvas, name: str, colours: Mapping[str, Colour], board: Board) -> Board:
-    """Return a panel with a legend above it, a row of coloured dots with names.
+    """Return a panel with a legend above it, which is a row of coloured dots with names.
 
     Args:
         canvas: the canvas.

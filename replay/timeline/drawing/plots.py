@@ -99,10 +99,10 @@ class Squares(NamedTuple):
 def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True) -> list[Board]:
     """Draw NEES, errors, NIS and effective particles of a case, at most `MOST_STRIPS` at a time.
 
-    If there are more plots, errors are in tabs by quantity, and the other plots too if there are still
-    too many. Single estimates in the plane are first shown in a close-up, because their plots over time
-    are single points. There are no plots without errors or innovations. `legend` is False if a scene has
-    its own legend.
+    If there are more plots, errors are in tabs by quantity; if there are still too many, the other plots
+    are in tabs too. Single estimates in the plane are first shown in a close-up, because their plots
+    over time are single points. There are no plots without errors or innovations. `legend` is False if a
+    scene has its own legend.
     """
     errors = draw_errors(canvas, scene, case)
     nees = draw_nees(canvas, scene, case, legend=legend)
@@ -142,7 +142,7 @@ def _tabs(groups: Mapping[str, Sequence[rrb.View]], most: int, name: str | None 
 
 
 def _by_quantity(views: Mapping[str, rrb.View]) -> dict[str, list[rrb.View]]:
-    """Group views by quantity: axes of a vector together, up to a tab full of other components."""
+    """Group views into tabs: axes of a vector together, and at most `TAB_STRIPS` other components."""
     groups: dict[str, list[rrb.View]] = {}
     for component, view in views.items():
         groups.setdefault(_vector_of(component), []).append(view)
@@ -390,7 +390,7 @@ def draw_components(
 
 
 def below_legend(curves: Sequence[Floats]) -> tuple[float, float] | None:
-    """Compute a range of a plot with room for its legend above all curves; None if all are NaN."""
+    """Compute a range of a plot with room for a legend above all curves; None if it has no values."""
     values = np.concatenate([np.ravel(each) for each in curves] or [np.empty(0)])
     values = values[np.isfinite(values)]
     if not len(values):

@@ -43,9 +43,9 @@ Rows = TypeVar("Rows", Stream, Errors)
 class Thinned(Generic[Rows]):
     """Rows of a stream, thinned on arrival to about `limit` rows and at most twice as many.
 
-    Time is divided into cells of a power of two of nanoseconds. In each cell, the rows of the last stamp
-    are kept, and those at which a curve has its minimum or maximum, which preserves peaks. Cells are
-    nested in wider cells, so the result does not depend on the division into blocks.
+    Time is divided into cells whose length in nanoseconds is a power of two. Each cell keeps the rows of
+    its last stamp and the rows at which a curve has its minimum or maximum, which preserves peaks. Cells
+    are nested in wider cells, so the result does not depend on the division into blocks.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Find the rows to keep in their cells; in the widest cell, only those of the last stamp."""
+        """Find the rows to keep in their cells; in the widest cell, keep only rows of the last stamp."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]

@@ -47,12 +47,12 @@ class Bag:
 
     @property
     def others(self) -> list[str]:
-        """Return the contents of all files other than messages."""
+        """Return what the files contain besides messages."""
         return [each for file in self.files for each in file.others]
 
     @property
     def losses(self) -> list[str]:
-        """Return a sentence for each part that cannot be read; complete after reading."""
+        """Return a sentence for each part that cannot be read; the list is complete after reading."""
         found = [*self.missing, *(loss for file in self.files for loss in file.losses)]
         return list(dict.fromkeys(found))  # a part that is read twice is reported twice
 
@@ -66,7 +66,7 @@ def looks_like_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag; raise BadInput if there is none, or none of its files can be read.
+    """Open a bag; raise BadInput if the path is no bag, or if none of its files can be read.
 
     Files that are compressed as a whole are decompressed to a temporary folder.
     """
@@ -116,7 +116,7 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
 
 
 def _looks_packed(batch: Batch) -> bool:
-    """Test by their first bytes whether messages are compressed although no metadata.yaml states it."""
+    """Test from the first bytes whether a batch is compressed, in case no metadata.yaml states it."""
     begin = int(batch.begins[0]) if len(batch.begins) else len(batch.data)
     return batch.connection.encoding == "cdr" and batch.data[begin : begin + 4].tobytes() == _MAGIC
 
@@ -133,7 +133,7 @@ def _unpacked(batch: Batch) -> Batch:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """Read metadata.yaml of a ROS 2 bag; an empty dict if it is missing."""
+    """Read metadata.yaml of a ROS 2 bag; return an empty dict if it is missing."""
     place = folder / "metadata.yaml"
     if not place.exists():
         return {}

@@ -45,7 +45,7 @@ class Batch(NamedTuple):
 class BagFile(Protocol):
     """A reader of one file of a bag.
 
-    `losses` is complete after reading. `others` names the contents of the file other than messages.
+    `losses` is complete only after reading. `others` names what the file contains besides messages.
     """
 
     path: Path
@@ -78,7 +78,7 @@ def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDA
 
     Args:
         data: the bytes.
-        places: (n,), position of each number in bytes.
+        places: (n,), byte position of each number.
         dtype: type of the numbers, such as "<i8".
 
     Returns:

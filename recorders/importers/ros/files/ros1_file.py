@@ -61,7 +61,7 @@ class _Scanned(NamedTuple):
 
 
 class Ros1File:
-    """A .bag file; see `BagFile`. Raises BadInput if it is not one, or cannot be read."""
+    """A .bag file; see `BagFile`. Raises BadInput if the file is not a .bag file, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -175,7 +175,7 @@ class Ros1File:
 
 
 def _record_at(file: BinaryIO, position: int, size: int) -> _Record | None:
-    """Read the record at a position, whose data may be truncated; None if its header is incomplete."""
+    """Read the record at a position; return None if it is truncated, except for a chunk's data."""
     file.seek(position)
     head = file.read(_LENGTH.size)
     length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else size

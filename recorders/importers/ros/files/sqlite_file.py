@@ -1,4 +1,4 @@
-"""Reader of the sqlite3 files of ROS 2 (.db3) that creates or changes no files next to them.
+"""Reader of the sqlite3 files of ROS 2 (.db3); it neither creates nor changes files next to them.
 
 Source: rosbag2_storage_sqlite3; definitions of types are included since version 4 of its tables.
 """
@@ -25,7 +25,7 @@ _Row = tuple[int, int, bytes]
 
 
 class SqliteFile:
-    """A .db3 file; see `BagFile`. Raises BadInput if it is not one, or cannot be read."""
+    """A .db3 file; see `BagFile`. Raises BadInput if the file is not a .db3 file, or cannot be read."""
 
     def __init__(self, path: Path, scratch: Path) -> None:
         self.path = path
@@ -82,7 +82,7 @@ class SqliteFile:
         return f"; `{command}` may recover more of it"
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """Yield the messages of the wanted connections, some thousand rows at a time."""
+        """Yield the messages of the wanted connections, a few thousand rows at a time."""
         chosen = [number for number, each in self._by_id.items() if wanted(each)]
         with closing(self._open()) as database:
             rows = self._messages(database, chosen)
@@ -138,7 +138,7 @@ def _whole_pages(path: Path, scratch: Path) -> Path:
 
 
 def _connections(database: sqlite3.Connection) -> Iterator[tuple[int, Connection]]:
-    """Yield the topics by their numbers, with the definitions of their types if the file has them."""
+    """Yield the topics with their numbers, and the definitions of their types if the file has them."""
     definitions = {}
     if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
         stated = database.execute(

@@ -116,7 +116,8 @@ def fit_concentrations(target: NDArray, z: NDArray) -> bool:
 
     The search starts at the fit of the first-order saddlepoint approximation. The residuals are weighted
     by E(x_i^2) / target_i, which makes them nearly linear in z if z is large; five steps then suffice
-    for concentrations from 0 to beyond -1e6. The order is never changed: z[i] belongs to target[i].
+    for concentrations from 0 to beyond -1e6. The order of the concentrations is never changed: z[i]
+    belongs to target[i].
 
     Args:
         target: moments (d,), ascending, with sum 1.

@@ -11,7 +11,7 @@ def solve_in_place(matrix: NDArray, right: NDArray) -> None:
     The result is NaN if the block is not positive definite.
 
     Args:
-        matrix: n or more rows and columns; its leading block is overwritten by the factor.
+        matrix: the matrix, with n or more rows and columns; the factor overwrites its leading block.
         right: (n, m), overwritten by the solution.
     """
     n, columns = right.shape

@@ -87,7 +87,7 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def circular_moments(distribution: WrappedNormal) -> CircularMoments:
-    """Compute circular moments in closed form; means and variances equal those of the distribution."""
+    """Compute, in closed form, the circular moments of the distribution."""
     c = distribution.covariance
     correlation = kernels.circular_correlation(c[..., 0, 0], c[..., 0, 1], c[..., 1, 1])
     return CircularMoments(distribution.mean, np.diagonal(c, axis1=-2, axis2=-1), correlation)
@@ -150,7 +150,8 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
 def fit_mixed_mle(samples: Samples) -> WrappedNormal:
     """Fit means and variances by moments, C_12 by maximum likelihood (Kurz and Hanebeck, CDC 2015).
 
-    This does not invert `five_samples`: for sigma (0.8, 1.3) and a correlation of 0.5 it returns 0.461.
+    This fit is not the inverse of `five_samples`: for five samples of sigma (0.8, 1.3) and correlation
+    0.5, it returns a correlation of 0.461.
     """
     return _assemble(_of_samples(kernels.fit_mixed_mle_each, samples))
 

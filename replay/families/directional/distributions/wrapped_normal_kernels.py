@@ -161,7 +161,7 @@ def mixed_mle(
 
 
 def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float, float]) -> float:
-    """Compute the log likelihood, up to a constant, of samples (n, 2) in standard deviations."""
+    """Compute the log likelihood, up to a constant, of samples (n, 2) scaled by standard deviations."""
     scale = 0.5 / (1.0 - rho * rho)
     total = 0.5 * math.log(scale)
     for n in range(len(weights)):
@@ -194,7 +194,7 @@ def fit_samples(x: NDArray, weights: NDArray) -> Components:
 
 
 def blank_mixture(variance: NDArray) -> Mixture:
-    """Allocate memory for a product of densities; `variance` (2,) limits the sum of their variances."""
+    """Allocate memory for a product; `variance` (2,) is at least the sum of the densities' variances."""
     most = (2 * _turns(variance[0]) + 1) * (2 * _turns(variance[1]) + 1)
     return Mixture(np.empty((most, 2)), np.empty(most), np.empty((2, 2)))
 
@@ -275,8 +275,8 @@ def fit_product(
 ) -> Components:
     """Fit a wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
-    If no positive definite covariance has this r_c (modes far apart), c12 keeps the correlation of the
-    components.
+    If no positive definite covariance has this r_c because the modes are far apart, c12 keeps the
+    correlation of the components.
 
     Args:
         mean, covariance, other_mean, other: means (2,) and covariances (2, 2) of both densities.

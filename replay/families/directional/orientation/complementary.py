@@ -1,11 +1,11 @@
 """Orientation by common methods: Madgwick's, Mahony's, and VQF by Laidig and Seel.
 
-These methods are baselines for filters. They estimate no covariance, so one is assumed. Madgwick,
-"An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
-Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
-Automatic Control 53(5), 2008; VQF is the unchanged library of its authors. Default gains and parameters
-are those of the authors. Quaternions rotate vectors from body axes to east, north, up. Estimates begin
-with the first sample.
+These methods are baselines for filters. They estimate no covariance, so a covariance is assumed.
+Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010;
+Mahony, Hamel, Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE
+Transactions on Automatic Control 53(5), 2008; VQF is the unchanged library of its authors. The default
+gains and parameters are the authors' own. Quaternions rotate vectors from body axes to east, north, up.
+Estimates begin with the first sample.
 """
 
 from typing import Any, NamedTuple
@@ -156,7 +156,7 @@ def follow_mahony(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """Integrate the gyro minus its bias, corrected towards gravity and magnetic field: (48)."""
+    """Integrate the gyro minus its bias, corrected towards gravity and magnetic field, by (48)."""
     bias = state.bias[run]
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])

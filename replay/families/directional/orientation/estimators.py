@@ -39,10 +39,12 @@ class InertialParameters(Parameters):
     """Noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
-        rest_s: duration of the rest at the start; if not set, it is found in the log, up to 20 s.
+        rest_s: duration of the rest at the start; if not set, it is detected in the log and is at most
+            20 s.
         block_s: averaging time, in s, of an attitude from accelerometer and magnetometer.
-        attitude_sigma_deg: standard deviation of this attitude, in deg.
-        drift_sigma_deg: random walk of the orientation by the gyro, in deg/sqrt(s).
+        attitude_sigma_deg: standard deviation of the attitude from accelerometer and magnetometer, in
+            deg.
+        drift_sigma_deg: random walk of the orientation due to the gyro's noise, in deg/sqrt(s).
         gap_s: time between two samples, in s, above which the orientation becomes unknown.
     """
 

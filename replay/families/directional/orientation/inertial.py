@@ -92,8 +92,8 @@ class InertialState(NamedTuple):
         increment: the rotation since the start of the block, (runs, 4).
         force: sum of the accelerometer's samples in the block, rotated into the frame of the last
             sample, (runs, 3).
-        field: the same for the magnetometer, (runs, 3).
-        rest_s: duration of the rest if shorter than in the model, (runs,).
+        field: sum of the magnetometer's samples in the block, rotated in the same way, (runs, 3).
+        rest_s: duration of the rest if it is shorter than in the model, (runs,).
     """
 
     time_ns: Integers
@@ -153,8 +153,8 @@ def run_inertial_filter(
 ) -> tuple[InertialState, OrientationEstimates]:
     """Process the samples of an ensemble; return the state after them and the estimates.
 
-    If `estimates` is given, it must be NaN everywhere and is filled. Raises BadInput if
-    the columns have different lengths or a value in the model is not positive.
+    If `estimates` is given, it must be NaN everywhere and is filled. Raises BadInput if the columns have
+    different lengths, if `rest_s` is negative, or if another value in the model is not positive.
     """
     samples, estimates = prepared(model, samples, estimates)
     state = InertialState._make(part.copy() for part in state)
@@ -184,7 +184,7 @@ def prepared(
     Args:
         model: assumptions of the filter.
         samples: samples of all runs.
-        estimates: estimates to fill, all NaN; made if None.
+        estimates: estimates to fill, all NaN; if None, they are allocated.
     """
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
@@ -306,7 +306,7 @@ def _dead_reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """Write the orientation after the increment of the block, and the covariance with its noise."""
+    """Write the orientation and covariance after the block's increment, including its noise."""
     increment, covariance = state.increment[run], estimates.covariance[row]
     compose(state.axes[run, :, 3], increment, estimates.orientation[row])
     covariance[:, :] = state.covariance[run]

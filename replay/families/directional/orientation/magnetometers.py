@@ -39,7 +39,7 @@ REFUSAL = (
 
 
 class _Waiting(NamedTuple):
-    """Fields (runs, 3) not yet assigned to a sample, NaN if none, and the estimator's state."""
+    """Fields (runs, 3) that wait for a sample, NaN if there is no field, and the estimator's state."""
 
     field: Floats | None
     inner: Any
@@ -66,7 +66,7 @@ def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
 
 
 def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> str:
-    """Find the magnetometer of a unit: in its namespace, or the only one if there is only one unit."""
+    """Find a unit's magnetometer: in the unit's namespace, or the only one if there is only one unit."""
     own = f"{unit.rpartition('/')[0]}/magnetic_field"
     kind = schemas.MAGNETIC_FIELD.full_name
     there = [name for name, topic in topics.items() if topic.schema_name == kind]

@@ -27,7 +27,7 @@ class ReckoningState(NamedTuple):
         time_ns: stamps of the first and the last sample, (runs, 2); -1 before they exist.
         sums: sums of gyro, accelerometer and magnetometer during the rest, (runs, 3, 3).
         rest_samples: number of samples in the sums, (runs,).
-        rest_s: duration of the rest if shorter than in the model, (runs,).
+        rest_s: duration of the rest if it is shorter than in the model, (runs,).
     """
 
     orientation: Floats
@@ -62,7 +62,7 @@ def run_dead_reckoning(
     *,
     unbiased: bool,
 ) -> tuple[ReckoningState, OrientationEstimates]:
-    """Integrate the gyro from the attitude at rest; if `unbiased`, subtract its mean during the rest.
+    """Integrate the gyro from the attitude at rest; if `unbiased`, subtract the gyro's mean at rest.
 
     There are no estimates before the end of the rest or after a gap. Args and errors as for
     `run_inertial_filter`.

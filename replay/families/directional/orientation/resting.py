@@ -84,8 +84,8 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
 def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
     """Return the estimator with automatic detection of its unit's initial rest.
 
-    The rest is detected if the estimator has a parameter `rest_s` and it is not set. The samples of
-    the rest are passed to the estimator's `start` under the name `REST`.
+    The rest is detected if the estimator has a parameter `rest_s` that is not set. The samples of the
+    rest are passed to the estimator's `start` under the name `REST`.
     """
 
     def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
@@ -137,7 +137,7 @@ def _first_ns(samples: Stream) -> int:
 
 
 def rests_of(given: Mapping[str, Ragged], runs: int) -> Floats:
-    """Return the duration of the rest in every run (runs,), in s; infinite if it was not detected."""
+    """Return each run's duration of rest (runs,) in s, or infinity if no rest was detected."""
     if REST not in given:
         return np.full(runs, np.inf)
     rest = given[REST]

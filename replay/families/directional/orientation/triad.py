@@ -24,7 +24,7 @@ def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
 
     Args:
         sigma_rad: standard deviation of a rotation about each axis.
-        z: concentrations (4,), overwritten; the first, that of the mode, is 0.
+        z: concentrations (4,), overwritten; the first belongs to the mode and is 0.
     """
     z[:] = -2.0 / sigma_rad**2
     z[0] = 0.0

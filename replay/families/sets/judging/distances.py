@@ -26,7 +26,7 @@ class Gospa(NamedTuple):
 
 
 def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 1.0) -> float:
-    """Compute the OSPA of point sets, from 0 to the cutoff, in the unit of the points.
+    """Compute the OSPA of point sets, which is between 0 and the cutoff, in the unit of the points.
 
     Raises BadInput as `gospa` does.
 
@@ -47,10 +47,10 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
 def gospa(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0, alpha: float = 2.0
 ) -> Gospa:
-    """Compute the GOSPA of point sets, and its parts to the power of the order.
+    """Compute the GOSPA of point sets, and its parts raised to the power of the order.
 
-    With alpha = 2, points are not paired if their distance reaches the cutoff: they count as one missed
-    and one false point. With any other alpha, only the surplus points of the larger set are missed or
+    With alpha = 2, points whose distance reaches the cutoff are not paired; they count as one missed and
+    one false point. With any other alpha, only the surplus points of the larger set count as missed or
     false.
 
     Raises BadInput if the points are not finite or have different dimensions, the cutoff is not
@@ -61,7 +61,7 @@ def gospa(
         truths: (m, d).
         cutoff: upper limit of a distance, in the unit of the points.
         order: order of the sum, at least 1.
-        alpha: determines the cost of a surplus point, cutoff^order / alpha.
+        alpha: determines the cost of a surplus point, which is cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
         raise BadInput(f"alpha {alpha:g}: alpha must be above 0 and at most 2")
@@ -98,7 +98,7 @@ def gospa_pairs(
 
 
 class _Costs(NamedTuple):
-    """Sizes of the sets, and the best pairs with their distances to the power of the order."""
+    """Sizes of the sets, and the best pairs with their distances raised to the power of the order."""
 
     estimates: int
     truths: int
@@ -108,7 +108,7 @@ class _Costs(NamedTuple):
 
 
 def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
-    """Form as many pairs as possible with the smallest total cost."""
+    """Form as many pairs as possible, with the smallest total cost."""
     from scipy.optimize import linear_sum_assignment  # slow to import
     from scipy.spatial.distance import cdist
 

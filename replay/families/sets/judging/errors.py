@@ -147,7 +147,7 @@ def _judge_run(
 
 
 class SetsJudge(KindJudge):
-    """Judge for sets of targets, and for regions that contain one target."""
+    """Judge of sets of targets, and of regions that should contain one target."""
 
     def add(self, outputs: Mapping[str, Ragged]) -> list[tuple[str, Any]]:
         """Judge a block; see `KindJudge`."""
@@ -162,7 +162,7 @@ class SetsJudge(KindJudge):
 
 
 class AnySets(ABC):  # noqa: B024  # named tuples have no base of their own
-    """Base of the results that the metrics of sets judge: sets of targets, and regions of one target."""
+    """Base class of results judged by metrics of sets: sets of targets, and regions of one target."""
 
 
 AnySets.register(SetErrors)

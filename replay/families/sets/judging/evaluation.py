@@ -40,12 +40,12 @@ class JudgedSets:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although bounds and arena hold; 0 for guaranteed sets."""
+        """Count sets that miss the truth although bounds and arena are right; 0 for guaranteed sets."""
         return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
 
     @property
     def outside_arena(self) -> int:
-        """Count the frames without a guarantee because the robot is outside its assumed arena."""
+        """Count the frames without a guarantee because the robot is outside the assumed arena."""
         return int((self.known & ~self.in_arena).sum())
 
 
@@ -92,7 +92,7 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Test whether the true position at each frame is in the arena and within the bounds: (2, frames).
+    """Test whether the true position is in the arena and within the bounds, for each frame: (2, frames).
 
     Args:
         sizes: the numbers of vertices of the sets of one run, one message per frame.

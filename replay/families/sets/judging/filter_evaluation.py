@@ -39,11 +39,11 @@ class JudgedFilter:
         sets: area, and whether the truth is inside.
         pose: the true pose (n, 3), NaN if it is unknown.
         frame_holds: whether bearings and arena satisfy their bounds at the truth.
-        odometry_holds: whether the odometry has kept its bounds since the set from which this one was
-            moved.
-        guaranteed: whether the set must contain the truth: an earlier set contained it, and all bounds
-            have held since then.
-        growth: factor by which the form L = 8 enlarges the set.
+        odometry_holds: whether the odometry's errors were within their bounds since the stamp of the set
+            from which this set was moved.
+        guaranteed: whether the set must contain the truth, because an earlier set contained it and no
+            bound has been violated since then.
+        growth: factor by which the enclosing pseudo-ellipsoid with L = 8 enlarges the set.
         finding: indices in `frames.FINDINGS`, or -1 without a finding.
     """
 
@@ -132,7 +132,7 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Compute errors (n, 2) of the odometry's displacements (m) and turns (rad) between true poses.
+    """Compute the odometry's errors of displacement (m) and turn (rad) between true poses, (n, 2).
 
     Args:
         odometry: odometry of the robot.

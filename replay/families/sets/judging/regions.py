@@ -33,7 +33,7 @@ class Regions(NamedTuple):
 def regions_of(
     outputs: Mapping[str, Ragged], truths: Sequence[Truths], gap_limit_s: float
 ) -> dict[str, Regions]:
-    """Judge the regions in outputs of a replay, or in a block of them; keys are the topics of sizes."""
+    """Judge the regions in a replay's outputs, or in a block; keys are the topics of region sizes."""
     found = {}
     for topic, sizes in outputs.items():
         base = topic.removesuffix("size")

@@ -101,7 +101,7 @@ def arena_around(points: ArrayLike, margin_m: float) -> Arena:
 
 
 def excess_rad(pairs: Pairs, points: Floats) -> Floats:
-    """Compute the excess of each pair's error over its bound at points; it is <= 0 in the set.
+    """Compute by how much each pair's error exceeds its bound at points; it is <= 0 in the set.
 
     This is the exact membership test, (4). It is NaN at a landmark itself, where the angle is undefined.
 
@@ -279,8 +279,8 @@ def box(border: Arcs) -> Arena:
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
     """Compute closed polygons (n, 2) around the set; the set is on their left.
 
-    The polygons contain the set: their vertices are on concave arcs and outside convex ones. The area
-    of the polygons exceeds that of the set by at most the relative tolerance.
+    The polygons contain the set: their vertices are on concave arcs and outside convex ones. The area of
+    the polygons exceeds the area of the set by at most the relative tolerance.
     """
     tolerance_m = relative_tolerance * max(area(border), 1e-12) / max(border.length.sum(), 1e-12)
     end = border.at(border.length)
@@ -309,7 +309,7 @@ def signed_area(ring: Floats) -> float:
 
 
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """Compute vertices along an arc without its end; outside convex arcs, tangents meet there."""
+    """Compute vertices along an arc, without its end; on convex arcs, they are where tangents meet."""
     length, curvature = border.length[index], border.curvature[index]
     pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
     pieces = max(pieces, int(np.ceil(abs(length * curvature))))
@@ -327,10 +327,10 @@ def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
 
 
 def to_blame(pairs: Pairs, arena: Arena) -> Integers:
-    """Find the pairs that contradict the others, worst first; none if the exact set is not empty.
+    """Find the pairs that contradict all other pairs, worst first; none if the exact set is not empty.
 
-    These are the pairs that are violated at the point in the arena with the fewest violations. The point
-    is the intersection of two circles with the smallest excess.
+    These are the pairs that are violated at the point in the arena with the fewest violations. This
+    point is chosen among the intersections of the circles; among equals, the total excess decides.
     """
     if len(exact_set(pairs, arena).length):
         return np.empty(0, np.int64)

@@ -104,7 +104,7 @@ def _arena(corners_m: tuple[float, ...]) -> Arena:
 
 
 def _within(places: Floats, range_m: float) -> Arena:
-    """Return the rectangle around positions within a range of all landmarks (n, 2).
+    """Return the rectangle around the positions that are within a range of every landmark (n, 2).
 
     If there are no such positions, a landmark was misidentified; the rectangle then contains all
     positions within the range of at least one landmark.

@@ -1,4 +1,4 @@
-"""Motion of sets of positions and headings that contain a robot, by odometry with bounded errors.
+"""Motion of sets of positions and headings that contain a robot; odometry errors are bounded.
 
 A set of positions is a shapely geometry, which may have several pieces; a set of headings is one
 interval. Every computed set contains the exact result: offsets by a disc are polygons around the exact
@@ -119,10 +119,10 @@ def relative_pose(first: Floats, second: Floats) -> Floats:
 
 
 def common_headings(one: Headings, other: Headings) -> Headings | None:
-    """Return the intersection of two intervals of headings; None if it is empty.
+    """Return the intersection of two intervals of headings, or None if they do not overlap.
 
-    If wide intervals overlap at both ends, their intersection is not an interval; the result is then
-    the narrower of the two, which contains it.
+    If wide intervals overlap at both ends, their intersection is not an interval; the result is then the
+    narrower of the two intervals, which contains the intersection.
     """
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     if one.half_rad + other.half_rad >= 2.0 * np.pi - abs(apart):
@@ -145,7 +145,7 @@ def all_headings_of(one: Headings, other: Headings) -> Headings:
 
 
 def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
-    """Compute headings after a motion or, with direction -1, before it."""
+    """Compute headings after a motion; with direction -1, compute the headings before it."""
     middle = float(wrap_angle(headings.middle_rad + direction * motion.turn_rad))
     return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
 
@@ -153,11 +153,11 @@ def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
 def moved(
     places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
 ) -> shapely.Geometry:
-    """Compute the positions of a robot after a motion or, with direction -1, before it.
+    """Compute the positions of a robot after a motion; with direction -1, compute those before it.
 
-    `headings` apply before the motion. The displacements for all headings are on an arc, and the set
-    is offset by a disc that contains the arc; if the headings span half a circle or more, the centre
-    of the disc is the origin.
+    `headings` apply before the motion. The displacements for all headings are on an arc, and the set is
+    offset by a disc that contains this arc. If the headings span half a circle or more, the centre of
+    the disc is the origin.
     """
     half = min(headings.half_rad, 0.5 * np.pi)
     length = float(np.hypot(*motion.displacement_m))
@@ -219,8 +219,9 @@ def within_l8(places: shapely.Geometry) -> shapely.Geometry:
     """Enclose a set in a pseudo-ellipsoid with L = 8, as a polygon.
 
     The result is the level set of the smallest ellipsoid around the monomials T of the set's points,
-    enlarged until it contains the set. The ellipsoid has the weights of Titterington, 1976, which need
-    no step length. A set that is too thin for the grid of the border is returned without a change.
+    enlarged until it contains the set. The weights of these points are computed by the multiplicative
+    updates of Titterington, 1976, which need no step length. A set that is too thin for the grid of the
+    border is returned unchanged.
     """
     low, high = np.reshape(places.bounds, (2, 2))
     origin, scale_m = 0.5 * (low + high), 0.5 * float(np.max(high - low))

@@ -112,7 +112,7 @@ def _least_on_axis(pairs: Pairs) -> Floats:
 
 
 def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
-    """Compute lower bounds (k,) of the functions over the arena, which are tight except for discs."""
+    """Compute lower bounds (k,) of the functions over the arena; only those of discs are not tight."""
     x, y = np.meshgrid(*np.stack(arena, axis=1))
     corners = evaluate(constraints, np.stack([x.ravel(), y.ravel()], axis=1)).min(axis=0)
     with np.errstate(divide="ignore"):
@@ -160,7 +160,7 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """Fuse a ring by (18) in information form, which is one sum per parameter.
+    """Fuse a ring by (18) in information form, that is, by adding to each parameter of the set.
 
     Args:
         prior: the set before the fusion.
@@ -197,9 +197,9 @@ def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
 
 
 def most_room(ellipsoid: PseudoEllipsoid) -> float:
-    """Compute the greatest fused slack over all monomials, s of (7), or its rounding error if greater.
+    """Compute the greatest fused slack over all monomials, s of (7), but at least its rounding error.
 
-    Raises BadInput if it is negative beyond rounding: the sets have no common point.
+    Raises BadInput if the slack is negative beyond rounding, because the sets then have no common point.
     """
     centre = np.linalg.lstsq(ellipsoid.information, ellipsoid.vector)[0]
     most = float(ellipsoid.vector @ centre) - ellipsoid.constant
@@ -212,7 +212,7 @@ def most_room(ellipsoid: PseudoEllipsoid) -> float:
 def fit(
     pairs: Pairs, arena: Arena, order: Order, weighting: Weighting = "area", sweeps: int = 1
 ) -> PseudoEllipsoid:
-    """Fuse all pairs of a frame, two rings each.
+    """Fuse all pairs of a frame, each of them as two rings.
 
     Args:
         pairs: the frame.
@@ -220,7 +220,7 @@ def fit(
         order: the number L of monomials, 4 or 8.
         weighting: "area" minimises the area of the set at every step, "batch" minimises it over all
             weights together; "determinant" minimises the determinant of C^e, starting from a wide prior;
-            "equal" uses equal weights. The paper mentions "area" without a procedure.
+            "equal" uses equal weights. The paper mentions "area" but gives no procedure for it.
         sweeps: number of times that the rings are fused; fusing a set repeatedly is valid.
 
     Returns the set, which contains the exact set for any weights. Raises BadInput if the filter finds
@@ -286,7 +286,7 @@ def _shares(logarithms: Floats) -> Floats:
 
 
 def _area_over(rings: Floats, weights: Floats, arena: Arena, order: Order) -> Size:
-    """Make a function that computes the area of the fused set for weights near given weights.
+    """Make a function that computes the area of the fused set for weights near the given weights.
 
     The area is computed in a window; a set that extends beyond it counts as larger than the window.
     """
@@ -342,7 +342,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
 
 
 def outline(ellipsoid: PseudoEllipsoid, arena: Arena, nodes: int = 400) -> Outline:
-    """Compute the part of the set inside the arena, on a grid of nodes x nodes around it."""
+    """Compute the part of the set inside the arena, on a grid of `nodes` x `nodes` points around it."""
     window = _window(lambda points: room(ellipsoid, points), arena, nodes)
     grid = _grid(window, nodes)
     return _outline(room(ellipsoid, grid.points), grid)
@@ -354,7 +354,7 @@ def _grid(window: Arena, nodes: int) -> Grid:
 
 
 def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Arena:
-    """Zoom in from the arena to the area where values are >= 0, plus a margin."""
+    """Find a window, inside the arena, around the area where values are >= 0, plus a margin."""
     window = arena
     for _ in range(8):
         grid = _grid(window, nodes)

@@ -126,7 +126,7 @@ def hungarian(
 
 
 def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
-    """Compute the cost of a pair relative to a miss: minus the log of the ratio of their weights.
+    """Compute the cost of a pair relative to a miss: minus the log of the ratio of the two weights.
 
     It is infinite if the pair is impossible.
     """

@@ -31,7 +31,7 @@ class Births(NamedTuple):
 
     Attributes:
         begins: whether detections of a kind begin tracks.
-        number: for each such kind, its index in `birth`.
+        number: the index in `birth` of each kind that begins tracks.
         birth: (number, detection, origin, parameters) -> see `ScanSensor.birth`.
     """
 
@@ -100,7 +100,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         correlate = choosing(correlations)
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Settings) -> bool:
-        """Test whether a confirmed track is so near that no other track may begin."""
+        """Test whether a confirmed track is so near to a position that no track may begin there."""
         for place in range(tracks.used[run]):
             apart = np.hypot(
                 at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
@@ -136,7 +136,7 @@ def beginning(tracker: Tracker) -> BeginTracks:
         p: Settings,
         memory: ScanMemory,
     ) -> int:
-        """Begin tracks at unassociated detections; return how many tracks there was no room for."""
+        """Begin tracks at unassociated detections; return the number of tracks that did not fit."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
             measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])

@@ -39,7 +39,7 @@ class AssociationMemory(NamedTuple):
             items, by the set of occupied slots.
         message: messages from detections to tracks.
         price, row_of, distance, before, is_done: quantities of the columns of an assignment problem;
-            `potential` and `column_of` are those of its rows.
+            those of the rows are `potential` and `column_of`.
     """
 
     rows: Integers
@@ -126,14 +126,15 @@ def gather_cluster(
     probability: Floats,
     memory: AssociationMemory,
 ) -> tuple[int, int]:
-    """List the tracks and detections that are connected with a track; return their numbers.
+    """List the tracks and detections that are connected with a track; return how many there are of each.
 
     Args:
         first: index of the track.
         weights: weights of pairs and of misses.
         tracks, detections: numbers of tracks and detections; the arrays may be longer.
-        probability: (tracks, 1 + detections), whose first column is NONE for tracks in no cluster yet.
-        memory: whose `rows` and `columns` are filled.
+        probability: (tracks, 1 + detections); its first column is NONE for tracks that are not yet in a
+            cluster.
+        memory: memory whose `rows` and `columns` are filled.
     """
     memory.rows[0], probability[first, 0] = first, 0.0
     rows, columns, next_row = 1, 0, 0
@@ -167,7 +168,7 @@ def enumerate_maps(
         weights: weights of pairs and of misses.
         rows, columns: numbers of tracks and detections of the cluster.
         probability: (tracks, 1 + detections), filled for the tracks of the cluster.
-        memory: with the cluster that `gather_cluster` found.
+        memory: memory with the cluster that `gather_cluster` found.
     """
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
@@ -235,7 +236,7 @@ def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemor
 
 
 def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory) -> float:
-    """Compute the sum over the assignments in which no item occupies a slot."""
+    """Compute the sum over the assignments in which the given slot is not occupied."""
     found = 0.0
     for taken in range(1 << slots):
         if not taken >> slot & 1:
@@ -248,7 +249,8 @@ def propagate_beliefs(
 ) -> None:
     """Approximate the marginals of one cluster by belief propagation between tracks and detections.
 
-    The marginals are exact if the cluster is a tree, and otherwise more certain than the exact ones.
+    The marginals are exact if the cluster is a tree; otherwise, they are closer to 0 or 1 than the exact
+    ones.
 
     Args:
         weights, rows, columns, probability, memory: as for `enumerate_maps`.
@@ -302,7 +304,7 @@ def choose(row: int, column: int, detections: int, probability: Floats) -> None:
         row: index of the track.
         column: index of the detection; NONE for no detection.
         detections: number of detections.
-        probability: (tracks, 1 + detections), of which the row is filled.
+        probability: (tracks, 1 + detections); the row is filled.
     """
     for entry in range(1 + detections):
         probability[row, entry] = 1.0 if entry == 1 + column else 0.0

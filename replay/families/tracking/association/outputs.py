@@ -21,12 +21,12 @@ class TrackOutputs(NamedTuple):
     """Outputs of a tracker after every scan.
 
     Attributes:
-        end: (runs, 2), number of rows of tracks and of associations that a run has filled.
+        end: (runs, 2), the numbers of rows that a run has filled: of tracks, and of associations.
         confirmed: (scans,), number of confirmed tracks; NEVER if the scan was too old to be used.
         approximated: (scans,), number of tracks in clusters too large for enumeration.
         turned_away: (scans,), number of detections that could not begin a track because there was no
             room.
-        number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
+        number, mean, covariance, probability, existence: (runs, rows, ...), values of confirmed tracks;
             `probability` has the probabilities of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), their probability.
         white, factor: (runs, rows, 2) and (runs, rows, 2, 2), the whitened innovation of a pair in its
@@ -50,7 +50,7 @@ class TrackOutputs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows for the estimates of one run, which `Steps.estimate` fills."""
+    """Rows for the estimates of one run, to be filled by `Steps.estimate`."""
 
     mean: Floats
     covariance: Floats

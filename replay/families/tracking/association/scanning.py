@@ -8,7 +8,7 @@ update uses the mean v of the innovations v_j, and the covariance of the track b
 
 (Bar-Shalom, Fortmann, Tracking and Data Association, 1988, 6.4). If one assignment is chosen, this is
 the covariance of the Kalman filter. A track with several modes has one Gaussian for each mode. The
-density of a detection is the mean of their densities, weighted by the probabilities of the modes. A
+density of a detection is the mean of the modes' densities, weighted by the probabilities of the modes. A
 detection of the track changes these probabilities by Bayes' rule: the probability of mode i becomes
 
     mu_i b_0 + sum_j b_j mu_i g_ij / sum_k mu_k g_kj,
@@ -48,7 +48,7 @@ class ScanMemory(NamedTuple):
         step: memory of the derivatives of sensors.
         pool: memory of the errors that all tracks share.
         place: (detections, 2), the detections of a scan after near ones are joined.
-        group: (detections,), the group in which each detection is joined.
+        group: (detections,), the group with which each detection is joined.
         clutter: (detections,), density of clutter and of targets that were never detected.
         undetected: (detections,), density of targets that were never detected.
         difference, spread, cross: (tracks, modes, ...), terms of the innovations; see `Innovation`.
@@ -134,7 +134,7 @@ def target_of(model: Model) -> Callable[[Numbers], Numbers]:
 
 @lru_cache(maxsize=64)
 def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
-    """Make the model's sensor for a kind of scan sensor, which may read the parameters `names`."""
+    """Make the model's sensor for a kind of scan sensor; functions may read the parameters `names`."""
     target, inner = target_of(model), kind.measure
 
     def measure(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:
@@ -158,7 +158,7 @@ def errors_at(component: int) -> OfParameters:
 
 
 def adding_errors(components: int) -> Callable[[Floats, Floats, Floats, Settings], None]:
-    """Make `add(rows, predicted, mean, parameters)`, which adds the state's sensor errors."""
+    """Make `add(rows, predicted, mean, parameters)`, which adds sensor errors to a prediction."""
     errors = tuple(errors_at(component) for component in range(components))
 
     def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Settings) -> None:
@@ -180,7 +180,7 @@ UpdateTrack = Callable[[int, int, int, Floats, Floats, ScanMemory], None]
 
 
 def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe:
-    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`, which predicts a scan.
+    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`, to predict detections.
 
     `observe` fills the prediction and the whitened innovation covariance of a mode. It returns the
     factor of exp(-d2 / 2) in the density, or NaN if the covariance is not positive definite.
@@ -229,7 +229,7 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Observe
 def correlating(
     model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
 ) -> Correlate:
-    """Make `correlate(mean, covariance, origin, parameters, work)`, for sensor errors of a new track.
+    """Make `correlate(mean, covariance, origin, parameters, work)`, for new tracks with sensor errors.
 
     An error db of a detection shifts the position by -H^-1 db, where H is the derivative of the
     measurement with respect to the position. The position has the indices `corner` in the state.
@@ -240,7 +240,7 @@ def correlating(
     linearise = sensor_derivative(model, measuring(model, kind, names))
 
     def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
-        """Move the position by a multiple of an error."""
+        """Move the position by the error at index `error`, multiplied by `by_x` and `by_y`."""
         mean[x] += by_x * mean[error]
         mean[y] += by_y * mean[error]
         for k in range(len(covariance)):
@@ -328,7 +328,7 @@ def updating(model: Model, kind: ScanSensor) -> UpdateTrack:
 def split_by_mode(
     run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
 ) -> float:
-    """Fill the associations of a track in one mode; return the mode's probability after them."""
+    """Fill the association probabilities of a track in one mode; return the mode's new probability."""
     probability, given = memory.probability[track], memory.given
     given[0] = probability[0] * tracks.mode[run, track, mode]
     after: float = given[0]
@@ -347,7 +347,7 @@ def split_by_mode(
 
 
 def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
-    """Fill the detections of a scan; replace each chain of near detections by its mean.
+    """Copy the detections of a scan to `memory`; replace each chain of near detections by its mean.
 
     Chains are in the order of their first detections. Returns the number of joined detections.
     """

@@ -53,7 +53,8 @@ class Scans(NamedTuple):
         offsets: (runs + 1,).
         time_ns, sensor, kind, number: (scans,), stamp, index of the sensor, index of its kind, and the
             number that the sensor gave the scan.
-        first, end: (scans,), bounds of the detections of each scan.
+        first, end: (scans,), the index of the first detection of each scan, and the index after its
+            last.
         origin: (scans, 2), position of the sensor.
         detection: (detections, 2), the measurements.
     """

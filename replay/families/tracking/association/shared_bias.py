@@ -7,10 +7,10 @@ over the tracks,
 
     B+^-1 = B^-1 + sum_i (B_i^-1 - B^-1),   B+^-1 b+ = B^-1 b + sum_i (B_i^-1 b_i - B^-1 b),
 
-where b and B are the mean and covariance of the errors, and b_i and B_i are the same after the update
-of track i only. Then every track gets the new marginal and keeps its conditional Gaussian of the
-target given b. States have no rotations. For constant b and certain associations, this is the joint
-Kalman filter.
+where b and B are the mean and covariance of the errors, and b_i and B_i are their mean and covariance
+after the update of track i only. Then every track gets the new marginal and keeps its conditional
+Gaussian of the target given b. The states must not contain rotations. For constant b and certain
+associations, this is the joint Kalman filter.
 """
 
 from typing import NamedTuple
@@ -57,8 +57,9 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
     """Fuse the confirmed tracks' estimates of the shared errors, and update all tracks of a run.
 
-    The errors are the components of every track's state from index `first`. If associations are so
-    ambiguous that the fused information is not positive definite, the shared errors are not changed.
+    The shared errors are the components from index `first` in the state of every track. If associations
+    are so ambiguous that the fused information is not positive definite, the shared errors are not
+    changed.
     """
     mean, covariance = tracks.shared_mean[run], tracks.shared_covariance[run]
     size = len(mean)
@@ -90,7 +91,7 @@ def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
 
 
 def conform(run: int, place: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Set the shared errors in a track, and keep its estimate of the target given the errors."""
+    """Set the shared errors in a track; keep its conditional estimate of the target given the errors."""
     shared_mean, shared = tracks.shared_mean[run], tracks.shared_covariance[run]
     mean, covariance = tracks.mean[run, place, 0], tracks.covariance[run, place, 0]
     size, t = len(shared_mean), len(covariance)

@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
 
 
 def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether the last detection by a sensor that begins tracks is too long ago."""
+    """Test whether a sensor that begins tracks has not detected the track for too long."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
     longest_s: float = p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s
     is_over: bool = silent_s > longest_s
@@ -66,7 +66,7 @@ def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: S
 
 
 def confirm(run: int, place: int, tracks: Tracks) -> None:
-    """Confirm a track, with existence 1."""
+    """Confirm a track, and set its existence to 1."""
     tracks.is_confirmed[run, place], tracks.existence[run, place] = True, 1.0
 
 
@@ -79,7 +79,7 @@ def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Setti
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Update the existence by Bayes' rule; a track stays confirmed down to `keeping_existence`."""
+    """Update the existence by Bayes' rule; confirmation ends below `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
     needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
@@ -137,7 +137,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Set
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether a track is silent, or its score is too far below zero (confirmed: below its best)."""
+    """Test whether a track is silent or its score too low: far below 0 or, if confirmed, its best."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

@@ -46,10 +46,10 @@ class Tracker(NamedTuple):
 
 
 class Newborn(NamedTuple):
-    """New target of which only the position is known.
+    """New target whose position is known, but nothing else.
 
     Attributes:
-        mean, covariance: (n,), (t, t); the entries of the position are placeholders.
+        mean, covariance: mean (n,) and covariance (t, t); the entries of the position are placeholders.
         mode: (modes,), the modes' probabilities.
     """
 
@@ -96,7 +96,7 @@ Result = TypeVar("Result")
 def choosing(
     functions: list[Callable[Arguments, Result]],
 ) -> Callable[Concatenate[int, Arguments], Result]:
-    """Make `call(kind, ...)`, which calls the function with the index `kind`."""
+    """Make `call(kind, ...)`, which calls the function of this kind, given its index."""
 
     def call(kind: int, *arguments: AnyArgument) -> AnyArgument:
         for number in range_of(1, len(functions)):

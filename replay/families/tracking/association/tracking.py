@@ -51,7 +51,7 @@ from fuselog.replay.inference.run.loops import Follow, over_events
 
 
 class ScanInputs(NamedTuple):
-    """Inputs of a tracker: scans, parameters (sensors, names), and a new target."""
+    """Inputs of a tracker: scans, parameters (sensors, names), and the state of a new target."""
 
     events: Scans
     settings: Floats

@@ -27,7 +27,8 @@ class Tracks(NamedTuple):
         mode, log_mode: (runs, places, modes), the modes' probabilities, and their logarithms.
         hits, chances: (runs, places), numbers of scans since the birth in which the track was, or could
             have been, detected.
-        score, best_score: (runs, places), the log-likelihood ratio since its birth, and its maximum.
+        score, best_score: (runs, places), the log-likelihood ratio of a track since its birth, and the
+            maximum of this ratio.
         seen_ns: (runs, places), time at which a sensor that begins tracks last detected the track.
         updated_ns: (runs, places, sensors), time at which each sensor last updated the track.
         shared_mean, shared_covariance: (runs, ...), mean and covariance of the errors that all tracks

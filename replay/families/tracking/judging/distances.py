@@ -1,6 +1,7 @@
 """Distances between tracks and targets' trajectories: trajectory GOSPA, HOTA and IDF1.
 
-Tracks and trajectories are arrays (targets, steps, axes), which are NaN at steps without the target.
+Tracks and trajectories are arrays (targets, steps, axes), with NaN at steps when the track or target is
+absent.
 
 Sources: Garcia-Fernandez, Rahmathullah, Svensson, "A metric on the space of finite sets of trajectories
 for evaluation of multi-target tracking algorithms", IEEE TSP 68, 2020 (trajectory GOSPA); Luiten et al.,
@@ -54,10 +55,10 @@ def trajectory_gospa(
 ) -> TrajectoryGospa:
     """Compute the trajectory GOSPA of tracks and trajectories, and its parts.
 
-    If two estimates swap their truths, the cost of each is the switch penalty to the power of the
-    order; if an estimate begins or ceases to be paired, the cost is half as large. By default, the
-    metric is computed by linear programming, in which an estimate may be split among truths; with
-    `exactly`, all assignments are enumerated step by step, which is feasible for small cases.
+    If two estimates swap their truths, each costs the switch penalty to the power of the order; an
+    estimate that begins or ceases to be paired costs half of this. By default, the metric is computed by
+    linear programming, in which an estimate may be split among truths; with `exactly`, all assignments
+    are enumerated step by step, which is feasible for small cases.
 
     Raises BadInput if the shapes do not match, a cutoff or penalty is not positive, the order is below
     1, or there are more than MOST_ASSIGNMENTS assignments to enumerate.
@@ -141,7 +142,7 @@ def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
 
 
 def _assignments(n: int, m: int) -> Floats:
-    """List all one-to-one assignments (ways, n, m) of some of n estimates to some of m truths."""
+    """List all one-to-one assignments (ways, n, m) between subsets of n estimates and m truths."""
     found = []
     for count in range(min(n, m) + 1):
         for rows in combinations(range(n), count):
@@ -168,16 +169,16 @@ def hota(
     """Compute the HOTA of tracks and trajectories at every threshold.
 
     The similarity of two points is max(0, 1 - distance / cutoff); they match if the similarity reaches
-    the threshold. The pairs of a step are those with the best match over the whole span. The usual
-    single figure is the mean over the thresholds 0.05, 0.10, ..., 0.95. Raises BadInput if the shapes
-    do not match or the cutoff is not positive.
+    the threshold. At each step, pairs are chosen that maximise similarity times the alignment of the
+    trajectories over the whole span. The usual single figure is the mean over the thresholds 0.05, 0.10,
+    ..., 0.95. Raises BadInput if the shapes do not match or the cutoff is not positive.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
         truths: (m, steps, axes), NaN when a target is absent.
         cutoff: distance at which the similarity of two points becomes zero, in the unit of the points.
         thresholds: thresholds of the similarity, 0 to 1.
-        others: number of points of further tracks, none of which is ever within the cutoff.
+        others: number of points of additional tracks that never come within the cutoff of a target.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
@@ -204,15 +205,15 @@ def hota(
 def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float, *, others: int = 0) -> float:
     """Compute the IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
 
-    Each trajectory is assigned to at most one track. IDTP is the number of trajectory points closer than
-    the cutoff to the assigned track; the assignment maximises it. The result is NaN if there are no
-    points. Raises BadInput as `hota` does.
+    Each trajectory is assigned to at most one track. IDTP is the number of trajectory points that are
+    closer than the cutoff to the assigned track; tracks are assigned such that IDTP is largest. The
+    result is NaN if there are no points. Raises BadInput as `hota` does.
 
     Args:
         estimates: (n, steps, axes), NaN when a track is absent.
         truths: (m, steps, axes), NaN when a target is absent.
         cutoff: greatest distance of a pair, in the unit of the points.
-        others: number of points of further tracks, none of which is ever within the cutoff.
+        others: number of points of additional tracks that never come within the cutoff of a target.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: the cutoff must be positive")
@@ -239,7 +240,7 @@ def _present(tracks: Floats) -> NDArray[np.bool_]:
 
 
 def _distances(first: Floats, second: Floats) -> Floats:
-    """Compute distances (steps, n, m), infinite if either is absent."""
+    """Compute distances (steps, n, m), which are infinite if the track or the target is absent."""
     difference = first[:, None] - second[None]
     distance = np.sqrt((difference**2).sum(axis=3))
     return np.where(np.isnan(distance), np.inf, distance).transpose(2, 0, 1)

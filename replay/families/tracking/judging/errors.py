@@ -2,8 +2,8 @@
 
 At every instant, the tracks are predicted to this instant and paired with the targets that are present
 (GOSPA with alpha 2). The pairs determine the distance of a track from its target, and the share of time
-in which a target is followed. Switches to another track, and breaks, are counted with the pairs of CLEAR
-MOT, which are kept while they are within the cutoff.
+in which a target is followed. Switches to another track and breaks are counted with the pairs of CLEAR
+MOT: a pair is kept while it is within the cutoff.
 
 By default, every track counts. If the metadata of a truth states that truths cover only some of the
 targets (`COVERS`), a track of another target is not a false track: tracks that are farther than a
@@ -50,10 +50,10 @@ class TrackErrors(NamedTuple):
 
     Attributes:
         gospa_all: (k,), GOSPA of all tracks.
-        gospa, localisation, missed, false: (k,), without unreferenced tracks.
+        gospa, localisation, missed, false: (k,), GOSPA and its parts without unreferenced tracks.
         unreferenced: (k,), number of unreferenced tracks; None if the truths cover all targets.
         track: (targets, k), the track with which GOSPA pairs each target, or NONE.
-        distance: (targets, k), NaN if a target has no track.
+        distance: (targets, k), distance of each target from its track; NaN if the target has no track.
         present: (targets, k), whether the target is present.
         kept: (targets, k), the track with which CLEAR MOT pairs each target, or NONE.
     """
@@ -98,10 +98,10 @@ def target_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
-    """Choose instants from the end of the burn-in to the earliest end of scans and truths.
+    """Choose instants from the end of the burn-in until scans or a truth end, whichever is first.
 
     Truths are interpolated linearly. Raises BadInput if there are no scans or no truths of positions, or
-    if they end before the first instant.
+    if any of them end before the first instant.
     """
     scans = source.read(topics_of(source.topics, schemas.SCAN))
     truths = source.read(target_topics(source.topics))
@@ -208,11 +208,11 @@ def track_errors(
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """Compute means over the instants, and RMSE and coverage of each target, numbered from 1.
+    """Compute means over the instants, and RMSE and coverage per target; targets are numbered from 1.
 
-    Missed and false are numbers of targets. The RMSE of a target that is never followed is NaN. If the
-    truths cover only some targets, the GOSPA of all tracks and the number of unreferenced tracks are
-    included.
+    `missed_targets` and `false_targets` are mean numbers of targets. The RMSE of a target that is never
+    followed is NaN. If the truths cover only some targets, the GOSPA of all tracks and the number of
+    unreferenced tracks are included.
     """
     alone = cutoff_m**2 / 2.0
     figures = {"gospa_m": float(errors.gospa.mean())}
@@ -242,8 +242,8 @@ def figures_of_whole_tracks(
 ) -> dict[str, float]:
     """Compute HOTA and IDF1 with a cutoff of 20 m.
 
-    By default, all tracks count. If truths cover only some targets, only tracks that are ever within the
-    cutoff of a target count, and the metrics have other names.
+    By default, all tracks count. If truths cover only some targets, tracks count only if they come
+    within the cutoff of a target at some instant, and the metrics have other names.
 
     Args:
         tracks: the tracks at each of k instants.

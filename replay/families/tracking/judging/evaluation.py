@@ -2,7 +2,7 @@
 
 Instants, pairs and distances are defined in `errors`; experiments with trackers use the same
 definitions. A target is present from the first to the last stamp of its truth. The judged span begins
-a while after the start of the log and ends with the last scan that the tracker processed.
+after a burn-in time and ends with the last scan that the tracker processed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,9 +54,10 @@ class TrackBlock(NamedTuple):
 
 
 def targets_of(source: Source, frame: str) -> Judged | None:
-    """Return the targets of a run in a frame at its instants, NaN when absent; None without targets.
+    """Return the targets of a run in a frame at the run's instants, or None if there are no targets.
 
-    Instants are PERIOD_S apart, from BURN_IN_S after the epoch to the end of the last truth.
+    Instants are PERIOD_S apart, from the end of the burn-in (BURN_IN_S, or BURN_IN_SHARE of the span if
+    this is shorter) to the end of the last truth. Positions are NaN when a target is absent.
     """
     topics = target_topics(source.topics)
     truths = {topic: truth for topic, truth in source.read(topics).items() if len(truth)}
@@ -110,7 +111,7 @@ def track_blocks(
 
 
 class TracksJudge(KindJudge):
-    """Judge for sets of tracks; it reads the targets of each run once per frame."""
+    """Judge of sets of tracks, which reads the targets of each run once for each frame."""
 
     def __init__(self, runs: JudgedRuns) -> None:
         super().__init__(runs)
@@ -142,7 +143,7 @@ class Followed:
     Attributes:
         targets: the instants, and the positions of the targets.
         sets: the tracks at the instants so far.
-        first: number of instants before the first set of tracks, which are not judged.
+        first: number of instants before the first set of tracks; these instants are not judged.
         last: the last set of tracks.
     """
 
@@ -173,7 +174,7 @@ class Followed:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Compute figures of the tracks at the instants so far; {} without tracks or targets."""
+        """Compute figures of the tracks at the instants so far, or {} without tracks or targets."""
         begin = self.first or 0
         truths = self.targets.truths[:, begin : begin + len(self.sets)]
         if not self.sets or not np.isfinite(truths).any():
@@ -216,7 +217,7 @@ def _figures(state: State) -> dict[int, dict[str, float]]:
 
 
 def _finish(state: State) -> dict[str, float]:
-    """Compute the means of the figures over the runs for which they are known."""
+    """Compute the mean of each figure over the runs that have it."""
     runs = [figures for figures in _figures(state).values() if figures]
     found = {}
     for name in dict.fromkeys(name for figures in runs for name in figures):

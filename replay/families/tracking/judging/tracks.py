@@ -1,7 +1,7 @@
 """Evaluation of tracks by the share of each target's reports that are in one track.
 
-Tracks are assigned to targets one to one, such that as many reports as possible are in the track of
-their target. A track that contains two targets counts for only one of them.
+Each track is assigned to at most one target and vice versa, such that the number of reports in the track
+of their target is largest. A track that contains two targets counts for only one of them.
 """
 
 import operator
@@ -26,7 +26,7 @@ KEPT_SHARE = 0.95
 
 
 class KeptTracks(NamedTuple):
-    """Number of judged targets, share that kept a track, and mean share of a target's reports in it."""
+    """Number of judged targets, share of kept targets, and mean share of reports in assigned tracks."""
 
     targets: int
     kept_share: float
@@ -76,7 +76,7 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
 
 
 def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> KeptTracks:
-    """Summarise the shares of reports for targets with more than `reports` reports."""
+    """Summarise the reports' shares in assigned tracks, for targets with more than `reports` reports."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
         return KeptTracks(0, np.nan, np.nan)
@@ -107,10 +107,10 @@ Reports = dict[int, list[tuple[Integers, Integers]]]
 
 
 def reports_of(output: Output) -> Reports:
-    """Return the true targets and the tracks (n,) of each run's reports; {} if identities are unknown.
+    """Return true targets and tracks (n,) of the reports by run, or {} if identities are unknown.
 
-    The rows of the stream correspond to the reports in the replayed span and thus to the identities.
-    Raises BadInput if the estimates do not belong to the log.
+    The rows of the stream correspond to the reports in the replayed span, and therefore to their
+    identities. Raises BadInput if the estimates do not belong to the log.
     """
     stream = output.rows.stream
     topic = f"{stream.metadata.get('reports', '').rpartition('/')[0]}/{IDENTITY}"
@@ -137,7 +137,7 @@ def reports_of(output: Output) -> Reports:
 
 
 def track_tables(reports: Reports) -> "list[pd.DataFrame]":
-    """Make a table per run; return no tables if a run has no reports."""
+    """Make a table per run; if any run has no reports, return no tables at all."""
     if not all(reports.values()):
         return []
     return [
