@@ -118,7 +118,6 @@ class Replaying:
         plan = plan_replay([source], estimators, **self.options)
         places = []
         if self.place is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
             there = (self.place / "estimates").resolve()
             is_remote = isinstance(log, RemotePath)
             places = [(path, log if is_remote else path.parent / os.path.relpath(log.resolve(), there))]

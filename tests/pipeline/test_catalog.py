@@ -380,6 +380,28 @@ def test_an_interrupted_selection_is_resumed(
 
 
 @pytest.mark.paper
+def test_a_full_disk_ends_a_selection_and_keeps_its_batches(
+    drives: Path, fuselog: Callable[..., Said]
+) -> None:
+    """Every other log would fail as well, so it is no row; the limit stands in for the disk's."""
+    resource = pytest.importorskip("resource")
+    line = ("replay", "drives", "-e", "dead-reckoning", "--workers", "1", "--out", "out")
+    whole = contents_of(line, fuselog)
+    largest = len(whole["estimates/0001-drive2.estimates.mcap"])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, hard))
+    try:
+        said = fuselog(*line)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert said.code == 2
+    assert "drive4.estimates.mcap: cannot be written (File too large)" in said.err
+    assert len(list(Path("out.unfinished").glob("*.bin"))) == 2
+    assert not Path("out").exists()
+    assert contents_of(line, fuselog) == whole
+
+
+@pytest.mark.paper
 def test_a_killed_worker_changes_no_byte(drives: Path, fuselog: Callable[..., Said]) -> None:
     for number in range(40):
         shutil.copy(drives / "robot0" / "drive4.mcap", drives / f"copy{number}.mcap")
