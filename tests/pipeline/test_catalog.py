@@ -261,6 +261,19 @@ def test_a_comparison_over_logs_is_that_of_one_replay(
     for name in ("first_mean", "second_mean", "difference", "low", "high", "runs"):
         assert both[name].tolist() == pytest.approx(both[f"{name}_alone"].tolist(), nan_ok=True), name
     rows = pd.read_parquet("out/compare/tables/logs.parquet")
+    assert [row["position_rmse_m"] for row in said.json["logs"]] == rows["position_rmse_m"].tolist()
+    Path("cut.mcap").write_bytes(logs[0].read_bytes()[:-99])
+    shown = fuselog(
+        "compare", drives, "cut.mcap", *labels[:-1], "--workers", "1", "--set", "ekf.sigma_range_m=0.2"
+    ).out.splitlines()
+    again = "-e ekf -e dead-reckoning --set ekf.sigma_range_m=0.2"
+    opened = [line for line in shown if line.startswith("fuselog replay")]
+    assert opened[0] == f"fuselog replay cut.mcap {again}"
+    assert shown[shown.index(opened[0]) - 1].startswith("cut.mcap: ")
+    assert {*opened[1:]} <= {f"fuselog replay {log} {again}" for log in logs}
+    assert len(opened) == 5
+    said = fuselog("compare", drives, "--group", "folder", *labels, "--stress")
+    assert (said.code, said.err.count("\n"), "--stress: does not apply" in said.err) == (2, 1, True)
     said = fuselog("compare", drives, *labels, "--group", "folder", "--out", "out/groups")
     found = pd.DataFrame(said.json["differences"]).set_index("quantity").loc["position_rmse_m"]
     own = rows[rows["estimator"] == "ekf"]
