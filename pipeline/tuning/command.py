@@ -1,6 +1,7 @@
 """Output of `fuselog tune`, and functions that `calibrate` shares with it."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,6 @@ def tune_logs(
     """
     chosen_logs, others = logs_meant(logs, where), logs_meant(held_out)
     logs, held_out = chosen_logs.logs, others.logs
-    for note in (*chosen_logs.notes, *others.notes):
-        warn(note)
     _check_apart(logs, held_out)
     check_outputs(
         out, None, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))}
@@ -61,6 +60,7 @@ def tune_logs(
             on_best=lambda best: show(progress_of(best)),
             **options,
         )
+    found = replace(found, unreadable={**chosen_logs.unreadable, **others.unreadable})
     saved = found.save(out)
     parameters = found.parameters.replace({np.nan: None}).to_dict("records")
     if as_json:

@@ -343,6 +343,17 @@ def test_commands_on_all_logs_together_take_a_catalog(
     assert sorted(each.stem for each in Path("viewed").glob("*.rrd")) == ["drive0", "drive1"]
     tuned = fuselog("tune", *chosen, "-e", "ekf", "--free", "sigma_range_m", "--json").json
     assert tuned["logs"] == [str(log) for log in logs]
+    [told] = pd.read_parquet("out/tune/tables/unreadable.parquet").to_numpy().tolist()
+    assert told == [str(drives / "robot1" / "drive5.mcap"), *fl.catalog(drives)["problem"].dropna()]
+    for command in ("run -e ekf", "view", "tune -e ekf --free sigma_range_m"):
+        name, *options = command.split()
+        said = fuselog(name, "logs.parquet", *options, "--where", "seed == 7")
+        words = f"no selected log can be read; {': '.join(told)}"
+        assert (said.code, words in said.err, said.err.count("\n")) == (2, True, 1), command
+    toml = Path("mine.toml").read_text().replace("seed < 2", "seed == 7")
+    Path("none.toml").write_text(toml)
+    said = fuselog("run", "none.toml")
+    assert (said.code, words in said.err, said.err.count("\n")) == (2, True, 1)
 
 
 @pytest.mark.paper
