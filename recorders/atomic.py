@@ -23,7 +23,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput, CannotWrite
 
 _LOCK, _NEW, _OLD = "fuselog.lock", "new", "old"
 _LOG = logging.getLogger(__name__)
@@ -225,4 +225,4 @@ def _telling(place: Path, work: Path | None = None) -> Iterator[None]:
         elsewhere = work is not None and about is not None and not about.is_relative_to(work.absolute())
         if error.errno is None or elsewhere:
             raise
-        raise BadInput(f"{place}: cannot be written ({error.strerror or error})") from error
+        raise CannotWrite(f"{place}: cannot be written ({error.strerror or error})") from error

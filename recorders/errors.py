@@ -16,6 +16,10 @@ class BadInput(Exception):
     """
 
 
+class CannotWrite(BadInput):
+    """An error of writing a file, such as a full disk, which other inputs would meet as well."""
+
+
 class UnknownName(BadInput, KeyError):
     """An error for an unknown name; also a KeyError, so that `in` and `get` of mappings still work."""
 

@@ -117,7 +117,6 @@ class Replaying:
         plan = plan_replay([source], estimators, **self.options)
         places = []
         if self.place is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
             there = (self.place / "estimates").resolve()
             is_remote = isinstance(log, RemotePath)
             places = [(path, log if is_remote else path.parent / os.path.relpath(log.resolve(), there))]
@@ -327,22 +326,7 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
         of_logs, over_all = (each.to_dict("records") for each in (table, verdicts))
         print_json({"logs": of_logs, "verdicts": over_all, "written": [str(found.folder)]})
         return is_good
-    errors = [name for name in map(str, table) if is_error(name)][:1]
-    columns = [
-        name for name in (*KEYS, *errors, *PRINTED) if name in table and table[name].notna().any()
-    ]
-    print_table(columns, table[columns].head(MOST_ROWS).to_numpy().tolist())
-    if len(table) > MOST_ROWS:
-        say(f"the worst {MOST_ROWS} of {len(table)} rows; all are in {found.folder}/tables")
-    is_bad = failed | (table[FAULTS].fillna(0) > 0) if FAULTS in table else failed | True
-    for log, own in list(table[is_bad].groupby("log", sort=False))[:MOST_OPENED]:
-        told = [each for name in SAID if name in own for each in own[name].dropna()]
-        written = own["estimates"].dropna().tolist() if "estimates" in own else []
-        view = ["view", *(str(found.folder / name) for name in written[:1]), "--at", "worst"]
-        words = view if written else [str(log) if word == LOG else word for word in opens]
-        for sentence in told[:1]:
-            say(f"{log}: {sentence}")
-        say(shlex.join(["fuselog", *words]))
+    show_worst(table, found.folder, opens)
     rows = [
         [
             each["estimator"],
@@ -352,7 +336,7 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
             *(each[name] for name in ("aim", "verdict", "logs", "units")),
         ]
         for each in found.verdicts.to_dict("records")
-        if each["quantity"] in (*errors, "nees", NIS)
+        if each["quantity"] in (*_shown_error(table), "nees", NIS)
     ]
     if rows:
         columns = ["estimator", "case", "metric", "value", "aim", "verdict", "logs", "units"]
@@ -365,3 +349,41 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
     say(f"{bad} of {count(table['log'].nunique(), 'log')} failed; {found.folder}: tables, result.json")
     say_next("report", str(found.folder))
     return is_good
+
+
+def opening(
+    command: str, labels: Sequence[str], settings_file: Path | None, settings: Sequence[str]
+) -> list[str]:
+    """Return the words of a command on a single log with the same estimators and settings."""
+    options = [("-e", label) for label in labels]
+    options += [("--settings", str(file)) for file in filter(None, [settings_file])]
+    options += [("--set", text) for text in settings]
+    return [command, LOG, *(word for option in options for word in option)]
+
+
+def show_worst(table: pd.DataFrame, folder: Path, opens: Sequence[str]) -> None:
+    """Print the rows of the worst logs, and the commands that open them; see `show_over_logs`."""
+    table = table.replace({np.nan: None})
+    columns = [
+        name
+        for name in (*KEYS, *_shown_error(table), *PRINTED)
+        if name in table and table[name].notna().any()
+    ]
+    print_table(columns, table[columns].head(MOST_ROWS).to_numpy().tolist())
+    if len(table) > MOST_ROWS:
+        say(f"the worst {MOST_ROWS} of {len(table)} rows; all are in {folder}/tables")
+    failed = table["problem"].notna()
+    is_bad = failed | (table[FAULTS].fillna(0) > 0) if FAULTS in table else failed | True
+    for log, own in list(table[is_bad].groupby("log", sort=False))[:MOST_OPENED]:
+        told = [each for name in SAID if name in own for each in own[name].dropna()]
+        written = own["estimates"].dropna().tolist() if "estimates" in own else []
+        view = ["view", *(str(folder / name) for name in written[:1]), "--at", "worst"]
+        words = view if written else [str(log) if word == LOG else word for word in opens]
+        for sentence in told[:1]:
+            say(f"{log}: {sentence}")
+        say(shlex.join(["fuselog", *words]))
+
+
+def _shown_error(table: pd.DataFrame) -> list[str]:
+    """Return the name of the error that is printed; none if no log has truth."""
+    return [name for name in map(str, table) if is_error(name)][:1]

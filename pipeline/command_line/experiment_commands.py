@@ -6,7 +6,7 @@ from shlex import quote
 from typing import Any
 
 from fuselog.pipeline.api.api import run, sweep
-from fuselog.pipeline.logs.cataloguing import select
+from fuselog.pipeline.logs.cataloguing import select_together
 from fuselog.pipeline.output.alarms import NOT_TESTED
 from fuselog.pipeline.output.results import RESULT_FILE, RUNS, keep, read_table, split_metric
 from fuselog.pipeline.output.terminal import (
@@ -21,7 +21,6 @@ from fuselog.pipeline.output.terminal import (
     progress,
     say,
     say_next,
-    warn,
 )
 from fuselog.pipeline.runs.experiment import (
     Experiment,
@@ -161,9 +160,7 @@ def _stated_experiment(
     if where is None and all(path.suffix == ".mcap" for path in files):
         stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
     else:
-        chosen = select(files, where)
-        for note in chosen.notes:
-            warn(note)
+        chosen = select_together(files, where)
         stated = experiment_of_logs(chosen.logs, labels, chosen.unreadable)
     values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]

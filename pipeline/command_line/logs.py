@@ -250,9 +250,9 @@ def view(paths: tuple[Path, ...], where: str | None, **options: Any) -> None:
     from fuselog.pipeline.presenting.options import Options
 
     if selecting(paths, {"where": where}):
-        from fuselog.pipeline.logs.cataloguing import select
+        from fuselog.pipeline.logs.cataloguing import select_together
 
-        paths = tuple(select(paths, where).logs)
+        paths = tuple(select_together(paths, where).logs)
     kept = [path / "estimates" for path in paths if (path / "tables" / "logs.parquet").is_file()]
     view_path(kept if len(kept) == len(paths) else paths, Options(**options))
     _say_next_of_view(paths[0], recover=options["recover"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fuselog.pipeline.api.over_logs import Replaying, campaign_of
+from fuselog.pipeline.api.over_logs import Replaying, campaign_of, opening, show_worst
 from fuselog.pipeline.comparing.comparing import Differences, Paired, compare
 from fuselog.pipeline.comparing.groups import recorded_labels, with_logs_of_folders
 from fuselog.pipeline.comparing.over_logs import compare_over_logs
@@ -107,6 +107,9 @@ def compare_selection(
     campaign = campaign_of(selection, out or Path("out/compare"))
     found = compare_over_logs(task, campaign, margin, gap_limit_s, fail_if_worse=fail_if_worse)
     worse = found.worse() if fail_if_worse else []
+    if not as_json:
+        opens = opening("replay", labels, settings_file, settings)
+        show_worst(found.tables["logs"], campaign.out, opens)
     _show(found, worse, [campaign.out], [], as_json=as_json)
     return not worse
 
@@ -132,6 +135,10 @@ def _show(
                 "stress": list(stress_tests),
                 "coverage": [row._asdict() for row in found.coverage],
                 "written": [str(path) for path in written],
+            }
+            | {
+                name: rows.replace({np.nan: None}).to_dict("records")
+                for name, rows in found.tables.items()
             }
         )
         return

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fuselog.pipeline.api.over_logs import LOG, campaign_of, show_over_logs
+from fuselog.pipeline.api.over_logs import campaign_of, opening, show_over_logs
 from fuselog.pipeline.diagnosing.consistency import comparable
 from fuselog.pipeline.diagnosing.diagnosis import diagnose
 from fuselog.pipeline.diagnosing.over_logs import Diagnosing
@@ -137,5 +137,5 @@ def diagnose_selection(
     campaign = campaign_of(selection, out or Path("out/diagnose"))
     task = Diagnosing(label, given | alterations, gap_limit_s, recover)
     found = campaign.run(task, "diagnose", {"estimators": {label: given} if label else {}})
-    opens = ("diagnose", LOG, *(("-e", label) if label else ()))
+    opens = opening("diagnose", [label] if label else [], settings_file, settings)
     return show_over_logs(found, as_json=as_json, opens=opens)

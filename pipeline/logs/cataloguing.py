@@ -248,7 +248,18 @@ def logs_meant(paths: Sequence[Path], where: str | None = None) -> Selection:
     """Find the logs that a command uses together: all logs in folders, or a selection of catalogs."""
     if where is None and not any(map(is_catalog, paths)):
         return Selection([log for path in paths for log in logs_in(path)])
-    return select(paths, where)
+    return select_together(paths, where)
+
+
+def select_together(paths: Sequence[Path], where: str | None = None) -> Selection:
+    """Select logs that a command uses together, and warn about those that cannot be read.
+
+    Raises BadInput if no log can be read; see also `select`.
+    """
+    found = select(paths, where)
+    found.require_readable(paths[0])
+    terminal.warn(*found.notes)
+    return found
 
 
 def show_catalog(

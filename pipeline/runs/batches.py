@@ -18,7 +18,7 @@ from fuselog.pipeline.runs.campaigns import Pace, work_off
 from fuselog.pipeline.runs.checkpoints import Checkpoints
 from fuselog.pipeline.runs.ensemble import Progress, no_progress
 from fuselog.pipeline.runs.executors import PoolFactory, keep_freed_memory, states_of, version_of_code
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput, CannotWrite
 
 # The number of logs in a batch, and the number of batches below which each log has its own.
 BATCH, FEW = 32, 64
@@ -81,9 +81,14 @@ class Batch:
 
 
 def rows_of(task: Task, log: Path, number: int, folder: Path) -> list[Row]:
-    """Return the rows of a log, or one row with the reason if it cannot be processed."""
+    """Return the rows of a log, or one row with the reason if it cannot be processed.
+
+    Raises CannotWrite if a file of the result cannot be written, which ends the command.
+    """
     try:
         return task(log, number, folder)
+    except CannotWrite:
+        raise
     except (BadInput, OSError) as error:
         return [{"problem": str(error).removeprefix(f"{log}: ")}]
 

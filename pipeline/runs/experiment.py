@@ -19,7 +19,7 @@ from fuselog.pipeline.runs.executors import PoolFactory
 from fuselog.pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
 from fuselog.pipeline.runs.settings import named_by, parameters_by_label
 from fuselog.pipeline.selecting.catalog import is_catalog
-from fuselog.pipeline.selecting.selection import of_catalog
+from fuselog.pipeline.selecting.selection import of_catalog, table_of
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import open_log
 from fuselog.recorders.parameters import Parameters, build, merge
@@ -267,7 +267,7 @@ def read_experiment(name: str) -> Stated:
 
 def is_of_logs(name: str) -> bool:
     """Test whether a name is that of a log, a catalog or a folder of logs, not of an experiment."""
-    path = Path(name)
+    path = located(name)
     is_folder = path.is_dir() and name not in shipped("experiments")
     return path.suffix == ".mcap" or is_catalog(path) or is_folder
 
@@ -297,7 +297,10 @@ def _logs_of(stated: Logs, folder: Path, where: str) -> Logs:
         if stated.where is not None:
             raise BadInput(f"{where}: where = {stated.where!r} selects from a catalog; name it too")
         return stated.model_copy(update={"files": files})
-    found = of_catalog(Path(os.path.normpath(folder / stated.catalog)), stated.where)
+    catalog = Path(os.path.normpath(folder / stated.catalog))
+    found = of_catalog(catalog, stated.where)
+    if not files:
+        found.require_readable(catalog)
     files = list(dict.fromkeys([*files, *map(str, found.logs)]))
     why = {str(log): problem for log, problem in found.unreadable.items()}
     return Logs(files=files, unreadable=why or None)
@@ -444,10 +447,7 @@ def run_experiment(
         )
         outcome = study.run(experiment, setting)
         if experiment.logs and experiment.logs.unreadable:
-            import pandas as pd  # slow to import
-
-            rows = list(experiment.logs.unreadable.items())
-            outcome.tables["unreadable"] = pd.DataFrame(rows, columns=["log", "problem"])
+            outcome.tables["unreadable"] = table_of(experiment.logs.unreadable)
         metrics = plain(outcome.metrics)
         outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers, recordings)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)

@@ -30,6 +30,12 @@ class Selection:
     groups: Sequence[str] = ()
     unreadable: Mapping[Path, str] = field(default_factory=dict)
 
+    def require_readable(self, path: Path) -> None:
+        """Raise BadInput if no log can be read."""
+        if not self.logs:
+            log, why = next(iter(self.unreadable.items()))
+            raise BadInput(f"{path}: no selected log can be read; {log}: {why}")
+
     @property
     def notes(self) -> Iterator[str]:
         """Yield sentences on the logs that cannot be read."""
@@ -42,6 +48,14 @@ def notes_of(left_out: Mapping[Any, str]) -> Iterator[str]:
         yield f"{log}: left out: {why}"
     if len(left_out) > MOST_NAMED:
         yield f"{len(left_out) - MOST_NAMED} other logs are left out as well"
+
+
+def table_of(left_out: Mapping[Any, str]) -> "pd.DataFrame":
+    """Return a table with a row for each log that is left out, with the reason."""
+    import pandas as pd  # slow to import
+
+    rows = [(str(log), why) for log, why in left_out.items()]
+    return pd.DataFrame(rows, columns=["log", "problem"])
 
 
 def of_catalog(path: Path, where: str | None = None) -> Selection:

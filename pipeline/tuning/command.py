@@ -1,6 +1,7 @@
 """Output of `fuselog tune`, and functions that `calibrate` shares with it."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ def tune_logs(
     logs: Sequence[Path],
     *,
     label: str,
-    search: Callable[..., Tuning] = tune,
+    search: Callable[..., Tuning] | None = None,
     bounds: Sequence[str],
     held_out: Sequence[Path],
     out: Path,
@@ -37,12 +38,10 @@ def tune_logs(
 ) -> None:
     """Tune on logs, write the result folder, and print the names of the logs and the result.
 
-    The other options are those of `search`.
+    The other options are those of `search`, by default `tune`.
     """
     chosen_logs, others = logs_meant(logs, where), logs_meant(held_out)
     logs, held_out = chosen_logs.logs, others.logs
-    for note in (*chosen_logs.notes, *others.notes):
-        warn(note)
     _check_apart(logs, held_out)
     check_outputs(
         out, None, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))}
@@ -52,7 +51,7 @@ def tune_logs(
     if not as_json:
         say(f"tuning on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
-        found = search(
+        found = (search or tune)(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             chosen,
             set=alterations,
@@ -61,6 +60,7 @@ def tune_logs(
             on_best=lambda best: show(progress_of(best)),
             **options,
         )
+    found = replace(found, unreadable={**chosen_logs.unreadable, **others.unreadable})
     saved = found.save(out)
     parameters = found.parameters.replace({np.nan: None}).to_dict("records")
     if as_json:

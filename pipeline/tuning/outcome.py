@@ -21,6 +21,7 @@ from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
 from fuselog.pipeline.output.summary import summarise, summary_table
 from fuselog.pipeline.output.words import label_of
+from fuselog.pipeline.selecting.selection import table_of
 from fuselog.pipeline.tuning.confidence import Profile, SearchOutcome, doubts, profiles
 from fuselog.pipeline.tuning.objective import Objective, innovations_in
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource
@@ -53,6 +54,7 @@ class Tuning:
         gate: the probability of the gate that was open in the search.
         advice: sentences on what to record next.
         files: texts that are written next to the settings, by file name.
+        unreadable: why other logs of the selection cannot be read.
     """
 
     label: str
@@ -67,6 +69,7 @@ class Tuning:
     gate: float
     advice: Sequence[str] = ()
     files: Mapping[str, str] = field(default_factory=dict)
+    unreadable: Mapping[Path, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         title = f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}"
@@ -350,6 +353,7 @@ class Tuning:
                 "profile": self.profile,
                 "whiteness": self.whiteness,
                 "folds": self.folds,
+                "unreadable": table_of(self.unreadable),
             }.items()
             if len(table)
         }

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.environment import cache_folder as cache_folder
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import CannotWrite
 
 _OTHERS_MAY_WRITE = 0o022
 # Every cached result is made in less time, even on a slow and busy machine.
@@ -100,12 +100,12 @@ def _content(written: bytes) -> bytes | None:
 def write_checked(path: Path, content: bytes, made_by: str) -> None:
     """Write a private file, which appears completely or not at all, in private folders.
 
-    Raises BadInput, with a message that begins with the path, if the file cannot be written.
+    Raises CannotWrite, with a message that begins with the path, if the file cannot be written.
     """
     try:
         _make_private(path.parent)
     except OSError as error:
-        raise BadInput(f"{path}: cannot be written ({error.strerror})") from error
+        raise CannotWrite(f"{path}: cannot be written ({error.strerror})") from error
     with whole_file(path, parents=False) as new:
         new.write_bytes(_digest(content) + f" {made_by}\n".encode() + content)
         new.chmod(0o600)

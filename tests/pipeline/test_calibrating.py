@@ -199,7 +199,7 @@ def test_the_next_manoeuvre_is_the_sheets() -> None:
     assert varied.sigmas * USEFUL == pytest.approx(
         [0.000883, 0.012926, 0.00118, 0.29077, 0.11701, 0.02947, 0.00118], rel=0.02
     )
-    said = [each for each in found.notes if "record turns at changing speed: among 6 manoeuvres" in each]
+    said = [each for each in found.notes if "record turns at changing speed: of 6 manoeuvres" in each]
     assert said
     assert any("by the determinant" in each for each in found.notes)
 

@@ -270,6 +270,19 @@ def test_a_comparison_over_logs_is_that_of_one_replay(
     for name in ("first_mean", "second_mean", "difference", "low", "high", "runs"):
         assert both[name].tolist() == pytest.approx(both[f"{name}_alone"].tolist(), nan_ok=True), name
     rows = pd.read_parquet("out/compare/tables/logs.parquet")
+    assert [row["position_rmse_m"] for row in said.json["logs"]] == rows["position_rmse_m"].tolist()
+    Path("cut.mcap").write_bytes(logs[0].read_bytes()[:-99])
+    shown = fuselog(
+        "compare", drives, "cut.mcap", *labels[:-1], "--workers", "1", "--set", "ekf.sigma_range_m=0.2"
+    ).out.splitlines()
+    again = "-e ekf -e dead-reckoning --set ekf.sigma_range_m=0.2"
+    opened = [line for line in shown if line.startswith("fuselog replay")]
+    assert opened[0] == f"fuselog replay cut.mcap {again}"
+    assert shown[shown.index(opened[0]) - 1].startswith("cut.mcap: ")
+    assert {*opened[1:]} <= {f"fuselog replay {log} {again}" for log in logs}
+    assert len(opened) == 5
+    said = fuselog("compare", drives, "--group", "folder", *labels, "--stress")
+    assert (said.code, said.err.count("\n"), "--stress: does not apply" in said.err) == (2, 1, True)
     said = fuselog("compare", drives, *labels, "--group", "folder", "--out", "out/groups")
     found = pd.DataFrame(said.json["differences"]).set_index("quantity").loc["position_rmse_m"]
     own = rows[rows["estimator"] == "ekf"]
@@ -339,6 +352,17 @@ def test_commands_on_all_logs_together_take_a_catalog(
     assert sorted(each.stem for each in Path("viewed").glob("*.rrd")) == ["drive0", "drive1"]
     tuned = fuselog("tune", *chosen, "-e", "ekf", "--free", "sigma_range_m", "--json").json
     assert tuned["logs"] == [str(log) for log in logs]
+    [told] = pd.read_parquet("out/tune/tables/unreadable.parquet").to_numpy().tolist()
+    assert told == [str(drives / "robot1" / "drive5.mcap"), *fl.catalog(drives)["problem"].dropna()]
+    for command in ("run -e ekf", "view", "tune -e ekf --free sigma_range_m"):
+        name, *options = command.split()
+        said = fuselog(name, "logs.parquet", *options, "--where", "seed == 7")
+        words = f"no selected log can be read; {': '.join(told)}"
+        assert (said.code, words in said.err, said.err.count("\n")) == (2, True, 1), command
+    toml = Path("mine.toml").read_text().replace("seed < 2", "seed == 7")
+    Path("none.toml").write_text(toml)
+    said = fuselog("run", "none.toml")
+    assert (said.code, words in said.err, said.err.count("\n")) == (2, True, 1)
 
 
 @pytest.mark.paper
@@ -398,6 +422,28 @@ def test_an_interrupted_selection_is_resumed(
     assert not Path("out").exists()
     assert contents_of(line, fuselog) == whole
     assert packed == ["drive0", "drive2", "drive4", "stopped", "drive1", "drive3"]
+
+
+@pytest.mark.paper
+def test_a_full_disk_ends_a_selection_and_keeps_its_batches(
+    drives: Path, fuselog: Callable[..., Said]
+) -> None:
+    """Every other log would fail as well, so it is no row; the limit stands in for the disk's."""
+    resource = pytest.importorskip("resource")
+    line = ("replay", "drives", "-e", "dead-reckoning", "--workers", "1", "--out", "out")
+    whole = contents_of(line, fuselog)
+    largest = len(whole["estimates/0001-drive2.estimates.mcap"])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, hard))
+    try:
+        said = fuselog(*line)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert said.code == 2
+    assert "drive4.estimates.mcap: cannot be written (File too large)" in said.err
+    assert len(list(Path("out.unfinished").glob("*.bin"))) == 2
+    assert not Path("out").exists()
+    assert contents_of(line, fuselog) == whole
 
 
 @pytest.mark.paper

@@ -18,7 +18,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from fuselog.recorders.atomic import whole_file
-from fuselog.recorders.errors import BadInput
+from fuselog.recorders.errors import BadInput, CannotWrite
 from fuselog.recorders.log.container.ahead import ahead
 from fuselog.recorders.log.container.chunks import COMPRESSIONS, MAGIC, RECORD_HEAD, chunk_record
 from fuselog.recorders.log.container.packing import INDEX_ENTRY, Chunk
@@ -166,7 +166,7 @@ class ContainerWriter:
         try:
             yield
         except OSError as error:
-            self._failure = BadInput(f"{self._path}: cannot be written ({error.strerror})")
+            self._failure = CannotWrite(f"{self._path}: cannot be written ({error.strerror})")
             raise self._failure from error
 
     def _finish(self) -> None:
