@@ -206,7 +206,7 @@ class LogSource(_Readable):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics`, ordered by the clock `order`, at most `block_messages` at a time."""
+        """Yield the span of `topics`, by the clock `order`, at most `block_messages` at a time."""
         before = Rejections()
         for block in read_blocks(
             self.log,
@@ -299,7 +299,7 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics`, ordered by the clock `order`, as one block, not `block_messages`."""
+        """Yield the span of `topics`, by the clock `order`, as one block, not `block_messages`."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
