@@ -178,6 +178,13 @@ def test_conditions_select_rows() -> None:
         ("topics == 3", "has lists"),
         ("(" * 300 + "1" + ")" * 300, "cannot be parsed"),
         ("1 < " * 9000 + "1", "longer than"),
+        (" and ".join(["seed == 1"] * 600), "too many parts"),
+        ("seed == '1'", "cannot be compared"),
+        ("seed in ['1']", "cannot be compared"),
+        ("seed == 2 or log", "log is not a comparison"),
+        ("'a' in log", "write a list"),
+        ("log in 'abc'", "write a list"),
+        ("seed * 9999999999999999999 > 1", "exceed 64 bits"),
     ],
 )
 def test_a_condition_is_only_a_comparison(condition: str, words: str) -> None:
