@@ -124,6 +124,10 @@ def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
         shutil.move(each, "moved")
     found = cataloguing.select([Path("moved/logs.parquet")], "seed == 2")
     assert found.logs == [Path("moved/drives/robot0/drive2.mcap")]
+    paths = [Path("moved/logs.parquet"), Path("moved/drives"), Path("moved").absolute() / "drives"]
+    again = cataloguing.select(paths)
+    assert (len(again.logs), len(again.unreadable)) == (5, 1)
+    assert len(fl.catalog(*paths[1:], out="twice.parquet")) == len(fl.catalog("twice.parquet")) == 6
 
 
 def test_conditions_select_rows() -> None:
@@ -199,6 +203,7 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
     fl.catalog(drives, out="logs.parquet")
     pd.read_parquet("logs.parquet").to_parquet("table.parquet")
     Path("text.parquet").write_text("log")
+    fl.write(drives / "still.mcap", fl.record("axis").streams.values())
     Path("empty").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fuselog.pipeline.selecting.catalog.FORMAT", 2)
@@ -214,6 +219,7 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
         "replay logs.parquet -e ekf": "drive0.mcap: changed after it was catalogued",
         "replay drives/robot0 -e ekf --group foldr": "did you mean 'folder'?",
         "replay drives/robot0 -e ekf --where seed>70": "--where seed>70",
+        "replay drives/robot0 drives/still.mcap -e ekf --group seed": "no value for drives/still.mcap",
         "replay drives/robot0 -e ekf --workers 1 --save a.rrd": "--save",
         "replay drives/robot0 -e ekf --workers 1 -o a.mcap": "a selection has a result folder",
     }.items():
