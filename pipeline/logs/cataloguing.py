@@ -1,9 +1,11 @@
 """The rows of catalogs, from the summaries of logs, and the logs that a command selects."""
 
 import json
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, ClassVar
 
@@ -204,7 +206,15 @@ def catalog(
 def _logs_of(paths: Sequence[Path]) -> list[str]:
     """List the logs in folders, and the logs that are given directly, without duplicates."""
     found = (logs_under(path) if path.is_dir() else [str(path)] for path in paths)
-    return list(dict.fromkeys(log for logs in found for log in logs))
+    distinct: dict[str, str] = {}
+    for log in chain.from_iterable(found):
+        distinct.setdefault(_place(log), log)
+    return list(distinct.values())
+
+
+def _place(log: str) -> str:
+    """Return what identifies a log: its URL or absolute path."""
+    return log if "://" in log else os.path.normpath(Path(log).absolute())
 
 
 def _rows(logs: Sequence[str], *, deep: bool = False) -> "pd.DataFrame":
@@ -224,7 +234,8 @@ def _row(log: str, found: Row, state: tuple[int, int, str], deep: bool) -> Row:
 def select(paths: Sequence[Path], where: str | None = None, group: str | None = None) -> Selection:
     """Find the logs of folders and catalogs, and single logs, that meet a condition.
 
-    Folders are searched with the folders in them, as by `catalog`.
+    Folders are searched with the folders in them, as by `catalog`. A log that several paths name is used
+    once, with the columns of the first path.
 
     Args:
         paths: logs, folders of logs, and catalogs.
@@ -240,7 +251,8 @@ def select(paths: Sequence[Path], where: str | None = None, group: str | None = 
             require_unchanged(table, path)
         else:
             tables.append(_rows(_logs_of([path])))
-    table = with_columns(table_of([row for table in tables for row in rows_in(table)]))
+    table = table_of([row for table in tables for row in rows_in(table)])
+    table = with_columns(table[~table["log"].map(_place).duplicated()])
     return selected(table, str(paths[0]), where, group)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from fuselog.pipeline.selecting.catalog import read_catalog, require_unchanged, with_columns
 from fuselog.pipeline.selecting.where import rows_where
-from fuselog.recorders.errors import BadInput, choices
+from fuselog.recorders.errors import BadInput, choices, some_of
 from fuselog.recorders.remote.paths import located
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def selected(
         where: the condition.
         group: the column that names the group of each log.
 
-    Raises BadInput if no log meets the condition, or there is no such column.
+    Raises BadInput if no log meets the condition, there is no such column, or a log has no value there.
     """
     if where is not None:
         table = rows_where(table, where)
@@ -90,6 +90,11 @@ def selected(
     bad = table["problem"].notna()
     logs = [located(log) for log in table["log"][~bad]]
     groups = [] if group is None else table[group][~bad].astype(str).tolist()
+    if group is not None and (unknown := table["log"][~bad & table[group].isna()]).size:
+        raise BadInput(
+            f"--group {group}: no value for {some_of(unknown, MOST_NAMED)}; "
+            f'fill the column, or leave them out with --where "{group} == {group}"'
+        )
     why = {
         located(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)
     }

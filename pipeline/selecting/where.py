@@ -41,16 +41,13 @@ def rows_where(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
                 f"--where: the column {node.id} has lists; compare those of a topic or model, such as "
                 "fix_messages and fits_robot"
             )
-        if isinstance(node, ast.BinOp):  # a text times a number could fill the memory
-            for side in (node.left, node.right):
-                is_text = isinstance(side, ast.Name) and not pd.api.types.is_numeric_dtype(
-                    table[side.id]
-                )
-                if is_text or not isinstance(getattr(side, "value", 0), int | float):
-                    raise BadInput(f"--where {condition}: {ast.unparse(side)} is not a number")
+    for node in reversed([*ast.walk(tree)]):
+        _check_kinds(node, table, condition)
     try:
         found = table.eval(ast.unparse(tree), engine="python")
-    except (TypeError, ValueError, AttributeError, NotImplementedError, OverflowError) as error:
+    except RecursionError:
+        raise BadInput(f"--where {condition[:200]}: has too many parts; shorten it") from None
+    except (TypeError, ValueError, AttributeError, NotImplementedError, ArithmeticError) as error:
         raise BadInput(
             f"--where {condition}: these values cannot be compared ({error}); compare numbers with "
             "numbers and texts with texts"
@@ -82,3 +79,61 @@ def _parsed(condition: str) -> ast.Expression:
                 "texts, comparisons, in, and, or, not, + - * /"
             )
     return tree
+
+
+def _check_kinds(node: ast.AST, table: "pd.DataFrame", condition: str) -> None:
+    """Raise BadInput if a part of a condition combines values that pandas would misunderstand."""
+    why = ""
+    if isinstance(node, ast.BinOp):  # a text times a number could fill the memory
+        sides = [side for side in (node.left, node.right) if _kind(side, table) not in ("number", "")]
+        why = f"{ast.unparse(sides[0])} is not a number" if sides else ""
+        if not why and _largest(node, table) >= 1 << 63:
+            why = "its numbers exceed 64 bits; write one of them with a decimal point"
+    elif isinstance(node, ast.BoolOp | ast.UnaryOp) and not isinstance(node.op, ast.USub):
+        for side in (each for each in ast.iter_child_nodes(node) if isinstance(each, ast.expr)):
+            is_flag = isinstance(side, ast.Name) and table[side.id].dtype in ("bool", "boolean")
+            if not (is_flag or _kind(side, table) == "condition"):
+                why = f"{ast.unparse(side)} is not a comparison"
+    elif isinstance(node, ast.Compare):
+        lists = [isinstance(side, ast.List | ast.Tuple) for side in (node.left, *node.comparators)]
+        if lists != [False, *(isinstance(each, ast.In | ast.NotIn) for each in node.ops)]:
+            why = "after `in`, and only there, write a list, such as folder in ['a', 'b']"
+        values = [
+            each for side in (node.left, *node.comparators) for each in getattr(side, "elts", [side])
+        ]
+        if len({_kind(each, table) for each in values} - {""}) > 1:
+            why = "these values cannot be compared; compare numbers with numbers and texts with texts"
+    if why:
+        raise BadInput(f"--where {condition}: {why}")
+
+
+def _kind(node: ast.AST, table: "pd.DataFrame") -> str:
+    """Return what the value of an expression is; empty for a column without values."""
+    import pandas as pd
+
+    if isinstance(node, ast.Constant):
+        return "text" if isinstance(node.value, str) else "number"
+    if isinstance(node, ast.Name):
+        column = table[node.id]
+        is_number = pd.api.types.is_numeric_dtype(column)
+        return "number" if is_number else "text" if column.notna().any() else ""
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        return _kind(node.operand, table)
+    return "number" if isinstance(node, ast.BinOp) else "condition"
+
+
+def _largest(node: ast.AST, table: "pd.DataFrame") -> float:
+    """Return a bound on the size of an integer expression; 0 if it is computed with decimals."""
+    import pandas as pd
+
+    if isinstance(node, ast.BinOp):
+        sides = _largest(node.left, table), _largest(node.right, table)
+        if isinstance(node.op, ast.Div) or not all(sides):
+            return 0
+        return sides[0] * sides[1] if isinstance(node.op, ast.Mult) else sum(sides)
+    if isinstance(node, ast.UnaryOp):
+        return _largest(node.operand, table)
+    if isinstance(node, ast.Name) and pd.api.types.is_integer_dtype(table[node.id]):
+        return int(table[node.id].abs().max() or 1) if table[node.id].notna().any() else 1
+    value = getattr(node, "value", 0.0)
+    return max(abs(value), 1) if isinstance(value, int) else 0

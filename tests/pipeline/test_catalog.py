@@ -126,6 +126,10 @@ def test_a_catalog_and_its_logs_are_moved_together(drives: Path) -> None:
         shutil.move(each, "moved")
     found = cataloguing.select([Path("moved/logs.parquet")], "seed == 2")
     assert found.logs == [Path("moved/drives/robot0/drive2.mcap")]
+    paths = [Path("moved/logs.parquet"), Path("moved/drives"), Path("moved").absolute() / "drives"]
+    again = cataloguing.select(paths)
+    assert (len(again.logs), len(again.unreadable)) == (5, 1)
+    assert len(fl.catalog(*paths[1:], out="twice.parquet")) == len(fl.catalog("twice.parquet")) == 6
 
 
 def test_conditions_select_rows() -> None:
@@ -180,6 +184,13 @@ def test_conditions_select_rows() -> None:
         ("topics == 3", "has lists"),
         ("(" * 300 + "1" + ")" * 300, "cannot be parsed"),
         ("1 < " * 9000 + "1", "longer than"),
+        (" and ".join(["seed == 1"] * 600), "too many parts"),
+        ("seed == '1'", "cannot be compared"),
+        ("seed in ['1']", "cannot be compared"),
+        ("seed == 2 or log", "log is not a comparison"),
+        ("'a' in log", "write a list"),
+        ("log in 'abc'", "write a list"),
+        ("seed * 9999999999999999999 > 1", "exceed 64 bits"),
     ],
 )
 def test_a_condition_is_only_a_comparison(condition: str, words: str) -> None:
@@ -199,6 +210,7 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
         values = pa.array([None if name == "log" else "{"] * len(damaged), pa.string())
         place = damaged.column_names.index(name)
         pq.write_table(damaged.set_column(place, name, values), f"{name}.parquet")
+    fl.write(drives / "still.mcap", fl.record("axis").streams.values())
     Path("empty").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fuselog.pipeline.selecting.catalog.FORMAT", 2)
@@ -216,6 +228,7 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
         "replay logs.parquet -e ekf": "drive0.mcap: changed after it was catalogued",
         "replay drives/robot0 -e ekf --group foldr": "did you mean 'folder'?",
         "replay drives/robot0 -e ekf --where seed>70": "--where seed>70",
+        "replay drives/robot0 drives/still.mcap -e ekf --group seed": "no value for drives/still.mcap",
         "replay drives/robot0 -e ekf --workers 1 --save a.rrd": "--save",
         "replay drives/robot0 -e ekf --workers 1 -o a.mcap": "a selection has a result folder",
     }.items():
