@@ -249,7 +249,7 @@ class BodyMotion:
         return found if _agree(found.value, usual) else found._replace(likeness=0.0, spread=np.inf)
 
     def turn(self, source: Series) -> Slope | None:
-        """Compute how much the course turns for each radian turned according to a turn rate.
+        """Compute the turn of the course per radian that is integrated from a turn rate.
 
         If the turn rate correlates with the course without a lag, no lag is used, since half a period
         of a winding road would look like a lag. If several lags fit better, some with opposite signs,
