@@ -130,11 +130,12 @@ def table(measured: Measured) -> str:
     one, two = measured.runs_per_s
     said = f"""\
 On two cores, {RUNS} runs of `landmarks`, including the start of processes and the figures, ran at
-{one:.0f} runs/s with one worker, {two:.0f} with two.
-A worker computes a cell in {measured.cell_s:.2f} s. Its result has {measured.cell_bytes / 1e6:.1f} MB,
-which the driver keeps and merges in {1e3 * measured.driver_s:.0f} ms. In a simulation
-with these numbers and a gigabit network, the driver limits the rate from {measured.limit_workers}
-workers on, to {measured.limit_runs_per_s:.0f} runs/s:
+{one:.0f} runs/s with one worker and at {two:.0f} runs/s with two.
+A worker computes a cell in {measured.cell_s:.2f} s.
+The result of a cell has {measured.cell_bytes / 1e6:.1f} MB; the driver keeps it
+and merges it in {1e3 * measured.driver_s:.0f} ms. In a simulation
+with these numbers and a gigabit network, the driver limits the rate of {measured.limit_workers}
+or more workers to {measured.limit_runs_per_s:.0f} runs/s:
 
 | workers | runs/s, simulated | share of the ideal rate |
 |---|---|---|
