@@ -423,7 +423,7 @@ def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
         ({"run": "0.5"}, "run is 0.5, expected a whole number"),
         ({"epoch_ns": str(2**63)}, "epoch_ns is after the year 2262"),
         ({"notes": "3"}, "notes is 3, expected an object"),
-        ({"notes": '{"a": 3}'}, "notes are not all texts"),
+        ({"notes": '{"a": 3}'}, "some notes are not texts"),
         ({"notes": "{"}, "Expecting property name"),
     ],
 )
