@@ -250,7 +250,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "lost messages",
         "",
     ),
-    "jitter": (stamps(IMU, scattered), IMU, "stamps", "scatter"),
+    "jitter": (stamps(IMU, scattered), IMU, "stamps", "steps vary"),
     "clock 2 % fast": (stamps(IMU, lambda t: 1.02 * t, logged=False), IMU, "clock drift", "gains"),
     "leap seconds": (stamps(FIX, lambda t: t + 18 * 10**9, logged=False), FIX, "delay", "18 s ahead of"),
     "TAI": (stamps(FIX, lambda t: t + 37 * 10**9, logged=False), FIX, "delay", "TAI"),
