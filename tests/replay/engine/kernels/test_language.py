@@ -351,7 +351,7 @@ def test_what_a_kernel_does_not_take_is_refused(wrong: Any):
     """Also where one of the same kind in this machine's order was given before."""
     loop, out = compile_over_runs(early_of), np.zeros(2)
     loop(2, np.zeros(2), out)
-    with pytest.raises(BadInput, match="a kernel takes (64-bit )?numbers"):
+    with pytest.raises(BadInput, match=r"a kernel takes (64-bit )?numbers"):
         loop(2, wrong, out)
 
 
