@@ -36,22 +36,21 @@ WHATS = {
     "FIELD_drift": "The field's bias grows by this much per second from the start of the run, and is "
     "subtracted.",
     "FIELD_axes": "The order of the vector's entries: yx if x and y are swapped.",
-    "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, such as `fuselog "
-    "ellipsoid` finds.",
-    "FIELD_turn": "The angle (rad) by which the vector is rotated about the vertical; it is rotated "
-    "back.",
-    "heading_bias": "The heading of orientations, or of a prior, is too large by this angle (rad); "
-    "orientations have heading_scale and heading_drift as well.",
-    "heading_convention": "north, if the headings of orientations are those of a compass, clockwise "
-    "from north.",
+    "FIELD_matrix": "The vector is multiplied by this matrix: nine numbers, row by row, for example "
+    "from `fuselog ellipsoid`.",
+    "FIELD_turn": "The angle (rad) by which the vector is wrongly rotated about the vertical; this "
+    "rotation is reversed.",
+    "heading_bias": "The heading of orientations, or of a prior, is too large by this angle (rad), "
+    "which is subtracted; orientations also have heading_scale and heading_drift.",
+    "heading_convention": "north, if orientations have compass headings, clockwise from north.",
     "origin": "For geodetic fixes, the origin of the tangent plane: latitude and longitude in deg, "
-    "altitude in m. For positions, the position of their origin in the plane, in m, which is added.",
+    "altitude in m. For positions, the position (m) of their origin in the plane, which is added to "
+    "them.",
     "plane": "For positions and states, the origin of their tangent plane, as if the log stated it: "
     "latitude and longitude in deg, altitude in m. /*.plane sets all such topics that state none.",
-    "covers": "For a truth: some, if the log has targets without a truth, whose tracks are then not "
-    "counted as false; or all, whatever the log states.",
-    "exchanged": "Two numbers that are swapped, such as 3,9; or the topic with which this one is "
-    "swapped.",
+    "covers": "For a truth: some, if targets in the log lack a truth (their tracks then do not count "
+    "as false), or all, if none do; this overrides the log.",
+    "exchanged": "The two numbers to swap, such as 3,9, or the topic to swap with this one.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 
@@ -343,7 +342,7 @@ def _order(given: _Setting, field_: str) -> list[int]:
 
 def _matrix(given: _Setting, field_: str) -> Callable[[Stream], Stream]:
     """Parse the matrix that multiplies a vector of three entries."""
-    example = "nine numbers by rows, such as 1,0,0,0,1,0,0,0,1"
+    example = "nine numbers, row by row, such as 1,0,0,0,1,0,0,0,1"
     if given.empty[field_].shape[1:] != (3,):
         raise BadInput(f"--set {given.key}: {field_} is not a vector of three entries; remove it")
     numbers = [_plain(given, text, example) for text in given.several((9,), example)]
@@ -398,7 +397,7 @@ def _origin(change: Change, given: _Setting) -> Change:
 
 def _plane(change: Change, given: _Setting) -> Change:
     if not is_planar(given.empty.schema.full_name, given.empty.metadata):
-        raise BadInput(f"--set {given.key}: its messages have no positions in a plane; remove it")
+        raise BadInput(f"--set {given.key}: this topic has no positions in a plane; remove the setting")
     texts = given.several((2, 3), EXAMPLE)
     origin = origin_of(texts)
     if origin is None:
@@ -454,5 +453,6 @@ def _check_exchange(
         )
     if other in changes:
         raise BadInput(
-            f"--set {given.key}={other}: {other} has other settings too; set only the swap, once"
+            f"--set {given.key}={other}: {other} has other settings too; give only the swap, and only "
+            "once"
         )

@@ -342,9 +342,9 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
         columns = ["estimator", "case", "metric", "value", "aim", "verdict", "logs", "units"]
         print_table(columns, rows)
     if rows and (few := min(row[-1] for row in rows)) < FEWEST_RUNS:
-        say(f"units, each a run or a group of runs: {too_few(few)}")
+        say(f"a unit is a run or a group of runs: {too_few(few)}")
     if "estimates" in table:
-        say(f"all of them: fuselog view {shlex.quote(str(found.folder / 'estimates'))}")
+        say(f"to view all estimates: fuselog view {shlex.quote(str(found.folder / 'estimates'))}")
     bad = table["log"][failed].nunique()
     say(f"{bad} of {count(table['log'].nunique(), 'log')} failed; {found.folder}: tables, result.json")
     say_next("report", str(found.folder))

@@ -153,7 +153,7 @@ def _check_cache() -> None:
         raise BadInput("FUSELOG_UNCOMPILED=1 disables compilation; unset it")
     if not is_private(cache_folder() / "kernels"):
         raise BadInput(
-            f"the cache {cache_folder()} is writable for other users, so nothing is stored; set "
+            f"the cache {cache_folder()} is writable by other users, so nothing is stored; set "
             "FUSELOG_CACHE to a folder of your own"
         )
 

@@ -73,7 +73,9 @@ def calibrate(
         )
     for name in fixed:
         if name not in marked:
-            raise BadInput(f"--fixed {name}: is not a calibration parameter: {', '.join(marked)}")
+            raise BadInput(
+                f"--fixed {name}: not a calibration parameter; choose from {', '.join(marked)}"
+            )
     free = [name for name in marked if name not in fixed]
     found = tune(logs, estimator, free, set=set, **options)
     names = [each.name for each in found.found.coordinates.free]

@@ -113,8 +113,8 @@ class Ellipsoid:
             turned = f"about one axis only, near {axis}" if axis else "to too few sides"
             others = f"about {' or '.join(AXES.replace(axis, ''))} as well" if axis else "to all sides"
             sentences.append(
-                f"the unit was rotated {turned}, which does not determine {', '.join(self.left_open)}: "
-                f"they have no value; rotate it {others}"
+                f"the unit was rotated {turned}, which does not determine {', '.join(self.left_open)}, "
+                f"so no value is given; rotate it {others}"
             )
         else:
             sentences.append(
@@ -123,8 +123,8 @@ class Ellipsoid:
             )
         if self.is_assumed:
             sentences.append(
-                f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one, "
-                "and only their ratios are meaningful"
+                f"no --length was given: {self.length:.5g} {unit} is assumed, which makes the mean "
+                "scale one, and only the ratios of the scales are meaningful"
             )
         if fitted.correlation:
             sentences.append(

@@ -128,8 +128,8 @@ def advice(found: Tuning) -> list[str]:
     by_determinant = table.iloc[int(table["nats"].argmax())]
     return [
         f"next, record {best['manoeuvre']}: of {len(MOTIONS)} manoeuvres of {DURATION_S:g} s, it "
-        f"reduces the widest interval most: the standard error of {widest}, now the widest, becomes "
-        f"{best[widest]:.3g} ({before[widest]:.3g} without)",
+        f"narrows the widest interval most: the standard error of {widest} becomes {best[widest]:.3g} "
+        f"({before[widest]:.3g} without it)",
         "judged by the determinant, which counts all parameters together, the best manoeuvre is "
         f"{by_determinant['manoeuvre']} ({by_determinant['nats']:.1f} nats; {best['manoeuvre']}: "
         f"{best['nats']:.1f})",

@@ -160,4 +160,4 @@ def _is_junit(path: Path) -> bool:
     return root.tag == "testsuites" and root.get("name") == NAME
 
 
-JUNIT = Kind(".xml", "a JUnit file of fuselog check", _is_junit)
+JUNIT = Kind(".xml", "a JUnit file that fuselog check wrote", _is_junit)

@@ -64,7 +64,7 @@ class Discrepancy(NamedTuple):
         elif math.isinf(self.apart):
             return f"{where}: differs from the golden"
         else:
-            detail = "rows between those stored in the golden differ; "
+            detail = "the rows that differ are not among those stored in the golden; "
         return f"{where}: {detail}relative difference {self.apart:.2g}, allowed {self.allowed:g}"
 
 
@@ -230,7 +230,9 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
     outputs = replayed.outputs[first.run]
     begin_ns = _first_changed(first, replayed, golden)
     if begin_ns is not None:
-        sentences.append(f"bits of {first.topic} differ from {begin_ns} ns on, perhaps only by rounding")
+        sentences.append(
+            f"the bits of {first.topic} differ from {begin_ns} ns on, perhaps only because of rounding"
+        )
     stamp_ns = first.stamp_ns if begin_ns is None else begin_ns
     if stamp_ns is not None:
         sentences += _innovation_at(outputs, split_topic(first.topic), stamp_ns)

@@ -68,7 +68,9 @@ def check_over_logs(
             "one"
         )
     missing = {
-        Path(each): "is missing: the golden has it" for each in stored["runs"] if each not in names
+        Path(each): "is missing, although the golden has it"
+        for each in stored["runs"]
+        if each not in names
     }
     unreadable: Mapping[Path, str] = {**selection.unreadable, **missing}
     campaign = campaign._replace(selection=replace(selection, unreadable=unreadable))

@@ -83,10 +83,10 @@ class _Stream(_Part):
     def _has_rows(self) -> Self:
         checked = len(base64.b64decode(self.checksums, validate=True))
         if checked not in (0, 2 * self.rows):
-            raise ValueError(f"it has {self.rows} rows, but checksums of {checked / 2:g} rows")
+            raise ValueError(f"it has {self.rows} rows, but checksums for {checked / 2:g} rows")
         for column in self.columns.values():
             if not (0 < len(column.kept) <= self.rows or len(column.kept) == self.rows == 0):
-                raise ValueError(f"it keeps {len(column.kept)} of {self.rows} rows")
+                raise ValueError(f"it cannot keep {len(column.kept)} of {self.rows} rows")
         return self
 
 

@@ -168,7 +168,9 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
-            raise BadInput(f"--out {out}: {len(logs)} logs have one estimates log each; give a folder")
+            raise BadInput(
+                f"--out {out}: each of the {len(logs)} logs gets its own estimates log; give a folder"
+            )
         return [out]
     if out is not None and out.suffix and not out.is_dir():
         raise BadInput(f"--out {out}: expected a name that ends in .mcap, or an existing folder")
@@ -306,7 +308,7 @@ def _print_outcome(
     print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
-            "nees: it is that of one run, and its interval is that of a single step, so a NEES inside "
+            "nees: the value is from one run, and its interval is for a single step, so a value inside "
             "the interval shows only that the filter is not grossly inconsistent; see also "
             "nis_per_component"
         )

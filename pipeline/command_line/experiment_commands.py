@@ -101,7 +101,7 @@ def run_named(
         return
     print_worst(result.alarms)
     for cause in result.causes:
-        say(f"likeliest cause for {cause.estimator}: {cause.words} {cause.mended}".rstrip())
+        say(f"most likely cause for {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
         from fuselog.pipeline.output.report.kinds import run_sentences  # slow to import
 

@@ -31,8 +31,8 @@ diagnose_option = click.option(
 stress_option = click.option(
     "--stress",
     is_flag=True,
-    help="Test whether each estimator's result is robust to changes that should not matter; verdicts on "
-    "smaller differences are then withheld.",
+    help="Test whether each estimator's result is robust to changes that should not matter, and "
+    "withhold verdicts on differences smaller than the effect of these changes.",
 )
 
 

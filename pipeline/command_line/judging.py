@@ -139,7 +139,7 @@ def evaluate(
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, if SIDES are trajectory files.")
 @click.option(
     "--case",
-    help="The truth for trajectory files, such as robot2, if a log has several.",
+    help="The truth to use for trajectory files, such as robot2, if a log has several.",
 )
 @click.option(
     "--margin",
@@ -263,7 +263,8 @@ def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> N
     "scales",
     multiple=True,
     metavar="COMPONENT=SIGMA",
-    help="The standard deviation that is the unit of a component, instead of the prior's (repeatable).",
+    help="The standard deviation to use as the unit of a component, instead of the prior's "
+    "(repeatable).",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @recover_option

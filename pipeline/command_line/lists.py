@@ -80,7 +80,7 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
     if pairs and not warm:
         raise BadInput(f"fuselog cache {pairs[0]}: add --warm to compile it in advance")
     if clear and warm:
-        raise BadInput("fuselog cache --clear --warm: use one option, then the other")
+        raise BadInput("fuselog cache --clear --warm: give the options in two separate commands")
     if warm:
         from fuselog.pipeline.api.precompiling import show_precompiling
 

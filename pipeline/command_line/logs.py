@@ -103,7 +103,7 @@ def catalog(folders: tuple[Path, ...], **options: Any) -> None:
     "--sheet",
     multiple=True,
     metavar="FIELD=VALUE UNIT",
-    help="A data sheet's value to compare with (repeatable); append 'one-sided' to a density.",
+    help="A data sheet's value to compare with (repeatable); append 'one-sided' to a one-sided density.",
 )
 @click.option(
     "--tau",
@@ -212,7 +212,7 @@ def lint(logs: tuple[Path, ...], out: Path | None, **options: Any) -> None:
 @click.option(
     "--port",
     type=click.IntRange(1, 65535),
-    help="Port of the server of the dataset [default: any free].",
+    help="Port of the dataset's server [default: any free port].",
 )
 @click.option(
     "--screenshot", type=PICTURE, help="Save a screenshot of the viewer as PNG, without a window."
@@ -221,8 +221,8 @@ def lint(logs: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     "--at",
     type=Instant(),
     metavar="SECONDS|worst[:ESTIMATOR]",
-    help="Set the time cursor to this many seconds into the run, or to the largest NEES (or else the "
-    "largest error) of all estimators or of one.",
+    help="Set the time cursor to this many seconds into the run, or to the largest NEES (without NEES, "
+    "the largest error) of all estimators or of one.",
 )
 @click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run.")
 @click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")

@@ -168,14 +168,14 @@ scheduler_option = click.option(
 where_option = click.option(
     "--where",
     metavar="CONDITION",
-    help="Only logs whose columns in the catalog meet this condition, such as "
+    help="Use only logs whose columns in the catalog meet this condition, such as "
     "'fix_rate_hz > 4 and duration_s > 60'.",
 )
 group_option = click.option(
     "--group",
     metavar="COLUMN",
-    help="The column of the catalog that names the unit of intervals, such as the robot [default: the "
-    "log].",
+    help="The catalog column that names the units over which intervals are computed, such as the robot "
+    "[default: the log].",
 )
 
 

@@ -96,7 +96,7 @@ def record(
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
-    help="For ROS: the source of a message's publish time, its header or the bag [default: header].",
+    help="For ROS: take a message's publish time from its header or from the bag [default: header].",
 )
 @click.option(
     "--mapping",

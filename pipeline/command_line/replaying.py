@@ -46,7 +46,7 @@ folds_option = click.option(
     "--folds",
     type=COUNT,
     default=0,
-    help="Cross-validate: divide the logs into N parts, and validate each part with the values from "
+    help="Cross-validate: divide the logs into N parts, and validate each part with values tuned on "
     "the others.",
 )
 

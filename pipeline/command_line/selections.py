@@ -34,14 +34,14 @@ def replay_selection(
         if options.pop(name):
             raise BadInput(f"{option}: applies to logs that are replayed together; leave it out here")
     if {*origins} - {"truth"}:
-        raise BadInput(f"--start-from {origins[0]}: only truth applies to the logs of a selection")
+        raise BadInput(f"--start-from {origins[0]}: a selection of logs can only start from truth")
     alterations, own = split_texts(settings)
     estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
     options |= {"start_from": origins, "start_sigma": sigmas_of(sigmas, "--start-sigma")}
     options["set"] = alterations
     place = Path("out/replay") if out is None else out
     if place.suffix == ".mcap":
-        raise BadInput(f"--out {out}: a selection has a result folder; give a folder")
+        raise BadInput(f"--out {out}: a selection of logs writes a result folder; give a folder")
     programs = states_of(program_files(estimators))
     task = Replaying(estimators, options, recover, place.absolute(), programs)
     stated = {"estimators": estimators, "options": options}

@@ -365,7 +365,7 @@ def _row_that_differs(kept: Candidate, again: Candidate) -> str:
         return ""
     row = both[apart].iloc[0]
     return (
-        f"replayed now, {row['quantity']} of {kept.label}, {row['run']} is {row['value_again']:.6g}, "
+        f"in a new replay, {row['quantity']} of {kept.label}, {row['run']} is {row['value_again']:.6g}, "
         f"not {row['value']:.6g}; the code has changed since"
     )
 

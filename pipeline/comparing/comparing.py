@@ -109,7 +109,7 @@ class Paired(NamedTuple):
                 f"{self.quantity}{of}: verdict withheld: {values}; {interval}: changes that should not "
                 f"matter move it by up to {self.stressed:.3g}"
             )
-        when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
+        when = f"; mostly from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
         return f"{self.quantity}{of}: {verdict}: {values}; {interval}, {of_runs}{when}"
 
 

@@ -26,7 +26,7 @@ def why_no_replay(made: CFilter) -> str:
         if sensor.read is not None:
             return f"the measurement of {sensor.topic} is computed from its messages in Python"
         if sensor.is_numbered:
-            return f"the measurement of {sensor.topic} depends on the number of a point"
+            return f"the measurement of {sensor.topic} depends on which numbered point it refers to"
     return ""
 
 

@@ -119,8 +119,8 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
     _, program = shorthand(name)
     if not program:
         raise BadInput(
-            f"-e {name}: a golden states its estimators; give a program to check in place of one, such "
-            "as lib:PATH, or add --update"
+            f"-e {name}: a golden names its estimators; give a program to check instead of one of them, "
+            "such as lib:PATH, or add --update"
         )
     stored = golden["settings"]["estimators"]
     if len(stored) != 1:

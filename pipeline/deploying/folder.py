@@ -79,7 +79,7 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
         return ""
     single = certificate.single
     if single is None:
-        sentence = f"The test was not run for lack of GCC; `test_{made.name}` shows the effect."
+        sentence = f"The test was not run because GCC is missing; `test_{made.name}` shows the effect."
     elif single.lost_event is not None:
         lost = lost_sentence(single._asdict(), is_root=made.is_root)
         sentence = f"{lost[0].upper()}{lost[1:]}."

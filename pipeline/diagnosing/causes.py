@@ -107,7 +107,7 @@ class Cause(NamedTuple):
         )
         first, second = self.of_halves
         half, worst = ("first", first) if first < second else ("second", second)
-        but = f"; but it loses {number(-worst, 4)} over the {half} half of the log, so it is not valid"
+        but = f"; but decreases it by {number(-worst, 4)} over the {half} half, so it is not valid"
         gained = f"; correcting this increases the log-likelihood by {number(self.gain, 4)}"
         return f"{self.statement}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 

@@ -110,7 +110,7 @@ def silent(name: str, label: str, bound: Sequence[Bound], settings: Mapping[str,
     topic, setting = next(offers, ("", ""))
     remedy = for_likelihood(settings) or "use a filter of the same model, such as -e ekf"
     if topic:
-        remedy = f"it does not use {topic}, unless you give {setting}"
+        remedy = f"to make it use {topic}, give {setting}"
     return BadInput(f"{name}: {label} gives no innovations, which a diagnosis needs; {remedy}")
 
 
@@ -190,7 +190,7 @@ def on_the_rest(
         return ""
     if gain > 0.0:
         return f", and {number(gain, 4)} over the rest of the log"
-    return f"; but over the rest of the log it loses {number(-gain, 4)}: it is not valid there"
+    return f"; but it decreases by {number(-gain, 4)} over the rest of the log, so it is not valid there"
 
 
 def _likelihood(
@@ -243,8 +243,8 @@ class Diagnosis:
         """Return the numbered sentences, or a sentence stating that no fault was found."""
         if not self.sentences:
             why = (
-                f"none of {self.hypotheses} faults reaches the required gain in log-likelihood, "
-                f"{self.least_gain:.3g}"
+                f"none of the {self.hypotheses} faults tried reaches the required gain in "
+                f"log-likelihood, {self.least_gain:.3g}"
             )
             return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]
         return [f"{number}. {each.sentence}" for number, each in enumerate(self.sentences, start=1)]
@@ -532,8 +532,8 @@ def _followed(
         remedies = [trying.over(Advice.of(each.setting)) for each in mended]
         settings_given = " ".join(f"--set {each.setting}" for each in remedies)
         note = (
-            f"all other findings are about the log with {settings_given}, because without these "
-            f"settings: {error}"
+            f"all other findings are about the log with {settings_given}, because it cannot be "
+            f"replayed without these settings: {error}"
         )
         with suppress(BadInput):
             other = alter(source, {each.key: each.value for each in remedies})

@@ -128,8 +128,8 @@ def notes_of_log(of_log: Sequence[Finding], sentences: Sequence[Finding]) -> lis
 def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Cause] = ()) -> list[str]:
     """List remarks on a diagnosis: causes in doubt, omitted messages and findings, missing truth."""
     notes = [
-        "in doubt, as is every cause with a smaller gain, because the parts of the log disagree about "
-        f"its value by more than chance: {each.words}"
+        "this cause and every cause with a smaller gain are in doubt, because the parts of the log "
+        f"disagree about its value by more than chance explains: {each.words}"
         for each in in_doubt
     ]
     left_out = Rejections().plus(source.rejections for source in done.logs)
@@ -141,8 +141,8 @@ def notes_of(done: Replay, sentences: Sequence[Finding], in_doubt: Sequence[Caus
         )
     elif len(done.logs) == 1:
         notes.append(
-            "there is only one run, so NEES has the interval of a single step; use fuselog run with "
-            "more runs"
+            "there is only one run, so the interval of NEES is that of a single step; use fuselog run "
+            "with more runs"
         )
     if len(sentences) > MOST_SENTENCES:
         notes.append(f"{len(sentences) - MOST_SENTENCES} more findings; fix these first")

@@ -109,7 +109,7 @@ def _evidence(case: Case) -> str:
     return (
         f"{' and '.join(facts)}, {within}."
         if facts
-        else "The log has neither a truth nor innovations to judge the estimator by."
+        else "There is neither a truth nor an innovation by which to judge the estimator."
     )
 
 

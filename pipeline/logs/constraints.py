@@ -49,7 +49,10 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
     force, rate = inertial["specific_force_mps2"], inertial["turn_rate_radps"]
     for name in ("specific_force_mps2", "turn_rate_radps"):
         if not np.isfinite(inertial[name]).all(axis=1).any():
-            raise BadInput(f"topic {inertial.topic}: has no {name}; give a unit that measures both")
+            raise BadInput(
+                f"topic {inertial.topic}: has no {name}; give an inertial unit that measures specific "
+                "force and turn rate"
+            )
     shaken, turned = unrest(time_ns, force, rate, parameters.window_s)
     stands = (shaken < parameters.still_mps2) & (turned < parameters.still_radps)
     rates_hz = {"standing": parameters.standing_hz, "rolling": parameters.rolling_hz}

@@ -92,7 +92,10 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     for sentence in worst(_findings(log) or [], path):
         say(sentence)
     if is_partial:
-        say(f"Its messages are not checked, since that needs all of them: fuselog lint {_quoted(path)}")
+        say(
+            "The messages are not checked, because that requires reading all of them; to check them: "
+            f"fuselog lint {_quoted(path)}"
+        )
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
     elif any(topic.startswith(ESTIMATES) for topic in log.topics):

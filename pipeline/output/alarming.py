@@ -219,7 +219,8 @@ def dominating_run(nees: "pd.Series[float]") -> str:
         return ""
     rest = float(np.delete(values, place).mean())
     return (
-        f"run {nees.index[place]} dominates it with {values[place]:.3g}; the others average {rest:.3g}"
+        f"run {nees.index[place]} dominates the mean with {values[place]:.3g}; the other runs average "
+        f"{rest:.3g}"
     )
 
 
@@ -232,12 +233,12 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Finding:
         axes = "forward, left, up" if len(constant.offset_m) > 2 else "forward, left"
         words += (
             f"({offset}) m {axes}: the truth may refer to another point of the body (a lever arm), or a "
-            "sensor has an offset"
+            "sensor may have an offset"
         )
         state = "add the lever arm or the offset to the model"
         return Finding("lever arm", estimator, case, excess, words, otherwise=state)
     words += (
-        f"({offset}) m: truth and estimate may have different origins: try fuselog evaluate --align se2"
+        f"({offset}) m: truth and estimate may have different origins; try fuselog evaluate --align se2"
     )
     return Finding("origin", estimator, case, excess, words)
 
@@ -281,8 +282,8 @@ def _of_digits(judge: Judge) -> Iterator[Finding]:
         else:
             words += (
                 f"has lost its precision in {found.lost} of {found.sampled} samples: {when} a pivot of "
-                f"its Cholesky factor is {max(found.least, 0.0):.2g} of a variance, where {LOST:g} "
-                "leaves four digits"
+                f"its Cholesky factor is {max(found.least, 0.0):.2g} of a variance; {LOST:g} would "
+                "leave four digits"
             )
         surer = "use a tighter prior, add noise to states that are known too well, or try sqrt:ekf"
         share = found.lost / found.sampled

@@ -321,7 +321,7 @@ def _few_runs(claim: StatedClaim, values: Values) -> str:
     stated = _stated(claim)
     if not any(needs_runs(each, stated, values) for each in (claim.holds, claim.reproducible) if each):
         return ""
-    return f"only {runs.value:g} runs; without an interval, a verdict needs at least {least}"
+    return f"only {runs.value:g} runs; a verdict without an interval needs at least {least}"
 
 
 def _stated(claim: StatedClaim) -> dict[str, str]:

@@ -239,7 +239,7 @@ def print_metrics(
     for title, columns, rows in tables_of(metrics, bounds, runs):
         print_table(columns, rows, title)
     if runs is not None and {"run", "nees"} <= {*runs} and 1 < runs["run"].nunique() < FEWEST_RUNS:
-        say(f"nees: no interval of its mean over the runs: {too_few(runs['run'].nunique())}")
+        say(f"nees: its mean over the runs has no interval: {too_few(runs['run'].nunique())}")
     if has_many_cases(metrics):
         say(f"each of the {_number_of_cases(metrics)} cases separately: {details}")
 

@@ -43,7 +43,7 @@ def view_path(paths: Sequence[Path], options: Options) -> None:
                 "one run; choose it with --runs NUMBER"
             )
         if options.port is not None:
-            raise BadInput(f"--port {options.port}: one run needs no server of a dataset; leave it out")
+            raise BadInput(f"--port {options.port}: a single run needs no dataset server; leave it out")
         segment, options = chosen[0], replace(options, gap_limit_s=runs.gap_limit_s)
     from fuselog.pipeline.presenting.timeline import view_timeline  # slow to import
 

@@ -138,7 +138,7 @@ def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) ->
     other, own = values["like"], {name: of for name, of in values.items() if name != "like"}
     if other not in stated or other in (label, *above):
         raise ValueError(
-            f"estimator {label} is like '{other}'; name another estimator of the experiment"
+            f"estimator {label} has like = '{other}'; name another estimator of the experiment"
         )
     return merge({"kind": other, **_spelt_out(other, stated, label, *above)}, own)
 

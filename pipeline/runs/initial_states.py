@@ -43,8 +43,8 @@ def order_of(
     found = None if late is None else parse_late(late, arrival_order=arrival_order)
     if found is not None and origins:
         raise BadInput(
-            f"--late {late} --start-from {origins[0]}: with messages in order of arrival, there is no "
-            "single stamp with a known state at which a span begins; use only one of these options"
+            f"--late {late} --start-from {origins[0]}: in order of arrival, a span does not begin at a "
+            "single stamp with a known state; use only one of these options"
         )
     return "log_time" if arrival_order else "publish_time", found
 

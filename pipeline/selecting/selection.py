@@ -93,7 +93,7 @@ def selected(
     if group is not None and (unknown := table["log"][~bad & table[group].isna()]).size:
         raise BadInput(
             f"--group {group}: no value for {some_of(unknown, MOST_NAMED)}; "
-            f'fill the column, or leave them out with --where "{group} == {group}"'
+            f'fill the column, or leave these logs out with --where "{group} == {group}"'
         )
     why = {
         located(log): str(of) for log, of in zip(table["log"][bad], table["problem"][bad], strict=True)

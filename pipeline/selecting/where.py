@@ -38,8 +38,8 @@ def rows_where(table: "pd.DataFrame", condition: str) -> "pd.DataFrame":
             raise BadInput(f"--where: no column '{node.id}' in the catalog; {choices(node.id, known)}")
         if isinstance(node, ast.Name) and table[node.id].map(pd.api.types.is_list_like).any():
             raise BadInput(
-                f"--where: the column {node.id} has lists; compare those of a topic or model, such as "
-                "fix_messages and fits_robot"
+                f"--where: the column {node.id} contains lists; compare columns of a single topic or "
+                "model, such as fix_messages and fits_robot"
             )
     for node in reversed([*ast.walk(tree)]):
         _check_kinds(node, table, condition)

@@ -225,11 +225,11 @@ def _drifts(drift: Drift, unit: str) -> str:
     if drift.offset:
         return (
             f"warms up: {drift.offset:.2g} {unit} decays with a time constant of {drift.time_s:.3g} "
-            f"s, plus {drift.rate:.2g} {unit}/s; removed from all numbers (log-likelihood "
+            f"s, plus {drift.rate:.2g} {unit}/s; both are removed from all numbers (log-likelihood "
             f"+{drift.gain:.3g})"
         )
     return (
-        f"drifts by {drift.rate:.3g} {unit}/s; removed from all numbers "
+        f"drifts by {drift.rate:.3g} {unit}/s; this is removed from all numbers "
         f"(log-likelihood +{drift.gain:.3g})"
     )
 
@@ -258,8 +258,8 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
         m = round(tau_s / found.step_s)
         if not 1 <= m <= len(values) // 3:
             raise BadInput(
-                f"--tau {tau_s:g}: the log allows {found.step_s:.3g} to {longest_s:.4g} s, a "
-                "third of its length; give a time in this range"
+                f"--tau {tau_s:g}: the log allows {found.step_s:.3g} to {longest_s:.4g} s (a third of "
+                "its length); give a time in this range"
             )
         at = allan_deviation(values, found.step_s, np.array([m]))
         degrees = degrees_of_freedom(found.fitted.terms, found.step_s, m, int(at.pairs[0]))

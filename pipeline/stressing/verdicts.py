@@ -248,7 +248,7 @@ class Stressed:
         share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
         half = f"half the change has {share:.2g} of this effect"
         if name in self.quarters:
-            half += f", and a quarter of the change has {1.0 / ratio:.2g} of that of half"
+            half += f", and a quarter of the change has {1.0 / ratio:.2g} of the effect of half"
         if self.worst == "sensitive":
             return f"{half}: the effect shrinks faster than the change" if ratio > HALVES[1] else half
         return f"{half}: the effect {'jumps' if ratio > SQUARED else 'does not shrink with the change'}"
@@ -269,8 +269,8 @@ class Stressed:
             )
         if self.is_redrawn:
             sentences.append(
-                "an ulp of the inputs changes the covariance: other samples are drawn, or a decision "
-                "changes; an estimator with samples needs more of them"
+                "a change of the inputs by one ulp changes the covariance: other samples are drawn, or "
+                "a decision changes; an estimator with samples needs more of them"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined

@@ -244,8 +244,8 @@ class Tuning:
         yield from found.lacks
         if not found.begins_alike:
             yield (
-                "with these values the filter starts elsewhere than in the search that found them; a "
-                "new search would move the start again; give every log a prior"
+                "with these values the filter starts at other stamps than in the search that found "
+                "them; a new search would move the start again; give every log a prior"
             )
         if found.at_edge:
             yield (
@@ -304,8 +304,8 @@ class Tuning:
             if self.objective.by == "likelihood":
                 what, sign = f"log-likelihood ({self._scale})", -1.0
             yield (
-                f"held-out logs: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
-                f"{'better' if after < before else 'no better'}"
+                f"held-out logs: {what} {sign * before:.6g} with the start values, {sign * after:.6g} "
+                f"with the tuned values: {'better' if after < before else 'no better'}"
             )
         if len(self.folds):
             better = int((self.folds[f"cost_{TUNED}"] < self.folds[f"cost_{START}"]).sum())

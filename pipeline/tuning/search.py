@@ -134,8 +134,8 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     count = points ** len(low)
     if count > MOST_GRID_POINTS:
         raise BadInput(
-            f"--grid {points}: these are {count} points for {len(low)} parameters; give a coarser grid, "
-            f"of at most {MOST_GRID_POINTS} points"
+            f"--grid {points}: this gives {count} points for {len(low)} parameters; give a coarser "
+            f"grid, of at most {MOST_GRID_POINTS} points"
         )
     axes = [np.linspace(begin, end, points) for begin, end in zip(low, high, strict=True)]
     start = coordinates.of(np.array([each.default for each in coordinates.free]))

@@ -253,8 +253,8 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     is_log = least >= 0.0 or (given is not None and given[0] > 0.0 and not useful)
     if is_log and start <= 0.0 and given is None:
         raise BadInput(
-            f"--free {name}: the search uses its logarithm, but its start value is {start:g}; give a "
-            f"positive start value with --set {name}=..."
+            f"--free {name}: the search uses the logarithm of this parameter, but the start value is "
+            f"{start:g}; give a positive start value with --set {name}=..."
         )
     low, high = given or ((start / REACH, start * REACH) if is_log else (least, greatest))
     if not (low < start < high and (low > 0.0 if is_log else low >= least)):

@@ -118,7 +118,7 @@ def negative(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     first_ns = int(stream.publish_time_ns[int(np.argmax(is_there))])
     words, fix = (
         "below zero, down to",
-        "the offset of the sensor, or of range_m under `offsets` in the mapping",
+        "correct the offset of the sensor, or of range_m under `offsets` in the mapping",
     )
     if is_code:
         words, fix = (

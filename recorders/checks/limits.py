@@ -57,9 +57,10 @@ def zeros(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         stream,
         "latitude_deg",
         float(np.nanmedian(latitude)),
-        f"its fixes are about 0, 0, {np.nanmedian(latitude):.3g} and {np.nanmedian(longitude):.3g} deg "
-        "from it, where there is only sea: their unit differs from that in the mapping",
-        "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
+        f"its fixes are near latitude 0, longitude 0 ({np.nanmedian(latitude):.3g} and "
+        f"{np.nanmedian(longitude):.3g} deg away), where there is only sea: their unit differs from "
+        "that in the mapping",
+        "correct `units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
     )
 
 
@@ -93,10 +94,11 @@ def leaps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "",
             float(back.mean()),
-            f"its fixes alternate, {np.median(steps_m):.3g} m from one to the next and "
-            f"{np.median(two_m):.3g} m to the one after it: they are two sequences of fixes, merged "
-            "into one",
-            "`vehicle`, or `order` and `zone` of `time`, in the mapping; remove one recording",
+            f"its fixes alternate: {np.median(steps_m):.3g} m from one to the next, but only "
+            f"{np.median(two_m):.3g} m to the one after that, so they are two sequences of fixes, "
+            "merged into one",
+            "correct `vehicle`, or `order` and `zone` of `time`, in the mapping, or remove one "
+            "recording",
         )
 
 
@@ -123,8 +125,8 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "quaternion",
             bent,
-            f"its heading is the same in all messages, but the course of the fixes turns by "
-            f"{bent:.3g} rad: it was not measured",
+            f"its heading is the same in all messages, but the course of the fixes turns by {bent:.3g} "
+            "rad, so the heading was not measured",
             "remove it, or missing = { COLUMN = [...] } in the table of the mapping",
         )
         return
@@ -134,9 +136,9 @@ def turns(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             "quaternion",
             rate,
-            f"its heading turns by {rate:.3g} rad/s or more for half of the time, at {speed:.3g} m/s: "
-            f"{rate * speed:.3g} m/s^2 sideways",
-            "the unit of the angle in the mapping",
+            f"its heading turns by {rate:.3g} rad/s or more for half of the time, at {speed:.3g} m/s, "
+            f"which would be {rate * speed:.3g} m/s^2 sideways",
+            "correct the unit of the angle in the mapping",
         )
 
 
@@ -167,7 +169,7 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             stream,
             0.0,
             f"its stamps begin on {_day(first_ns)}, before such logs existed",
-            "`unit` and `zero` of `time` in the mapping",
+            "correct `unit` and `zero` of `time` in the mapping",
         )
     days = np.unique(_day(stream.publish_time_ns))
     of_month = (days - days.astype("datetime64[M]")).astype(int) + 1
@@ -180,9 +182,9 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         yield of_stamps(
             stream,
             0.0,
-            f"its stamps fall on {len(days)} days, each day {of_month[0]} of a month, the first on "
+            f"its stamps fall on {len(days)} dates, all on day {of_month[0]} of a month, the first on "
             f"{days[0]}: day and month are swapped",
-            "`format` of `time` in the mapping",
+            "correct `format` of `time` in the mapping",
         )
     for other in streams.values():
         apart_ns = int(other.publish_time_ns.min()) - first_ns
@@ -193,8 +195,8 @@ def dates(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                 other,
                 0.0,
                 f"it begins {hours} h after {stream.topic}, which has ended by then: a time zone is "
-                "stated for only one of them, or twice",
-                "`zone` or `utc_offset_h` of `time` in the mapping",
+                "stated for only one of them, or is stated twice",
+                "correct `zone` or `utc_offset_h` of `time` in the mapping",
             )
             return
 

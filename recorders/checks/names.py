@@ -44,7 +44,7 @@ def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         0.0,
         f"{stream.topic}: by REP 145 it repeats {raw.topic}, with an orientation from a filter: an "
         "estimator that uses both counts one unit twice",
-        otherwise=f"--set topics.inertial={raw.topic} at the replay uses only one",
+        otherwise=f"--set topics.inertial={raw.topic} uses only one in the replay",
         severity="hint",
     )
 
@@ -68,8 +68,8 @@ def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         0.0,
         f"{stream.topic}: it is alone in its namespace, but {other.topic}, which has the same messages, "
         f"is with {spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
-        otherwise=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
-        f"them; at the import "
+        otherwise=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins them; when "
+        f"importing, use "
         f"""--set 'names={{"{stream.topic}" = "{used}"}}'""",
         severity="hint",
     )

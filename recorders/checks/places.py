@@ -42,7 +42,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         yield _place(
             stream,
             1e7,
-            f"latitude and longitude are integers of 1e-7 deg: they reach {largest[0]:.6g}",
+            f"latitude and longitude are integers in units of 1e-7 deg: they reach {largest[0]:.6g}",
             "factors = { latitude_deg = 1e-7, longitude_deg = 1e-7 } in the mapping",
         )
         return
@@ -55,7 +55,7 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             f"latitude and longitude {what}: a latitude is {largest[0]:.6g} deg",
             "in the mapping swap the sources of latitude_deg and longitude_deg"
             if is_exchanged
-            else "`units` of latitude_deg and longitude_deg in the mapping",
+            else "correct `units` of latitude_deg and longitude_deg in the mapping",
         )
     elif largest[1] > 180.0:
         yield _place(
@@ -95,7 +95,7 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
             stream,
             as_is.spread / other.spread,
             f"latitude and longitude are swapped: after swapping, fixes move {other.value:.4g} m for "
-            f"each metre of the wheels (spread {other.spread:.2g}), as recorded {as_is.value:.4g} m "
+            f"each metre of the wheels (spread {other.spread:.2g}); as recorded, {as_is.value:.4g} m "
             f"(spread {as_is.spread:.2g})",
             "in the mapping swap the sources of latitude_deg and longitude_deg",
             is_fact=False,
@@ -151,8 +151,8 @@ def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
                 stream,
                 as_is.value,
                 f"latitude and longitude are {what}: corrected, fixes move {other.value:.4g} m for each "
-                f"metre of the wheels, as recorded {as_is.value:.4g} m",
-                "`units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
+                f"metre of the wheels; as recorded, {as_is.value:.4g} m",
+                "correct `units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
                 is_fact=False,
             )
             return

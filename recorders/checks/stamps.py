@@ -102,7 +102,7 @@ def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
             float(count),
             f"{stream.topic}: {count} of its {len(stream)} stamps go back in time, the first "
             f"{first_s:.4g} s after the earliest{how}",
-            otherwise=f"replay them as they came, with --late rewind:{np.ceil(behind_s * 10) / 10:g}"
+            otherwise=f"replay them with --arrival-order --late rewind:{np.ceil(behind_s * 10) / 10:g}"
             if is_late
             else "`rollover` of `time`, or `vehicle` of the table, in the mapping"
             if began_again
@@ -137,8 +137,8 @@ def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         yield of_stamps(
             stream,
             scatter / usual_s,
-            f"its steps scatter by {100 * scatter / usual_s:.2g} % of the usual {usual_s:.3g} s: its "
-            "stamps say when it was written rather than measured",
+            f"its steps vary by {100 * scatter / usual_s:.2g} % of the usual {usual_s:.3g} s: its "
+            "stamps give the time of writing, not of measurement",
             "time = { column = ... } of the sensor's own clock",
         )
 

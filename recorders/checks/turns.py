@@ -110,7 +110,7 @@ def _compass(orientation: Series, others: str) -> Finding:
         -1.0,
         f"{orientation.topic}: its heading is clockwise, as a compass's, but ours is anticlockwise "
         f"from east: {others} in the opposite direction",
-        otherwise="in the mapping make it from attitude = { heading = ... }",
+        otherwise="in the mapping derive it from attitude = { heading = ... }",
     )
 
 
@@ -172,7 +172,7 @@ def headings(motion: BodyMotion) -> Iterator[Finding]:
                 "sensor's mounting, or of magnetic "
                 f"north{', or of a wrong sign of speeds' * is_backwards}",
                 otherwise="in the mapping rotate it by mounting_deg"
-                f"{', or change the sign of the speeds by factors' * is_backwards}",
+                f"{', or change the sign of the speeds with `factors`' * is_backwards}",
             )
 
 

@@ -41,7 +41,8 @@ def is_private(folder: Path) -> bool:
             continue
         if status.st_uid != _user():
             say_once(
-                f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to your own"
+                f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to a folder of "
+                "your own"
             )
         else:
             say_once(f"the cache {place} is not used: other users may write to it; run chmod go-w on it")

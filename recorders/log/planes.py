@@ -73,7 +73,7 @@ def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
     found = origin_of(parts)
     if found is None:
         raise BadInput(
-            f"topic {topic} states the origin {', '.join(parts)}; expected {EXAMPLE}: record it again"
+            f"topic {topic} states the origin {', '.join(parts)}; expected {EXAMPLE}; record it again"
         )
     return found
 

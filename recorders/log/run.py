@@ -60,7 +60,7 @@ class RunMetadata:
             if epoch_ns >= 2**63:
                 raise ValueError("epoch_ns is after the year 2262")
             if not all(isinstance(note, str) for note in notes.values()):
-                raise ValueError("the notes are not all texts")
+                raise ValueError("some notes are not texts")
             return cls(
                 scenario=record["scenario"],
                 parameters=_stated(record, "parameters", dict),

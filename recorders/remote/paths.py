@@ -232,7 +232,7 @@ def open_binary(path: Path) -> BinaryIO:
                 return cast(BinaryIO, RangeStream(path))
         except NoRanges:
             pass
-        copy_whole(path, "its server cannot send parts of it")
+        copy_whole(path, "its server cannot send parts of a file")
     return path.open("rb")
 
 

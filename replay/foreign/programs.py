@@ -338,7 +338,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
         if missing := np.flatnonzero(~np.isfinite(numbers[name])).tolist():
             raise BadInput(
                 f"the program's estimates have no number in column {name}, row {missing[0] + 1} "
-                f"({len(missing)} in total); write one, or leave out the row"
+                f"({len(missing)} such rows in total); write a number, or leave out the row"
             )
     whole = table[clock].to_numpy()
     time_ns = whole.astype(np.int64) if clock == "time_ns" else np.rint(whole * 1e9).astype(np.int64)

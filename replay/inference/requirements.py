@@ -36,7 +36,7 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
         return f"it has no topic that {which}"
     missing = "; ".join(part.words for part in parts if not part.is_here)
     if not missing:
-        return f"model {name} fits it, but is only used if it is named: --model {name}"
+        return f"model {name} fits it, but is used only if you name it: --model {name}"
     return f"model {name} is the closest one, but lacks {missing}"
 
 

@@ -273,7 +273,9 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
             return
         time.sleep(0.05)
-    raise BadInput(f"Rerun's viewer did not answer within {_START_S:g} s of its start; try again")
+    raise BadInput(
+        f"Rerun's viewer did not answer within {_START_S:g} s after it was started; try again"
+    )
 
 
 def _ended(process: subprocess.Popen[bytes]) -> bool:

@@ -324,7 +324,7 @@ def _reason(error: Exception) -> str:
     no_method = re.search(r"which has no callable (\w+) method", str(error))
     if no_method:
         function = no_method[1]
-        return f"it uses np.{function} on an array with some known numbers; apply it to each number"
+        return f"it uses np.{function} on an array that has some known numbers; apply it to each number"
     if isinstance(error, IndexError) and "only integers" in str(error):
         return str(refused("an index"))
     return f"{type(error).__name__}: {error}"
@@ -349,7 +349,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
             "a number" if each.is_number else f"a tuple of {len(each.returned)}" for each in (yes, no)
         ]
         raise CannotTrace(
-            f"it returns {' on one path and '.join(ways)} on another; return the same on both"
+            f"it returns {' on one path and '.join(ways)} on another; return the same on both paths"
         )
     returned = tuple(
         graph.select(condition, *both) for both in zip(yes.returned, no.returned, strict=True)

@@ -56,7 +56,7 @@ def test_a_run_that_dominates_the_mean_nees_is_named(log: MemorySource) -> None:
     ]
     late = _truth_moved(logs[1], lambda _, time: (np.where(time > 0.9, 0.5, 0.0), 0.0 * time))
     [found] = [each for each in replay([logs[0], late, logs[2]], "ekf").alarms if each.kind == "errors"]
-    assert "; run 1 dominates it with " in found.sentence
+    assert "; run 1 dominates the mean with " in found.sentence
     assert not any("dominates" in each.sentence for each in replay([late], "ekf").alarms)
 
 
@@ -133,7 +133,7 @@ def test_an_aligned_estimate_has_no_other_origin(
     write_log(tmp_path / "run.mcap", moved.streams.values(), moved.run)
     fuselog("replay", tmp_path / "run.mcap", "-e", "ekf", "-o", tmp_path / "est.mcap")
     said = fuselog("evaluate", tmp_path / "est.mcap")
-    assert "different origins: try fuselog evaluate --align se2" in said.out.splitlines()[0]
+    assert "different origins; try fuselog evaluate --align se2" in said.out.splitlines()[0]
     assert "doubtful" not in fuselog("evaluate", tmp_path / "est.mcap", "--align", "se2").out
 
 

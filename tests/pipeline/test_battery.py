@@ -358,7 +358,7 @@ def test_fixes_of_another_name_are_offered() -> None:
         "/car/place": replace(log.streams[FIX], topic="/car/place"),
     }
     with pytest.raises(
-        fl.BadInput, match=r"it does not use /car/place, unless you give --set topics\.fix=/car/place"
+        fl.BadInput, match=r"to make it use /car/place, give --set topics\.fix=/car/place"
     ):
         fl.diagnose(replace(log, streams=renamed), "ekf")
 
@@ -537,7 +537,7 @@ def test_causes_of_a_part_are_tried_on_the_rest(monkeypatch: pytest.MonkeyPatch)
     found = fl.diagnose(log, "ekf", set={"gate_probability": 1.0})
     words = found.sentences[0].sentence
     assert "turn_radps is too large by 0.0" in words
-    assert "over the rest of the log it loses" in words
+    assert "; but it decreases by" in words
     assert found.notes[0].startswith("causes were searched in the first 50 s")
 
 

@@ -93,7 +93,7 @@ def test_what_cannot_be_compiled_ahead_is_one_sentence(place: Path, fuselog: Cal
         (["--warm", "robot:smoother:ekff"], "'ekff' is not a filter"),
         (["--warm", "robot:analytic"], "the model lacks exact moments"),
         (["robot"], "add --warm"),
-        (["--warm", "--clear"], "use one option, then the other"),
+        (["--warm", "--clear"], "give the options in two separate commands"),
     ):
         told = fuselog("cache", *arguments)
         assert (told.code, said in told.err) == (2, True), told.err

@@ -224,7 +224,7 @@ def test_bad_input(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) ->
         ((tmp_path / "empty", "--against", golden), "has no logs to replay"),
         (
             (log, "--against", golden, "-e", "ukf"),
-            "to check in place of one, such as lib:PATH, or add --update",
+            "to check instead of one of them, such as lib:PATH, or add --update",
         ),
         ((log, "--against", golden, "--update", "--tolerance", "mean"), "expected PATTERN=RELATIVE"),
         ((log, "--against", golden, "--junit", note), "give a name that ends in .xml"),

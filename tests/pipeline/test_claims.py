@@ -227,7 +227,7 @@ def test_few_runs_decide_by_intervals_or_by_a_stated_number_of_runs(
         return found
 
     assert decided(3).verdict == verdict
-    assert ("only 3 runs; without an interval, a verdict needs at least 20" in decided(3).why) == (
+    assert ("only 3 runs; a verdict without an interval needs at least 20" in decided(3).why) == (
         verdict == "inconclusive"
     )
     assert (decided(20).verdict == verdict) == (verdict != "inconclusive")
@@ -274,7 +274,7 @@ def test_an_estimator_is_like_another_but_for_what_it_says() -> None:
     assert found["ukf"] == {"rate": {"a": 1, "b": 3}, "gate": 1}
     for other in ("ekf", "nobody"):
         circle = {"title": "t", "estimators": {"plain": {"like": other}, "ekf": {"like": "plain"}}}
-        with pytest.raises(BadInput, match=f"mine.toml: .* is like '{other}|is like 'plain'"):
+        with pytest.raises(BadInput, match=f"mine.toml: .* has like = '{other}|has like = 'plain'"):
             build(Experiment, circle, "mine.toml")
 
 

@@ -302,7 +302,7 @@ def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() ->
     assert table[["aim", "verdict"]].iloc[1].tolist() == ["3", "withheld"]
     assert table[["most_from_s", "most_to_s"]].iloc[1].isna().all()
     said = "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2 (95 % 1.5 to "
-    assert stressed[0].sentence == f"{said}2.75), 8 runs, margin 0.02; most from 4.0 to 6.0 s"
+    assert stressed[0].sentence == f"{said}2.75), 8 runs, margin 0.02; mostly from 4.0 to 6.0 s"
 
 
 def test_estimates_under_another_label_are_the_same_but_for_their_names() -> None:

@@ -175,7 +175,8 @@ def first(source: fl.MemorySource, **settings: float) -> Any:
 def test_nothing_is_found_where_nothing_is_wrong(run: fl.MemorySource) -> None:
     found = fl.diagnose(run, "ekf")
     assert found.sentences == []
-    assert found.told[0].startswith(f"nothing found: none of {found.hypotheses} faults reaches")
+    told = f"nothing found: none of the {found.hypotheses} faults tried reaches"
+    assert found.told[0].startswith(told)
     assert found.least_gain == least_gain(found.hypotheses)
     assert found.components["mean_square"].between(0.8, 1.2).all()
 
@@ -451,7 +452,7 @@ def test_what_is_wrong_with_messages_is_said() -> None:
     assert "position_m x is rounded to 2, but its noise is" in told(fixes(rounded))
     late_ns = np.arange(300) * 10**9 + (np.arange(300) % 10 == 0) * 2_500_000_000
     late = told(fixes(place, log_time_ns=late_ns))
-    assert late.endswith("and are up to 2 s behind; replay them as they came, with --late rewind:2")
+    assert late.endswith("and are up to 2 s behind; replay them with --arrival-order --late rewind:2")
     silent = np.arange(300) + 60 * (np.arange(300) > 100)
     assert "is silent for 61 s from 100 s after its first stamp on" in told(
         fixes(place, publish_time_ns=silent * 10**9)

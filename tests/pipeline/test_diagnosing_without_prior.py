@@ -315,7 +315,7 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     fl.write(log, car(2000))
     found = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert found["found"] == [
-        f"nothing found: none of {found['hypotheses']} faults reaches the required gain in "
+        f"nothing found: none of the {found['hypotheses']} faults tried reaches the required gain in "
         f"log-likelihood, {found['least_gain']:.3g}"
     ]
     fl.write(log, car(2000, 1 / 256))

@@ -527,7 +527,7 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
     assert {path.name for path in out.iterdir()} == names
     four = fuselog(*run, "--runs", "4").out
     assert "nees_mean_over_runs" not in four
-    assert "nees: no interval of its mean over the runs: an interval needs at least 5 runs" in four
+    assert "nees: its mean over the runs has no interval: an interval needs at least 5 runs" in four
     fuselog("report", out, "-o", tmp_path / "four.html")
     page = (tmp_path / "four.html").read_text(encoding="utf-8")
     assert "No 95 % intervals: an interval needs at least 5 runs, and there are only 4." in page

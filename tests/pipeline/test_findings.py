@@ -125,7 +125,7 @@ def test_wheels_that_turn_backwards_are_named_beside_the_compass() -> None:
     [found] = fl.lint(replace(log, streams={**log.streams, ODOMETRY: wheels}))
     assert found.where == "/car/heading"
     assert "or of a wrong sign of speeds" in found.evidence
-    assert "or change the sign of the speeds by factors" in found.fix
+    assert "or change the sign of the speeds with `factors`" in found.fix
     with pytest.warns(FutureWarning, match="Finding: 'words' was renamed to 'sentence'"):
         assert found.words == found.sentence  # what scripts of the release before ask for
 

@@ -309,7 +309,7 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     broken = ["--set", "ekf.sigma_range_m=0.025", "--set", "duration_s=5", "--runs", "2"]
     broken += ["--set", "ekf.turn_noise_density=0.001"]  # a second one, which stays
     done = fuselog("run", "landmarks", *broken, "--diagnose", "--out", folder)
-    assert "likeliest cause for ekf: sigma_range_m (standard deviation of a range) is" in done.out
+    assert "most likely cause for ekf: sigma_range_m (standard deviation of a range) is" in done.out
     [cause] = read_result(folder).causes
     key, _, value = cause.setting.partition("=")
     assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")

@@ -91,7 +91,7 @@ def test_a_run_that_dominates_the_mean_nees_is_named() -> None:
     bad = {"position_rmse_m": errors, "nees": [2.0, 4.0, 400.0, 2.5, 3.5]}
     told = _told({"bad": bad, "good": {"position_rmse_m": errors, "nees": [3.0] * 5}})
     notes = {card.estimator: " ".join(card.notes) for card in told.cards}
-    assert "Mean NEES: run 2 dominates it with 400; the others average 3." in notes["bad"]
+    assert "Mean NEES: run 2 dominates the mean with 400; the other runs average 3." in notes["bad"]
     assert "dominates" not in notes["good"]
     assert [dominating(np.array(each)) for each in ([1.0, 9.0], [9.0, 4.0, 5.0], [9.0, 4.0, 4.9])] == [
         None,

@@ -216,7 +216,7 @@ def test_commands_and_c_have_the_same_names(
             {"topics": {"fix": "/gps1/fix,/gps3/fix"}},
             "topics.fix = /gps3/fix: the log has no such topic",
         ),
-        ({"topics": {"fix": "/gps1/fix,/compass1/heading"}}, "no such topic that serves as fix"),
+        ({"topics": {"fix": "/gps1/fix,/compass1/heading"}}, "no such topic that can serve as fix"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

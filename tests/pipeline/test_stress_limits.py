@@ -70,7 +70,7 @@ def test_other_samples_are_no_noise_per_prediction() -> None:
         line(list(np.linspace(0.0, 2.0, 6))), {"own": fl.modelled(LINE, "particles:50")}
     ).stressed
     said = " ".join(stressed.sentences)
-    assert "an ulp of the inputs changes the covariance: other samples are drawn" in said
+    assert "a change of the inputs by one ulp changes the covariance: other samples are drawn" in said
     assert "per prediction" not in said
 
 

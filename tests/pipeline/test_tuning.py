@@ -232,7 +232,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
         (
             "turn_noise_density",
             {"set": {"turn_noise_density": 0.0}},
-            "its start value is 0; give a positive start value",
+            "the start value is 0; give a positive start value",
         ),
         ("sigma_range_m", {"by": "rmse"}, "has no truth to compare its estimates with"),
         ("sigma_range_m", {"by": "luck"}, "--by luck: available: likelihood, nis"),
@@ -247,7 +247,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
             "--folds 2: expected a number between 2 and the number of logs, 1",
         ),
         ("bias_range_m", {"grid": 3}, "bias_range_m: a grid needs bounds"),
-        ("sigma_range_m", {"grid": 10_001}, "--grid 10001: these are 10001 points for 1 parameters"),
+        ("sigma_range_m", {"grid": 10_001}, "--grid 10001: this gives 10001 points for 1 parameters"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(

@@ -250,7 +250,7 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "lost messages",
         "",
     ),
-    "jitter": (stamps(IMU, scattered), IMU, "stamps", "scatter"),
+    "jitter": (stamps(IMU, scattered), IMU, "stamps", "steps vary"),
     "clock 2 % fast": (stamps(IMU, lambda t: 1.02 * t, logged=False), IMU, "clock drift", "gains"),
     "leap seconds": (stamps(FIX, lambda t: t + 18 * 10**9, logged=False), FIX, "delay", "18 s ahead of"),
     "TAI": (stamps(FIX, lambda t: t + 37 * 10**9, logged=False), FIX, "delay", "TAI"),
@@ -297,7 +297,12 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
         "place",
         "9 of 600 fixes are at 0, 0",
     ),
-    "integers": (column(FIX, "latitude_deg", lambda x: 1e7 * x), FIX, "place", "integers of 1e-7"),
+    "integers": (
+        column(FIX, "latitude_deg", lambda x: 1e7 * x),
+        FIX,
+        "place",
+        "integers in units of 1e-7",
+    ),
     "frozen": (force(setting(100, 300, 0.1, 0)), IMU, "values", "frozen at 0.1 for 200"),
     "saturated": (column(IMU, "turn_rate_radps", saturating), IMU, "values", "end of a range"),
     "clipped": (

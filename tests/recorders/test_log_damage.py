@@ -239,9 +239,9 @@ def test_a_number_that_means_two_channels_is_told(tmp_path):
     data = slice(raw.index(b"\x06", 40), raw.index(b"\x0f" + struct.pack("<Q", 4)))
     other = bytearray(raw[data]).replace(b"/scan", b"/scam")
     path.write_bytes(raw[: data.stop] + other)
-    assert "it declares channel 1 twice, differently" in refusal(path)
+    assert "it declares channel 1 twice, in different ways" in refusal(path)
     log, _, found = everything(path, recover=True)
-    assert "it declares channel 1 twice, differently" in log.loss_statement
+    assert "it declares channel 1 twice, in different ways" in log.loss_statement
     assert found["/scan"]["scan_id"].tolist() == [1, 2, 3]
 
 
@@ -423,7 +423,7 @@ def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
         ({"run": "0.5"}, "run is 0.5, expected a whole number"),
         ({"epoch_ns": str(2**63)}, "epoch_ns is after the year 2262"),
         ({"notes": "3"}, "notes is 3, expected an object"),
-        ({"notes": '{"a": 3}'}, "notes are not all texts"),
+        ({"notes": '{"a": 3}'}, "some notes are not texts"),
         ({"notes": "{"}, "Expecting property name"),
     ],
 )

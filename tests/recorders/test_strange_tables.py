@@ -75,7 +75,7 @@ def _linted(folder: Path, columns: dict[str, Any], table: str, *streams: str) ->
 
 
 TIME = "time = { column = 't' }"
-ZEROS = "its fixes are about 0, 0"
+ZEROS = "its fixes are near latitude 0, longitude 0"
 ATTITUDE = "attitude = { heading = 'heading'"
 DAYS = [f"{7 + k // 100:02d}/09/2019 10:{k // 2 % 50:02d}:{k % 2 * 30:02d}" for k in range(400)]
 # Other columns, the head of the table, its streams, and what lint says.

@@ -1000,7 +1000,7 @@ def test_tables_of_ardupilot_have_one_clock_and_its_codes_and_axes(tmp_path: Pat
 TIMELESS = {
     "frame,id,x,y": 'column = "frame", rate_hz = 25 } for 25 a second, and in the table vehicle = "id"',
     "recordingId,trackId,frame,trackLifetime,xCenter,yCenter": 'vehicle = "trackId"',
-    "id,x,y": "no column could be the time of rows of several vehicles, by column id",
+    "id,x,y": "no column could be the time of the rows of several vehicles, by column id",
     "YEAR,DOY,SOD,lat,lon": "columns DOY, YEAR hold the date in parts",
     "year,day_of_year,seconds_of_day,lat,lon": "hold the date in parts",
     "time,lat,lon": "neither a date since 1970 nor less than a year",

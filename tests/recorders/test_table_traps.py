@@ -106,7 +106,7 @@ def test_text_that_is_not_utf_8_is_refused_where_it_is_read(tmp_path: Path) -> N
     table = open_table(path)
     (batch,) = table.batches(["t", "x"])
     assert batch["x"].to_pylist() == [2.0, 3.0]
-    assert table.left_out == {"of another number of cells than 3": 1}
+    assert table.left_out == {"with a number of cells other than 3": 1}
     with pytest.raises(BadInput, match="column note holds text that is not UTF-8"):
         list(table.batches(["t"], ["note"]))
 

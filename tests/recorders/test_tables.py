@@ -227,7 +227,7 @@ delay_s = 0.5
     streams, notes = imported(tmp_path / "raw.csv", tagged.replace("0.5", "0.0"))
     since = streams["/x"].publish_time_ns - 1756402240_250000000
     assert since.tolist() == [0, 500_500_000, 2_002_000_000]  # 2000 ms of the counter are 2002
-    assert notes["raw.csv: rows left out, of another number of cells than 2"] == "1"
+    assert notes["raw.csv: rows left out, with a number of cells other than 2"] == "1"
     assert notes["raw.csv: rows without a time are left out"] == "1"
     raw = tmp_path / "raw"
     raw.mkdir()
@@ -576,7 +576,7 @@ def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any],
     assert notes["table.csv: stamps go back in time, so they are sorted"] == "1"
     assert notes["table.csv: stamps repeat, but are kept"] == "1"
     assert notes["/fix: messages left out: NaN or infinite"] == "2"
-    assert notes["table.csv: rows left out, of another number of cells than 4"] == "1"
+    assert notes["table.csv: rows left out, with a number of cells other than 4"] == "1"
     import_log(
         "table",
         tmp_path / "table.csv",

@@ -277,7 +277,7 @@ def test_a_number_that_two_topics_have_gives_rows_of_the_first_until_then(tmp_pa
     off, notes = read(tmp_path / "twice.ulg", content + foreign)
     assert len(off) == 300
     assert not off.any()
-    assert notes["lost, number of sensor_combined that other also has"] == "1"
+    assert notes["lost, number of sensor_combined that other also uses"] == "1"
 
 
 @pytest.mark.parametrize("content", [b"", b"no ULog at all", MAGIC], ids=["empty", "magic", "short"])

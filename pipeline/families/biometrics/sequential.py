@@ -112,8 +112,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     }
     if len(ratios) < 2:
         raise BadInput(
-            "study biometrics-sequential monitors each matcher by the others: give a score-mixture of "
-            "all pairs with at least two matchers as its subsets"
+            "study biometrics-sequential monitors each matcher with the help of the others; give a "
+            "score-mixture of all pairs, with at least two matchers as its subsets"
         )
     rng = np.random.default_rng(experiment.seed)
     count = len(next(iter(ratios.values())))

@@ -141,7 +141,7 @@ class Findings:
         return (
             f"No 95 % intervals: {too_few(self.runs)}."
             if few
-            else "Small print: 95 % intervals over runs."
+            else "Values in small type: 95 % intervals over runs."
         )
 
     @cached_property

@@ -69,8 +69,8 @@ _TERMS = {
     ),
     "idf1": Term(
         "IDF1",
-        "The share of detections with the correct identity, where missed and false ones count as "
-        "errors; 1 is best.",
+        "The share of detections with the correct identity; missed and false detections count as "
+        "errors. 1 is best.",
         "https://arxiv.org/abs/1609.01775",
     ),
     "^gated_share$": Term(

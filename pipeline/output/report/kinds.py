@@ -107,7 +107,7 @@ def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(
         begun.story.verdict
-    ) or "There are no errors against a truth, and no claims."
+    ) or "The result has neither errors against a truth nor claims."
 
 
 def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:

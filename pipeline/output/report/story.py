@@ -224,7 +224,7 @@ def _advice(
         if any(relation(found, take, each) == Comparison.WITHHELD for each in equal):
             return (
                 f"No verdict between {both}: changes that should not matter change the {main} by more "
-                "than they differ."
+                "than these estimators differ."
             )
         return f"A tie so far: {runs} cannot distinguish {both}; {whom}."
     if all(relation(found, take, each) is None for each in found.labels if each != take):
@@ -371,7 +371,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
         notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
     if each.squares[1:] and each.decisive is each.squares[0] and found.runs == 1:
         nis = number(each.squares[1].found.value)
-        notes.append(f"According to its innovations, NIS is {nis} per component; 1 is ideal.")
+        notes.append(f"The NIS of its innovations is {nis} per component; 1 is ideal.")
     if each.age_s:
         own = scale("s", each.age_s)
         age = f"{own.text(each.age_s)} {own.sign}"

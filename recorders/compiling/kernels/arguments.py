@@ -70,7 +70,7 @@ def with_types(value: Value, kinds: Iterator[Value]) -> Value:
         is_usual = layout & _ALIGNED and dtype.isnative
         if dtype.char not in _LETTERS or not is_usual:
             why = "" if is_usual else ", unaligned or in another machine's order"
-            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
+            raise BadInput(f"a kernel takes 64-bit numbers, not an array of {value.dtype}{why}")
         is_square = len(known) > 1 and known[-1] == known[-2]
         sizes = (size if size <= KNOWN or is_square else None for size in known)
         shape = (*(None,) * (axes - len(known)), *sizes)

@@ -351,7 +351,7 @@ class Expressions(Scope, ABC):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
         name = getattr(function, "__name__", function)
         raise TypeError(
-            f"a kernel that creates no arrays cannot call {name}; others have allocates=True"
+            f"a kernel that creates no arrays cannot call {name}, which needs allocates=True"
         )
 
     def new_array(self, like: Value, dtype: Value = float, *, is_zero: bool) -> Array:

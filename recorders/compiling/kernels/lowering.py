@@ -185,7 +185,7 @@ class _Lowering(Frame):
         """Lower `return`; outside of branches the value may stay known; inside, it is kept in memory."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
-            raise TypeError("it returns an array that it created; pass an array that it fills")
+            raise TypeError("it returns an array that it created; pass it an array to fill")
         if self._depth == 0 and not self._exit:
             self._returned, self.ended = value, True
             return

@@ -207,7 +207,7 @@ def _checked_entry(function: FunctionType, kinds: tuple[Value, ...], title: str)
     def checked(*arguments: Value) -> None:
         fault = kernel(*arguments)
         if fault:
-            raise IndexError(f"an index is beyond its array in {program.faults[fault - 1]}")
+            raise IndexError(f"an array index is out of range in {program.faults[fault - 1]}")
 
     return checked
 

@@ -185,7 +185,7 @@ def common_kind(*values: Scalar) -> str:
     if rows:
         return rows[0]
     if {WORD, WHOLE} <= kinds:
-        raise TypeError("signed and unsigned integers together; convert one of them")
+        raise TypeError("signed and unsigned integers are mixed; convert one of them")
     return max(kinds, key=_WIDTH.__getitem__)
 
 

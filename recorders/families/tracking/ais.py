@@ -131,7 +131,7 @@ def _reports(path: Path) -> Reports:
         table,
         "Time",
         backwards,
-        "a time that is not before that of the row above; sort the rows by Time",
+        "a time no earlier than that of the row above; sort the rows by Time",
     )
     mmsi, latitude, longitude, course, speed = numbers.to_numpy(float).T
     return Reports(

@@ -243,7 +243,7 @@ class _Walk:
             self._found.texts[path] = _Text(self._position, max(length - self._is_cdr, 0))
             self._step(length)
         elif name not in _NUMPY_TYPES:
-            raise Undecodable(f"its field {path} is a {name}, which is not read")
+            raise Undecodable(f"its field {path} has the type {name}, which fuselog cannot read")
         else:
             dtype = np.dtype(self._order + _NUMPY_TYPES[name])
             if count != 0:

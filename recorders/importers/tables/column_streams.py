@@ -166,7 +166,7 @@ def _fix(table: GuessedTable) -> Iterator[str]:
         ]
     else:
         lines += [
-            "# No standard deviations are named; stated ones, east, north, up:",
+            "# No columns give standard deviations; to state them for east, north and up:",
             "# deviations.covariance_m2 = [1, 1, 2]",
         ]
     why = "the names are a latitude and a longitude"
@@ -281,7 +281,7 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     if place:
         lines += [
             "# If this is the truth:",
-            '# topic = "/truth", becomes = "TruthState", and in place of the fields above',
+            '# topic = "/truth", becomes = "TruthState", and instead of the fields above:',
             *(f"# {line}" for line in _truth(place, factors, turn, heading) if not line.startswith("#")),
         ]
     names = ["a position"] * bool(place) + ["a unit quaternion"] * bool(turn)
@@ -425,7 +425,9 @@ def _truth(
         )
         if is_compass:
             quarter = round(np.pi / 2 / unit(in_unit).size, 9)
-            lines.append("# By the path, the heading is clockwise from north; fuselog's is from east:")
+            lines.append(
+                "# According to the path, the heading is clockwise from north; fuselog's is from east:"
+            )
             lines.append(f"offsets.state = {[*[0] * len(place), quarter]}")
             signs.append(-1)
         else:

@@ -199,7 +199,7 @@ def _split_table(table: Table, split: Mapping[str, Sequence[str]]) -> Table:
                 found = pc.extract_regex(cells, _parts_of(parts[source]))
                 lacking = int(pc.sum(pc.and_(pc.is_valid(cells), pc.is_null(found))).as_py() or 0)
                 if lacking:
-                    fact = f"whose cell of {source} does not hold {len(parts[source])} numbers"
+                    fact = f"whose cell in column {source} does not have {len(parts[source])} numbers"
                     table.left_out[fact] += lacking
                 for index, name in enumerate(parts[source]):
                     made[name] = pc.struct_field(found, [index])
@@ -350,7 +350,7 @@ def _text_batches(
     left_out: Counter[str],
 ) -> Iterator[Batch]:
     def leave_out(row: pyarrow.csv.InvalidRow) -> str:
-        left_out[f"of another number of cells than {row.expected_columns}"] += 1
+        left_out[f"with a number of cells other than {row.expected_columns}"] += 1
         return "skip"
 
     is_spaced = layout.delimiter == " "

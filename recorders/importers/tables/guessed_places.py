@@ -207,7 +207,7 @@ def places_of(table: GuessedTable, place: Sequence[GuessedColumn]) -> Places:
     else:
         lines += [
             f'units.{field} = "{name}"'
-            + "   # minutes that are positive to the west, as a VBOX has them" * name.startswith("-")
+            + "   # minutes that are positive to the west, as in VBOX files" * name.startswith("-")
             for field, name in zip(("latitude_deg", "longitude_deg"), units, strict=True)
             if name != "deg"
         ]
@@ -376,19 +376,19 @@ def _by_name(
     if set(fitting) == {"deg", "rad"}:
         return (
             "rad",
-            f'by their size, up to {np.nanmax(np.abs(place[0].values)):.4g}; units = "deg" if not',
+            f'by their size, up to {np.nanmax(np.abs(place[0].values)):.4g}; if wrong, units = "deg"',
         )
     if list(fitting) == [_MINUTES]:
         return _MINUTES, "degrees and minutes, by their size"
     if _MINUTES in fitting and "hemispheres" in table.prepared:
-        return _MINUTES, "degrees and minutes as NMEA has them, with hemispheres"
+        return _MINUTES, "degrees and minutes as in NMEA sentences, with hemispheres"
     plain = [column.plain for column in place]
     is_fit = all(re.fullmatch("(.*_)?position_(lat|long)", name) for name in plain)
     if "semicircle" in fitting and is_fit:
-        return "semicircle", "as files of FIT have them"
+        return "semicircle", "as in FIT files"
     is_alike = {"1e-7 deg", "semicircle"} <= {*fitting} and len(fitting) <= 3
     if is_alike and plain[0] in ("lat", "latitude") and np.nanmax(np.abs(place[0].values)) > 9e7:
-        return "1e-7 deg", "as u-blox, PX4 and MAVLink have them"
+        return "1e-7 deg", "as in data of u-blox, PX4 and MAVLink"
     if len(fitting) == 1:
         return fitting[0], "by their size"
     return "", ""

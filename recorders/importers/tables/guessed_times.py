@@ -302,7 +302,8 @@ def _check_frames(table: _Table) -> None:
     of_frames = f"column {frames} counts frames, but the frame rate is not in the file" if frames else ""
     time = f'column = "{frames}", rate_hz = 25' if frames else 'column = "COLUMN", unit = "s"'
     raise BadInput(
-        f"{table.path}: {of_frames or 'no column could be the time of rows of ' + of_several}; write a "
+        f"{table.path}: {of_frames or 'no column could be the time of the rows of ' + of_several}; "
+        "write a "
         f"mapping yourself with time = {{ {time} }}" + " for 25 a second" * bool(frames) + whose
     )
 
@@ -887,7 +888,7 @@ def _seen(parts: Sequence[Stamps]) -> list[str]:
         steps_s = -steps_s
     forward = steps_s[steps_s > 0]
     if not len(forward):
-        return ["# All rows have one stamp."]
+        return ["# All rows have the same stamp."]
     usual_s = float(np.median(forward))
     gaps = forward[forward > 5 * usual_s]
     rate = f"{1 / usual_s:.4g}"

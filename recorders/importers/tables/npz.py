@@ -79,7 +79,7 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
         chosen = {name: columns[name] for name in wanted}
         row_bytes = sum(each.array.kind.itemsize * each.array.width for each in chosen.values())
         if row_bytes > block_bytes:
-            raise ValueError(f"its rows are of {row_bytes} bytes; at most {block_bytes} can be read")
+            raise ValueError(f"its rows have {row_bytes} bytes; at most {block_bytes} can be read")
         step = block_bytes // max(row_bytes, 1)
         with _archive(path) as archive, ExitStack() as stack:
             # one open file for an array, or for each of its columns if they are stored one after the

@@ -116,7 +116,8 @@ def _onto_map(projection: str) -> Any:
         ) from None
     if not crs.is_projected:
         raise BadInput(
-            f"projection {projection}: has no east and north in m; give a projected one: EPSG:25832"
+            f"projection {projection}: has no east and north in m; give a projected one, such as "
+            "EPSG:25832"
         )
     return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 

@@ -29,7 +29,7 @@ _WEEKS = 1024  # after which receivers with ten bits roll over to 0
 _WEEK_NS = 7 * 86400 * 10**9
 # Settings that cannot be combined with a column of frames.
 _UNCOUNTED = {"unit", "week", "rollover"}
-REMEDY = "check `unit`, and give in `zero` the date that the times count from"
+REMEDY = "check `unit`, and state in `zero` the date from which the times count"
 ISO = "ISO8601"
 # Offsets from UTC in h of zones with short names, if the name is unambiguous.
 ZONES = {
@@ -122,16 +122,16 @@ class TimeMapping(Parameters):
             and (len(self.columns) > 1 or self.model_fields_set & _UNCOUNTED)
         ):
             raise ValueError(
-                "`rate_hz` with `column` counts frame numbers in one column; remove `unit`, `week` and "
-                "`rollover`, or `rate_hz`"
+                "`rate_hz` with `column` expects frame numbers in a single column; remove `unit`, "
+                "`week` and `rollover`, or `rate_hz`"
             )
         counted = len(self.columns) - bool(self.week)
         if isinstance(self.unit, list) and len(self.unit) != counted:
             raise ValueError(f"unit has {len(self.unit)} units for {counted} columns; give one for each")
         if counted > 1 and self.unit != "date" and not isinstance(self.unit, list):
             raise ValueError(
-                'several columns together need unit = "date", or a list of units of numbers to add, '
-                'such as unit = ["s", "ns"]'
+                'several columns together need unit = "date", or a list of units whose numbers are '
+                'added, such as unit = ["s", "ns"]'
             )
         if self.rollover and self.unit == "date":
             raise ValueError('`rollover` is for counters; remove it if unit = "date"')

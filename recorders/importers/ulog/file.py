@@ -357,7 +357,7 @@ class UlogFile:
         numbers = data[begins].astype(np.int64) + (data[begins + 1].astype(np.int64) << 8)
         is_known = self._known.since[numbers] < _NEVER
         self.losses["rows of no topic"] += int((~is_known).sum())
-        self.losses["rows of a number that two topics have"] += int(is_known.sum())
+        self.losses["rows with a number that two topics share"] += int(is_known.sum())
 
     def _times(
         self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
@@ -381,7 +381,7 @@ class UlogFile:
         if known is not None:
             if (known.topic, known.instance) != (topic, instance):
                 self._known.until[number] = min(self._known.until[number], position)
-                self.losses[f"number of {known.topic} that {topic} also has"] += 1
+                self.losses[f"number of {known.topic} that {topic} also uses"] += 1
             return
         try:
             layout = layout_of(topic, self._formats)

@@ -370,7 +370,7 @@ def _declare(found: Container, declarations: Iterable[Any]) -> None:
     for record in declarations:
         kind = type(record)
         if kind in known and known[kind].setdefault(record.id, record) != record:
-            raise Damaged(f"it declares {kind.__name__.lower()} {record.id} twice, differently")
+            raise Damaged(f"it declares {kind.__name__.lower()} {record.id} twice, in different ways")
 
 
 def _checksum(file: BinaryIO, end: int) -> int:

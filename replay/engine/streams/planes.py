@@ -127,7 +127,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
         raise BadInput(
             f"topic {stream.topic} states the origin {own} of its tangent plane, but other topics state "
             f"{origin}; messages of type {schema} cannot be transformed between planes, so record them "
-            "with the origin of the others"
+            "with the same origin as the others"
         )
     return replace(stream, columns=columns, metadata={**stream.metadata, **origin.metadata})
 

@@ -85,7 +85,8 @@ def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
     finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
     if not finite.any():
         raise BadInput(
-            f"topic {inertial.topic}: no sample has both specific force and turn rate, as a start needs"
+            f"topic {inertial.topic}: no sample has both specific force and turn rate, which the start "
+            "needs"
         )
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / NS)
     force, rate = (column[finite] for column in columns)
@@ -321,8 +322,9 @@ def _first_place(
     if not len(usable):
         later_s = (time_ns[0] - samples.time_ns[0]) * NS if len(fix) else np.nan
         raise BadInput(
-            f"no message of {fix.topic} is within the time span of {topic}; it starts {later_s:.3g} s "
-            "later; if their clocks differ, correct them by fix_delay_s or inertial_delay_s"
+            f"no message of {fix.topic} is within the time span of {topic}; {fix.topic} starts "
+            f"{later_s:.3g} s later; if their clocks differ, correct them by fix_delay_s or "
+            "inertial_delay_s"
         )
     first = usable[0]
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]

@@ -57,7 +57,7 @@ from fuselog.replay.inference.sampling.resampling import choose_systematically
 KINDS = {
     "set": "states weighted by the exact likelihood of unordered pairs (x, y)",
     "axes": "states weighted by the exact likelihoods of unordered x and of unordered y",
-    "associations": "associations with a Kalman filter each (Rao-Blackwellized)",
+    "associations": "associations, each with its own Kalman filter (Rao-Blackwellized)",
 }
 LEAST_EFFECTIVE_SHARE = 0.5
 _choose = compiled(choose_systematically)

@@ -199,8 +199,7 @@ def begin(
     for name, mean in zip(added.names, means, strict=True):
         if not np.isfinite(mean):
             raise BadInput(
-                f"estimator {label}: estimate = {name}: its value at the start is missing; give "
-                f"{name}=..."
+                f"estimator {label}: estimate = {name}: the start value is missing; give {name}=..."
             )
     variances = np.array([process.sigma**2 for process in added.processes])
 

@@ -131,7 +131,7 @@ def with_more(
                     for kind in kinds
                     if own.schema_name in serving(kind.schema)
                 ]
-                why = f"the log has no such topic that serves as {role}; {choices(name, known)}"
+                why = f"the log has no such topic that can serve as {role}; {choices(name, known)}"
                 raise BadInput(f"estimator {label}: topics.{role}: {name}: {why}")
             place = max(place for place, (sensor, _) in enumerate(sensors) if sensor.topic == role)
             sensors[place + 1 : place + 1] = [(each, topic) for each in serves]

@@ -67,7 +67,8 @@ def unscented(dimension: int, kappa: float = 0.5) -> Samples:
     spread = dimension + kappa
     if not spread > 0:
         raise BadInput(
-            f"kappa = {kappa} gives no covariance in {dimension} dimensions; give more than {-dimension}"
+            f"kappa = {kappa} gives no valid covariance in {dimension} dimensions; give a value above "
+            f"{-dimension}"
         )
     weights = np.full(2 * dimension + 1, 1 / (2 * spread))
     weights[0] = kappa / spread

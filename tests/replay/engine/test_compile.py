@@ -277,7 +277,8 @@ def test_only_a_folder_of_this_user_alone_is_used(
     assert caplog.messages == [
         f"the cache {kernels} is not used: other users may write to it; run chmod go-w on it",
         f"the cache {kernels.parent} is not used: other users may write to it; run chmod go-w on it",
-        f"the cache {kernels.parent} is not used: another user owns it; set FUSELOG_CACHE to your own",
+        f"the cache {kernels.parent} is not used: another user owns it; "
+        "set FUSELOG_CACHE to a folder of your own",
     ]
 
 
@@ -355,7 +356,7 @@ def test_a_kernel_that_makes_arrays_is_numbas():
     values, found = np.array([[3.0, 1.0, 2.0]]), np.zeros(1)
     numba_over_runs(sorted_copy)(1, values, found)
     assert found[0] == 9.0 == 3.0 * from_table(0, 1)
-    with pytest.raises(BadInput, match="cannot call sort; others have allocates=True"):
+    with pytest.raises(BadInput, match="cannot call sort, which needs allocates=True"):
         compile_over_runs(sorted_copy)(1, values, found)
 
 

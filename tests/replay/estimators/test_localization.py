@@ -519,5 +519,5 @@ def test_what_no_run_can_use_is_bad_input():
         foreign = replace(source.streams[topic], schema=schemas.SCAN)
         with pytest.raises(BadInput, match=f"{said} .*which has type fuselog.Scan in this log"):
             replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])
-    with pytest.raises(BadInput, match="gives no covariance"):
+    with pytest.raises(BadInput, match="gives no valid covariance"):
         unscented(3, -3.0)

@@ -257,7 +257,7 @@ def test_a_program_that_writes_mcap(tmp_path: Path) -> None:
     [
         ("fail", "the program ended with exit code 1: no such road"),
         ("nothing", "the program wrote no estimates"),
-        ("gap", r"have no number in column x_m, row 2 \(2 in total\); write one, or leave out the row"),
+        ("gap", r"no number in column x_m, row 2 \(2 such rows in total\); write a number, or leave"),
         ("table", "have a column z_m, which /robot1/truth does not have; it has x_m, y_m, heading_rad"),
     ],
 )

@@ -211,7 +211,7 @@ def test_a_sensor_that_fits_no_topic(registered: dict[str, Model]) -> None:
     with pytest.raises(BadInput, match=r"vehicle-a is the closest one, but lacks /prior .*of x_m, y_m"):
         fit(changed("/prior", None))
     registered["vehicle-a"] = replace(registered["vehicle-a"], by_name=True)
-    with pytest.raises(BadInput, match=r"is only used if it is named: --model vehicle-a"):
+    with pytest.raises(BadInput, match=r"is used only if you name it: --model vehicle-a"):
         fit(SOURCE)
     registered["vehicle-a"] = with_sensor(SPEED, topic="velocity")
     with pytest.raises(BadInput, match=r"does not fit this log: .*vehicle-a"):

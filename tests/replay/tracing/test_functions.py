@@ -129,7 +129,10 @@ REFUSED = {
     "an option": (lambda x: np.sin(x, where=True), r"it uses np\.sin with where; write np\.where"),
     "a function": (lambda x: np.heaviside(x, 0.0), rf"it uses np\.heaviside {NUMBER}; write it with"),
     "a table": (lambda x: np.interp(x, [0.0, x], TABLE), r"it uses np\.interp on a table that is only"),
-    "mixed arrays": (lambda x: np.sin(np.array([x, 1.0]))[0], r"it uses np\.sin on an array with some"),
+    "mixed arrays": (
+        lambda x: np.sin(np.array([x, 1.0]))[0],
+        r"it uses np\.sin on an array that has some",
+    ),
     "two results": (
         lambda x: x if x > 0.0 else (x, x),
         r"it returns a number on one path and a tuple of 2",

@@ -129,7 +129,7 @@ def test_bad_names_are_refused_in_one_sentence(name, reason):
     [
         ("gf-3", 0, "dimension of 1 or more"),
         ("s2kf-50", -2, "dimension of 1 or more"),
-        ("ukf:kappa=-2", 2, "give more than -2"),
+        ("ukf:kappa=-2", 2, "give a value above -2"),
         ("s2kf-8", 8, "give 9 or more"),
         ("s2kf-15:symmetric", 8, "give 16 or more"),
     ],
