@@ -191,7 +191,7 @@ def profile_ends(
     within: float = END,
     doublings: int = DOUBLINGS,
 ) -> tuple[Floats, Floats]:
-    """Find the ends of each coordinate's 95 % interval, where the curvature gives the other coordinates.
+    """Find the ends of each coordinate's 95 % interval; the curvature predicts the other coordinates.
 
     Args:
         cost: function that computes minus the log-likelihoods of points (n, k).
@@ -269,7 +269,7 @@ def side_by_side(
     searches: Sequence[Search[Asked, Found]],
     gains_of: Callable[[Sequence[tuple[int, Asked]]], Sequence[float]],
 ) -> list[Found]:
-    """Run searches in parallel, and evaluate the values that all of them request together.
+    """Run searches in parallel; the values that they request are evaluated together.
 
     `gains_of` computes the gains of pairs: the index of a search, and a value. A gain of NaN counts as
     minus infinity.

@@ -86,5 +86,5 @@ def outage_stream(topic: str, spans_ns: NDArray[np.int64]) -> Stream:
 
 
 def stated_numbers(parameters: Parameters, *names: str) -> dict[str, str]:
-    """Format parameters as a channel states them: text that gives the same numbers when read back."""
+    """Format parameters as text for a channel; reading the text gives exactly the same numbers."""
     return {name: repr(getattr(parameters, name)) for name in names}

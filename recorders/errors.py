@@ -17,7 +17,7 @@ class BadInput(Exception):
 
 
 class CannotWrite(BadInput):
-    """An error of writing a file, such as a full disk, which other inputs would meet as well."""
+    """An error of writing a file, such as a full disk, that would occur with any other input too."""
 
 
 class UnknownName(BadInput, KeyError):

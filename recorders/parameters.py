@@ -194,7 +194,7 @@ class Parameter(NamedTuple):
         is_log: whether the logarithm of the value is varied.
         is_assumed: whether the value comes neither from a setting nor from the log.
         useful: standard error that is sufficient for a calibration; zero if there is none.
-        group: heading under which it is shown, such as a topic.
+        group: title under which it is shown, such as a topic.
     """
 
     name: str

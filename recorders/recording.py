@@ -49,7 +49,7 @@ def named_generator(
 
     Args:
         rng: generator of the run or of a part of the run; no numbers are drawn from it.
-        name: name of a sensor, for example, with at least two letters; the same name gives the same
+        name: name, such as that of a sensor, with at least two letters; the same name gives the same
             numbers.
         numbers: spawn indices by name, for names that used `rng.spawn(...)` before generators had names.
     """

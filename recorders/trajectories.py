@@ -251,7 +251,7 @@ def _recognised(
 
 
 def _unit(rows: Sequence[Sequence[str]]) -> str:
-    """Infer the unit of stamps (s, ms, us or ns) from their size and steps; empty if it is ambiguous.
+    """Infer the unit of stamps (s, ms, us, ns) from size and steps; return "" if it is ambiguous.
 
     Poses are assumed to be at most three hours apart, and to have a rate of at most 1 kHz. Dates in ms
     and us are from 2001 to 2033.

@@ -113,14 +113,15 @@ def written(unit: str) -> str:
 
 
 def mistaken(unit_: str) -> dict[str, float]:
-    """Return units often used by mistake instead of `unit_`, and how much too large numbers get."""
+    """Return units often mistaken for `unit_`, with the factors by which numbers become too large."""
     return {name: unit(unit_).size / unit(name).size for name in MISTAKEN.get(unit_, ())}
 
 
 def conversion(given: str, name: str, *, is_root: bool = False) -> float:
     """Compute the factor that converts numbers in a unit to the unit of the field or component `name`.
 
-    With `is_root` the numbers are square roots, such as the standard deviations for a covariance.
+    With `is_root`, the numbers are square roots of the field's values, such as standard deviations for a
+    covariance.
 
     Raises BadInput if the text is not a unit, or if the unit measures another quantity.
 

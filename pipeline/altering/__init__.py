@@ -1,4 +1,4 @@
-"""Alterations of a run's topics, which correct a fault or plant one before any replay.
+"""Alteration of a run's topics before a replay, to correct a fault or to plant one.
 
 Begin with `sources`.
 """

@@ -152,7 +152,7 @@ def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
-    """Make an alteration that reorders a vector's entries and covariance and ignores its number."""
+    """Make an alteration that reorders a vector's entries and its covariance; its number is unused."""
     return partial(_permuted, field, tuple(order))
 
 
@@ -249,7 +249,7 @@ def _thinned(seed: int, stream: Stream, share: float) -> Stream:
 
 
 def strayed(seed: int, field: str) -> Alteration:
-    """Make an alteration that moves a random share of a vector's messages, each entry by up to STRAY."""
+    """Make an alteration that adds errors up to STRAY to all entries of a random share of messages."""
     return partial(_strayed, seed, field)
 
 

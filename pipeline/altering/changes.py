@@ -204,7 +204,7 @@ def names_in(stream: Stream, field_: str) -> list[str]:
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
-    """Parse settings of topics into changes of a run, by topic, in the order of the settings.
+    """Parse settings of topics into changes of a run, keyed by topic, in the order of the settings.
 
     `WHATS` lists the possible settings. Fields are given by their full name without the unit, or by an
     unambiguous prefix of it. Entries of vectors are given with their axis, such as `position_x_bias`,

@@ -82,7 +82,7 @@ def alter_all(
 def _before_1970(
     stored: LogSource | MemorySource, changes: Mapping[str, Change]
 ) -> dict[str, tuple[int, int]]:
-    """Count the messages that changes move before 1970, and all messages, by topic."""
+    """Count, by topic, the messages that changes move to before 1970, and all messages."""
     found = {}
     for topic, change in changes.items():
         if change.is_moving and change.moved(np.array(stored.extent("publish_time")))[0] < 0:
@@ -148,7 +148,7 @@ class AlteredRecording(MemorySource):
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """Count the messages that would be before 1970, and all messages, by topic."""
+        """Count, by topic, the messages that would be before 1970, and all messages."""
         return _before_1970(self.before, self.changes)
 
 
@@ -184,7 +184,7 @@ class AlteredLog(LogSource):
 
     @cached_property
     def left_out(self) -> dict[str, tuple[int, int]]:
-        """Count the messages that would be before 1970, and all messages, by topic."""
+        """Count, by topic, the messages that would be before 1970, and all messages."""
         return _before_1970(LogSource(self.log), self.changes)
 
     @cached_property
@@ -205,7 +205,7 @@ class AlteredLog(LogSource):
         return max(0, int(np.min(moved))), int(np.max(moved))
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Read whole topics in publish-time order, whatever the source's span."""
+        """Read whole topics in publish-time order, regardless of the source's span."""
         return self._altered(super().read([self._stored(topic) for topic in topics]), topics)
 
     def empty(self, topic: str) -> Stream:

@@ -113,7 +113,7 @@ def show(kind: str, name: str | None, *, as_json: bool) -> None:
 
 
 def methods() -> dict[str, dict[str, str]]:
-    """For each model, find the methods that can estimate it, and what it lacks for the others."""
+    """For each model, find the methods that can estimate it, and what it lacks for all other methods."""
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 

@@ -105,7 +105,7 @@ class Replaying:
         return [row | about for row in rows]
 
     def _refusal(self, log: Path, label: str) -> str:
-        """Return why an estimator cannot replay a log; empty if it can."""
+        """Return the reason why an estimator cannot replay a log, or "" if it can."""
         try:
             replace(self, place=None)._replay(log, {label: self.estimators[label]}, Path())
         except BadInput as error:
@@ -160,7 +160,7 @@ class OverLogs(NamedTuple):
 
 
 class Campaign(NamedTuple):
-    """A selection of logs, the result folder, the workers, and the options that state the selection."""
+    """A selection of logs, the result folder, the workers, and the options that define the selection."""
 
     selection: Selection
     out: Path
@@ -187,7 +187,7 @@ class Campaign(NamedTuple):
 
     @contextmanager
     def table(self, task: Task) -> Iterator[tuple[pd.DataFrame, Callable[[Path], None]]]:
-        """Yield the rows of a task, the worst log first, and a function that moves its files.
+        """Yield the rows of a task, the worst log first, and a function that moves the task's files.
 
         The function takes the folder. Rows and files are kept until the block has succeeded.
         """
@@ -224,9 +224,9 @@ def _table_of(selection: Selection, found: Sequence[Sequence[Row]]) -> pd.DataFr
 
 
 def worst_first(table: pd.DataFrame) -> pd.DataFrame:
-    """Sort the rows of logs: those with a problem, then by the error of the most accurate estimator.
+    """Sort the rows of logs: logs with a problem first, then by error of the most accurate estimator.
 
-    Without errors, the order is that of the faults in the logs, or of the distance of NIS from its aim.
+    Without errors, logs are sorted by their faults or gains, or by how far their NIS is from 1.
     """
     logs = table["log"]
     by = next((name for name in map(str, table) if is_error(name) and table[name].notna().any()), None)
@@ -247,7 +247,7 @@ def worst_first(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
-    """Add each metric over the logs to the outcome, with those of its units, and yield its row.
+    """Add each metric over the logs, and its values by unit, to the outcome; yield a row per metric.
 
     The unit of an interval is the log, or the group of logs; see docs/judge.md.
     """
@@ -295,13 +295,13 @@ def measured(table: pd.DataFrame, outcome: Outcome) -> Iterator[Row]:
 
 
 def aims_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the expected NEES of rows, for all and for the position, if it is the same for all rows."""
+    """Return the expected NEES of the state and of the position, if it is the same in all rows."""
     sizes = {name: {*rows[of].dropna()} for name, of in SIZES.items() if of in rows}
     return {name: float(own.pop()) for name, own in sizes.items() if len(own) == 1 and any(own)}
 
 
 def by_unit(values: pd.Series, units: pd.Series, *, is_rms: bool) -> pd.Series:
-    """Compute the value of each unit, such as a robot: the mean or root mean square of its logs.
+    """Compute the value of each unit, such as a robot: the mean or root mean square over its logs.
 
     Args:
         values: (n,) one value per log.
@@ -354,7 +354,7 @@ def show_over_logs(found: OverLogs, *, as_json: bool, opens: Sequence[str] = ("i
 def opening(
     command: str, labels: Sequence[str], settings_file: Path | None, settings: Sequence[str]
 ) -> list[str]:
-    """Return the words of a command on a single log with the same estimators and settings."""
+    """Return the words of a command that processes one log with the same estimators and settings."""
     options = [("-e", label) for label in labels]
     options += [("--settings", str(file)) for file in filter(None, [settings_file])]
     options += [("--set", text) for text in settings]
@@ -385,5 +385,5 @@ def show_worst(table: pd.DataFrame, folder: Path, opens: Sequence[str]) -> None:
 
 
 def _shown_error(table: pd.DataFrame) -> list[str]:
-    """Return the name of the error that is printed; none if no log has truth."""
+    """Return a list with the name of the error to print, which is empty if no log has truth."""
     return [name for name in map(str, table) if is_error(name)][:1]

@@ -70,8 +70,8 @@ def replay(
         end_s: end of the span.
         start_from: initial state of filters at `start_s`: "truth", or for each log the estimates log of
             an earlier replay.
-        start_sigma: by component, standard deviations for a start from the truth; by default those of
-            the prior.
+        start_sigma: standard deviations by component for a start from the truth; by default those of the
+            prior.
         gap_limit_s: the longest gap over which the truth is interpolated.
         arrival_order: process messages in order of log time, as they arrived.
         late: handling of messages that arrive out of sequence: "drop", "wait:0.5" (in seconds) or
@@ -226,7 +226,7 @@ class Replay(Showing):
 
     @property
     def coverage(self) -> pd.DataFrame:
-        """Return a table of counts per topic and estimator: messages, used, gated, skipped, why."""
+        """Return a table of used, gated and skipped messages per topic and estimator, with reasons."""
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":

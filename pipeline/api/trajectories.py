@@ -292,7 +292,7 @@ def trajectory_figures(
 
 
 def _plane(truth: Trajectory) -> list[int]:
-    """Find the two axes with the truth's largest extents: the ground plane, also in a camera's axes."""
+    """Find the ground plane in any axis convention: the two axes along which the truth extends most."""
     return sorted(np.argsort(-np.ptp(truth.position_m, axis=0), kind="stable")[:2].tolist())
 
 
@@ -308,7 +308,7 @@ def _path_chart(compared: Mapping[str, Compared]) -> Chart:
 
 
 def _error_chart(compared: Mapping[str, Compared]) -> Chart:
-    """Draw APE at every pose and RPE at the last pose of every pair, over time or pose number."""
+    """Draw APE at every pose and RPE at the later pose of every pair, over time or pose number."""
     timed = all(done.estimate.time_ns is not None for done in compared.values())
     x = Axis(label="time (s)" if timed else "pose")
     panels = []

@@ -178,9 +178,9 @@ class Ellipsoid:
 def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
     """Estimate offsets, scales and cross terms of a magnetometer or an accelerometer that was rotated.
 
-    For an accelerometer, only readings at rest are used, because it then measures only gravity. The
-    matrix is symmetric, because readings do not determine the rotation between the sensor's and the
-    body's axes.
+    For an accelerometer, only readings while the unit is stationary are used, because it then measures
+    only gravity. The matrix is symmetric, because readings do not determine the rotation between the
+    sensor's and the body's axes.
 
     Args:
         logs: paths, opened logs, or recordings of one sensor unit that was rotated through many
@@ -221,7 +221,7 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
 
 
 def _readings(source: LogSource | MemorySource, field: str) -> Floats:
-    """Return the readings (n, 3) of a field; average an accelerometer's over periods at rest."""
+    """Return the readings (n, 3) of a field; average an accelerometer's over stationary periods."""
     topic, _, name = field.rpartition(".")
     if not topic:
         raise BadInput(f"--field {field}: expected TOPIC.FIELD, such as /imu.magnetic_field_ut")
@@ -237,7 +237,7 @@ def _readings(source: LogSource | MemorySource, field: str) -> Floats:
 
 
 def _still(readings: Floats, times_s: Floats) -> Floats:
-    """Average readings (n, 3) over each half second in which they are still, and return (m, 3)."""
+    """Average readings (n, 3) over each half second in which the unit is stationary; return (m, 3)."""
     if len(readings) < FEWEST:
         return readings[:0]
     size = max(2, round(_STILL_S / float(np.median(np.diff(times_s)))))

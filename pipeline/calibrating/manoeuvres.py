@@ -91,9 +91,9 @@ def gain(known: Floats, added: Floats) -> Gain:
 def manoeuvres(found: Tuning) -> pd.DataFrame:
     """Tabulate manoeuvres of 20 s, in ascending order of the widest interval that would remain.
 
-    The columns are the manoeuvre, the information that it adds in nats, the largest standard deviation
-    with it in useful units, and the standard deviation of each parameter with it in the parameter's
-    unit. The row "none" describes the logs without another manoeuvre.
+    The columns are the manoeuvre, the information that it adds in nats, the largest remaining standard
+    deviation in useful units, and each parameter's remaining standard deviation in the parameter's unit.
+    The row "none" describes the logs without another manoeuvre.
 
     Raises BadInput if the logs are not those of a robot with wheels.
     """
@@ -117,7 +117,7 @@ def manoeuvres(found: Tuning) -> pd.DataFrame:
 
 
 def advice(found: Tuning) -> list[str]:
-    """Recommend the best manoeuvre for the widest interval, and the best for the determinant."""
+    """Recommend the manoeuvres that are best for the widest interval and for the determinant."""
     table = manoeuvres(found)
     names = list(table.columns[3:])
     before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
@@ -175,7 +175,7 @@ def _first_of(log: Source, schema: Schema) -> Stream | None:
 
 
 def _of_kinds(log: Source) -> dict[str, Stream]:
-    """Return the log's streams that the simulation imitates, by the simulation's topics."""
+    """Return the log's streams that the simulation imitates, keyed by the simulation's topics."""
     streams = {topic: _first_of(log, schema) for topic, schema in SIMULATED.items()}
     found = {topic: stream for topic, stream in streams.items() if stream is not None}
     if "/car/odometry" not in found or "/car/fix" not in found:

@@ -42,8 +42,8 @@ def check_path(
 ) -> bool:
     """Compare the runs at `path` with a golden, or write the golden; return whether all fields agree.
 
-    `in_place` is called with a program's name, the runs and the golden. It returns the settings of the
-    estimators that replace those of the golden.
+    `in_place` is called with a program's name, the runs and the golden. `in_place` returns the settings
+    of the estimators that replace those of the golden.
     """
     if is_update:
         if junit is not None:

@@ -32,8 +32,8 @@ class Discrepancy(NamedTuple):
         run: name of the run.
         topic: topic of the stream.
         part: the column, or another part of the stream, such as its metadata.
-        apart: difference relative to the size of the column; infinite if the part is missing on one
-            side.
+        apart: difference relative to the size of the column; infinite if the golden or the replay lacks
+            the part.
         allowed: largest allowed difference, relative to the size of the column.
         row: first row in the golden whose difference exceeds `allowed`; None if there is no such row.
         component: component of the column.
@@ -214,7 +214,7 @@ def _difference(before: Floats, after: Floats) -> Floats:
 
 
 def _relative(difference: Floats, size: ArrayLike) -> Floats:
-    """Divide differences by `size`; zero differences give zero, missing values NaN."""
+    """Divide differences by `size`; zero differences give zero, and missing values give NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative: Floats = np.where(difference == 0.0, 0.0, np.abs(difference) / size)
     return relative

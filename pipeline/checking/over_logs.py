@@ -1,4 +1,4 @@
-"""Checks of a selection of logs against the runs of a golden, each by itself."""
+"""Checks of selected logs, each by itself, against the runs of a golden."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ def _read(path: Path, sha256: str) -> Golden:  # noqa: ARG001
 def check_over_logs(
     campaign: Campaign, golden: Path, label: str | None, in_place: InPlace | None
 ) -> OverLogs:
-    """Check each log of a selection against the run of the same name; a missing log is a row as well.
+    """Check each log of a selection against the run of the same name; a missing log also gets a row.
 
     Raises BadInput if two logs have the same name, or the golden cannot be read.
     """

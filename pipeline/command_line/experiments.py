@@ -130,7 +130,7 @@ def sweep(
 ) -> None:
     """Run EXPERIMENT, or replay logs, at all points of a parameter grid, or at samples of it.
 
-    A table holds every metric at every point, with the range of the middle 90 % of runs; figures show
+    A table contains every metric at every point, with the range of the middle 90 % of runs; figures show
     the metrics as curves, or as heat maps over two parameters. Keys are written as for --set.
     """
     from fuselog.pipeline.command_line.experiment_commands import sweep_named

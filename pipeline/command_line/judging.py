@@ -167,9 +167,9 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 
     SIDES can also be logs or folders of logs, with -e for each estimator. Estimates that the logs
     already contain, such as an autopilot's, come first and are not replayed. All other sides are
-    compared with the first, metric by metric over the runs that both have, with 95 % bootstrap intervals
-    over runs. With a catalog, or with --where, --group, --workers or --scheduler, each log is replayed
-    by itself.
+    compared with the first, metric by metric over the runs that both sides have, with 95 % bootstrap
+    intervals over runs. With a catalog, or with --where, --group, --workers or --scheduler, each log is
+    replayed by itself.
     """
     from fuselog.pipeline.comparing.command import compare_candidates, compare_selection
 

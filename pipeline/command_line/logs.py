@@ -121,7 +121,7 @@ def catalog(folders: tuple[Path, ...], **options: Any) -> None:
 @recover_option
 @json_option
 def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options: Any) -> None:
-    """Estimate sensor noise from LOG, a recording at rest: white noise, random walk and more.
+    """Estimate sensor noise from LOG, recorded while stationary: white noise, random walk and more.
 
     Parameters are estimated by maximum likelihood, with intervals. The Allan deviation is computed as
     well, and fuselog reports where it departs from the model. If LOG is the output of imu_utils or
@@ -151,7 +151,7 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 @recover_option
 @json_option
 def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
-    """Estimate offsets, scales and cross terms of a sensor that LOGS show in many orientations.
+    """Estimate offsets, scales and cross terms of a sensor that was recorded in many orientations.
 
     The Earth's magnetic field and gravity have constant magnitudes, so raw readings lie on an ellipsoid.
     Hold an accelerometer still in each position. Terms that the rotations do not determine are named and
@@ -389,7 +389,7 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     """Write PATH with zero-velocity and, with --set rolling_hz=10, non-holonomic pseudo-measurements.
 
-    The model inertial uses these pseudo-measurements like sensors: a vehicle at rest has no velocity,
+    The model inertial uses these pseudo-measurements like sensors: a stationary vehicle has no velocity,
     and a vehicle that rolls on wheels moves neither sideways nor up.
     """
     from fuselog.pipeline.logs.edit import constrain as constrain_log

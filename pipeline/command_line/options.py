@@ -314,5 +314,5 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
 
 
 def replay_options(function: Callable[..., None]) -> Callable[..., None]:
-    """Add the options for reading, judging, printing and settings that all replay commands share."""
+    """Add the options that all replay commands share: for reading, judging, printing and settings."""
     return recover_option(gap_option(json_option(settings_option(set_option("estimators")(function)))))

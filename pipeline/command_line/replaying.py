@@ -1,4 +1,4 @@
-"""The commands that replay estimators over logs, for estimates, parameters or a check."""
+"""The commands that replay estimators over logs, such as replay, tune, calibrate and check."""
 
 from pathlib import Path
 from typing import Any

@@ -108,7 +108,7 @@ def measured(
 ) -> Candidate:
     """Judge the estimates of a label run by run; each of the `pairs` is a log with its estimates.
 
-    Estimates in the order of measurement also get an age, which is zero.
+    Estimates in the order of measurement have no metric of their age; an age of zero is added for them.
     """
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []

@@ -68,7 +68,7 @@ class Paired(NamedTuple):
         where: start and end of the time span that contributes most to the difference, in s since the
             run's epoch; None if there is no such span.
         stressed: largest change of either candidate's metric under changes that should not matter.
-        unit: what a run is, if it is not a single run.
+        unit: "run", or "group" if the difference is over groups of logs.
     """
 
     first: str
@@ -410,7 +410,7 @@ def differences_of(
 
 
 def _with_ages(group: Sequence[Candidate]) -> list[Candidate]:
-    """Leave the age of estimates out if it is zero for all candidates."""
+    """Omit the age of estimates if it is zero for all candidates."""
     rows = pd.concat([each.rows for each in group])
     if (rows["value"][rows["quantity"] == AGE] > 0.0).any():
         return list(group)
@@ -517,7 +517,7 @@ def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
 def _where(
     over_time: pd.DataFrame, quantity: str, case: str, found: Difference
 ) -> tuple[float, float] | None:
-    """Find the consecutive spans that contribute most to a significant difference; otherwise None."""
+    """Find the consecutive spans that contribute most to a difference; None if it is insignificant."""
     if over_time.empty or found.verdict not in DIFFER:
         return None
     own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]

@@ -40,7 +40,7 @@ def compare_over_logs(
 
 
 def _in_common(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per log, estimator, case and metric that all estimators with the metric have."""
+    """Return the rows of each log, case and metric that no estimator with this metric lacks."""
     keys = ["log", *(name for name in ("group", "estimator", "case") if name in table)]
     metrics = [name for name in table if name not in OTHERS]
     rows = table.melt([*keys, *(name for name in SIZES.values() if name in table)], metrics, "quantity")

@@ -101,7 +101,7 @@ def _description(made: CFilter, reading: Reading) -> str:
 
 
 def _parameters(made: CFilter) -> list[tuple[str, list[str], float]]:
-    """List the names of the parameters, the C variables that hold each, and the values.
+    """List the parameters' names, the C variables that contain each parameter, and the values.
 
     A parameter whose value differs between the motion and sensors is listed separately for each.
     """

@@ -54,7 +54,7 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """An upper bound of a step's cost: the more expensive side of every branch, and the most iterations.
+    """An upper bound of a step's cost: the costlier alternative of every branch, and most iterations.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
@@ -101,7 +101,7 @@ def _cost_of_step(step: Step) -> Cost:
 
 
 def cost_of(outputs: Sequence[Node], known: Collection[Node] = ()) -> Cost:
-    """Count the operations of a graph; of two sides of a branch, the more expensive one counts."""
+    """Count the operations of a graph; for a branch, count those of the more expensive alternative."""
     choice_of, levels = choices(outputs, known)
     on_level: dict[Level, list[Node]] = {}
     for node in needed(outputs, known):
@@ -135,7 +135,7 @@ def _traced(function: Any, *arguments: Argument) -> Cost:
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
-    """Count the cost of loops in the motion (0) or a sensor: over samples, for noise and for factors."""
+    """Count the cost of the motion's (0) or a sensor's loops: those for samples, noise and factors."""
     step = made.steps.predict if part == 0 else made.steps.innovate[part - 1]
     sampled, t = made.steps.sampled[part], made.tangent
     costs = [_entering(step, size)]
@@ -158,7 +158,7 @@ def _entering(step: Step, size: int) -> Cost:
 
 
 def _sampling(sampled: SampledFunction) -> Cost:
-    """Count the cost of evaluating a function at samples and of its mean, for the most iterations."""
+    """Count the cost of evaluating a function at samples and averaging, with the most iterations."""
     count, size = sampled.points.shape
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
@@ -189,7 +189,7 @@ def _narrowing(sampled: SampledFunction) -> Cost:
 
 
 def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
-    """Count the cost of a step at every sample; operations that all samples share count once."""
+    """Count the cost of a step at every sample; operations that all samples share are counted once."""
     outputs = list(step.outputs.values())
     same = steady(outputs, lambda at: at[0] in varying)
     return added(cost_of(same), *[cost_of(outputs, same)] * count)

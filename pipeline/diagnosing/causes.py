@@ -1,6 +1,6 @@
-"""Search for the most likely causes of an inconsistent filter, the faults with the largest gains.
+"""Search for the most likely causes of a filter's inconsistency: the faults with the largest gains.
 
-Faults that a log does not distinguish are called names of one cause.
+Faults that a log does not distinguish are treated as different names of one cause.
 """
 
 import re
@@ -134,7 +134,7 @@ def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
 
 
 def least_gain(count: int, size: int = 1) -> float:
-    """Compute the gain that the best of `count` hypotheses exceeds by chance in FALSE_ALARMS of logs.
+    """Compute the gain that the best of `count` hypotheses exceeds by chance at the rate FALSE_ALARMS.
 
     Twice the gain is chi-square distributed with `size` degrees of freedom, one for each estimated value
     (Wilks); the probability is divided by `count` (Bonferroni).
@@ -147,7 +147,7 @@ class Found(NamedTuple):
 
     Attributes:
         names: faults that the log does not distinguish, with their values; the first one is corrected.
-        over: the trial to which gains are relative, while the cause is the only one.
+        over: the trial to which gains are relative, as long as this is the only cause.
         contenders: faults that gained nearly as much before other causes were corrected.
     """
 
@@ -186,10 +186,10 @@ def find_causes(
 ) -> tuple[list[Cause], list[Tried], list[Cause]]:
     """Find at most `most` causes, the gain of each hypothesis, and a cause in doubt.
 
-    Each cause has the largest gain in log-likelihood, minus the cost of its values, after all causes
-    before it are corrected. Several causes are fitted together. The gains of hypotheses are computed in
-    the unaltered log. A cause is in doubt if the parts of the log disagree about its value although it
-    would be the next cause, or gains more than the last one.
+    Each cause is the fault with the largest gain in log-likelihood minus the cost of its values, after
+    all causes before it are corrected. Several causes are fitted together. The gains of hypotheses are
+    computed in the unaltered log. A cause that would be the next one, or that gains more than the last
+    one, is in doubt if the parts of the log disagree about its value.
     """
     search = _Search(likelihood, base, most, len(tried))
     peaks = search.peaks(base, tried)
@@ -557,7 +557,7 @@ def _likeliest(
 
 
 def _takes_all(at: Peak, of: Hypothesis) -> bool:
-    """Test whether a fault explains part of any other fault: understated noise, or outliers."""
+    """Test whether a fault is understated noise or outliers, which explain part of any other fault."""
     return of.kind == "outliers" or (of.kind in NOISES and at.value > 0.0)
 
 
@@ -603,7 +603,7 @@ def _is_other_name(pair: Named, first: Named) -> bool:
 
 
 def _is_early(pair: Named) -> bool:
-    """Test whether a fault makes a topic early or its clock slow; usually another topic is late."""
+    """Test whether a fault makes a topic early or its clock slow (usually, another topic is late)."""
     at, of = pair
     is_of_stamps = of.kind in ("delay", "clock drift") and isinstance(at.value, float)
     return is_of_stamps and of.already + at.value < 0.0
@@ -698,7 +698,7 @@ def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Num
 
 
 def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -> list[Cause]:
-    """Add to the causes their gains over each half of the log; a real fault is in both."""
+    """Add to the causes their gains over each half of the log; a real fault is in both halves."""
     trials = [base] * (len(causes) + 1)
     for place, cause in enumerate(causes):
         trials = [

@@ -171,7 +171,7 @@ def on_the_rest(
     advised: Mapping[str, Any],
     end_ns: int,
 ) -> str:
-    """Compute the gain of advice over the rest of the log, and format it as the end of a sentence.
+    """Compute the gain from advice over the rest of the log, and format it as the end of a sentence.
 
     Args:
         source: the whole log.

@@ -1,7 +1,7 @@
 """Findings on unusual innovations and estimates, and on the log itself.
 
-The thresholds are listed here with their meaning. The thresholds are far from values that chance causes
-in a log that follows its model.
+The thresholds are listed here with their meaning. The thresholds are far from the values that occur by
+chance in a log that follows its model.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -58,7 +58,7 @@ class Supposed(NamedTuple):
         return list(self.value) if self.of.size > 1 else [self.value]
 
     def number(self, numbers: Sequence[float]) -> Number:
-        """Convert a vector's entries to a value of the fault; a fault without values keeps its own."""
+        """Convert a vector's entries to the fault's value; keep that value if there are no entries."""
         if not self.of.tried:
             return self.value
         return tuple(map(float, numbers)) if self.of.size > 1 else float(numbers[0])
@@ -201,7 +201,7 @@ class _Together:
         return np.abs(point) >= (1.0 - NEAR) * limits
 
     def beside_jumps(self) -> Floats:
-        """Return the start (k,), moved slightly if the log-likelihood jumps there.
+        """Return the start (k,) of a search, moved slightly if the log-likelihood jumps there.
 
         A delay moves the first or the last message out of the log; slopes across such a jump have no
         meaning.

@@ -1,9 +1,9 @@
 """The log-likelihood of replays, from which the gains of corrected settings and logs are computed.
 
 A trial is a log with an estimator's settings, in which faults may be corrected. All trials have the same
-measurements, and start by the same rule. In some trials, the filter cannot score some measurements, for
-example a fix that a delay moves beyond the odometry's span. These measurements are scored by a broad
-model, in which successive messages differ by the amount that is usual for their topic.
+measurements, and their estimators start by the same rule. In some trials, the filter cannot score some
+measurements, for example a fix that a delay moves beyond the odometry's span. These measurements are
+scored by a broad model, in which successive messages differ by the amount that is usual for their topic.
 
 A measurement that the gate rejects is scored as an outlier. Outliers are uniform in the volume that the
 innovations span, and have the observed share of outliers as their probability. Without a gate there are
@@ -235,7 +235,7 @@ class Likelihood:
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
-        """Compute log-likelihoods of equal shares of the measurements, each given the shares before."""
+        """Compute log-likelihoods of equal shares of the measurements, each given the earlier shares."""
         until = []
         for share in np.arange(1, count + 1) / count:
             found = [self._of_start(scored, part, share) for part in parts]
@@ -292,8 +292,8 @@ def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) 
     """Find the span in which a filter can score measurements, and the time step of its controls.
 
     Measurements at most one step before the span are scored at its start, and measurements at most two
-    steps after the span are scored as well. Thus messages that a small delay moves across an end stay
-    comparable.
+    steps after the span are scored as well. Thus messages that a small delay moves across an end of the
+    span stay comparable.
     """
     begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
     for topic in controls:
@@ -324,8 +324,8 @@ def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
 def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream) -> dict[str, float]:
     """Limit the broad likelihood of topics that a filter predicts better than its variances suggest.
 
-    For a body at rest, the broad model is more precise than a conservative filter. Without the limit, a
-    delay would gain by moving messages out of the scored span.
+    For a stationary body, the broad model is more precise than a conservative filter. Without the limit,
+    a delay would gain by moving messages out of the scored span.
     """
     found = {}
     is_known = np.isfinite(innovations["innovation"])
@@ -341,8 +341,8 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
     """Test which innovations are in the first share of their sensor's innovations.
 
-    A share of the innovations of all sensors together would select other innovations if a delay changes
-    their order.
+    If the share were taken of the innovations of all sensors together, a delay that changes their order
+    would change the selection.
     """
     known = np.isfinite(innovations["innovation"])
     sensor = known @ 2.0 ** np.arange(known.shape[1])
@@ -388,7 +388,7 @@ def _alike(bound: Sequence[Bound]) -> Hashable:
 
 
 def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator for the runs of all trials, `count` per trial, with the trial's parameters."""
+    """Make one estimator for the runs of all trials: `count` runs with the parameters of each trial."""
     first = bounds[0]
     alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
     if all(each is first for each in bounds):

@@ -141,7 +141,7 @@ def _is_lopsided(low: float, best: float, high: float) -> bool:
 
 
 def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
-    """Compute the maximum of the parabola through zero and both sides; infinity without a maximum."""
+    """Compute the maximum of the parabola through zero and both sides, or infinity if it has none."""
     if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
         return np.inf
     low, high = sorted(sides)

@@ -1,4 +1,4 @@
-"""The sentences of a diagnosis in order, on causes and on findings in the log itself."""
+"""The ordered sentences of a diagnosis, on causes and on findings in the log itself."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,7 +59,7 @@ def names_of(found: Finding) -> list[tuple[Kind, str]]:
 def ranked(
     causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
 ) -> list[Finding]:
-    """Order findings: stamps, causes, and other findings that need no filter.
+    """Order findings: those on stamps, then causes, then other findings that need no filter.
 
     A finding with a setting that corrects it comes before causes that are only consequences of the
     finding, such as noise. Findings that are among the causes, or whose settings are already advised,

@@ -1,9 +1,10 @@
 """A study of diagnosing, which plants faults in logs and settings and counts how often they are named.
 
-Faults that cannot be distinguished count as one kind, such as a bearing's bias and its sensor's rotated
-frame. A rotation or a drift is only visible between two frames or clocks, so either may be named. The
-gain in log-likelihood from removing a fault shows whether it is visible at all. Some faults are
-invisible, such as a delay of the only sensor of a vehicle without controls.
+Faults that cannot be distinguished, such as a bearing's bias and its sensor's rotated frame, are treated
+as one kind. A rotation is only visible between two frames, and a drift only between two clocks, so
+either of the two may be named. The gain in log-likelihood from removing a fault shows whether it is
+visible at all. Some faults are invisible, such as a delay of the only sensor of a vehicle without
+controls.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -293,7 +294,7 @@ def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.Series:
-    """Count the runs in which the fault matters, is named, and has its size covered."""
+    """Count runs in which the fault matters, in which it is named, and in which its size is covered."""
     counted = rows[rows["worth"] >= WORTH]
     return pd.Series(
         {

@@ -175,7 +175,7 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
     """Choose the extremes of each span as rows to draw, so that no outlier is lost.
 
     Args:
-        values: (n,); infinite and NaN values count as 0.
+        values: (n,); infinite and NaN values are treated as 0.
         most: the largest number of rows; if there are fewer values, all are chosen.
 
     Returns:
@@ -190,9 +190,9 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
 
 
 def typical_time_s(case: Case) -> float | None:
-    """Choose the second whose share of NEES above the interval is closest to the whole run's share.
+    """Choose the one-second span whose share of NEES above the interval is closest to the whole run's.
 
-    If there are several such seconds, choose the one closest to the middle of the run. Without truth,
+    If there are several such spans, choose the one closest to the middle of the run. Without truth,
     return None.
     """
     if case.errors is None or len(case.errors.nees) == 0:
@@ -209,7 +209,7 @@ def typical_time_s(case: Case) -> float | None:
 
 
 def instant_of(case: Case | None) -> float:
-    """Return the first instant of the lens, which is in a typical second or the middle of the run."""
+    """Return the instant that the lens shows first, in a typical second or in the middle of the run."""
     if case is None or not len(case.time_s):
         return 0.0
     found = typical_time_s(case)

@@ -340,7 +340,7 @@ class Page:
         self._work.ask(work)
 
     def _rest(self, along: Callable[..., None]) -> None:
-        """Show the likelihood and update the plots' accessible names when a slider comes to rest."""
+        """Show the likelihood and update the plots' accessible names when a slider stops moving."""
         self._along = along
         self._along(case=self._chosen_case())
         self.plots["likelihood"].show_if_drawn()

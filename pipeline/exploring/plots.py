@@ -68,7 +68,7 @@ class Plot:
         self.figure.title.text = title
 
     def name(self) -> None:
-        """Set the title for screen readers; this is slow, so it waits until a slider rests."""
+        """Set the title for screen readers; this is slow, so it waits until a slider stops moving."""
         self.figure.html_attributes = {"role": "img", "aria-label": self.figure.title.text}
 
     def show_if_drawn(self) -> None:
@@ -357,7 +357,7 @@ def show_likelihood(
 
 
 def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
-    """Scale the axis of errors so that all except rare errors are visible, including pinned replays."""
+    """Scale the error axis so that all except rare errors are visible, also those of pinned replays."""
     most, ends = 0.0, [0.0]
     for each in played.values():
         one = each.cases.get(case)

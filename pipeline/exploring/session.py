@@ -155,7 +155,7 @@ class Session:
     Attributes:
         source: the log, with the requested alterations.
         filters: settings by label.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: the longest gap over which the truth is interpolated.
         estimated: parameters that are part of the state, with their initial standard deviations.
     """
 
@@ -366,7 +366,7 @@ def open_session(
         log: a path, an opened log, or a recording.
         estimators: the filters, in the form that `replay` accepts.
         set: parameters of the filters and alterations of topics, in the form that `replay` accepts.
-        gap_limit_s: the truth is not interpolated over longer gaps.
+        gap_limit_s: the longest gap over which the truth is interpolated.
 
     Raises BadInput if there are several logs or too many filters, or if one cannot follow the log.
     """

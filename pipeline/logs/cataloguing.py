@@ -1,4 +1,4 @@
-"""The rows of catalogs, from the summaries of logs, and the logs that a command selects."""
+"""Rows of catalogs, made from the summaries of logs, and the logs that a command selects."""
 
 import json
 import os
@@ -51,7 +51,7 @@ CATALOG = Kind(SUFFIX, "a catalog of fuselog", is_written)
 
 @dataclass(frozen=True)
 class Describing:
-    """The description of a log for its row in a catalog.
+    """The task of describing a log for its row in a catalog.
 
     Attributes:
         deep: whether the messages are read as well, for gaps, findings and the hash.
@@ -97,7 +97,7 @@ class Describing:
 
 
 def _deep(log: Path, source: LogSource) -> Row:
-    """Return what only the messages of a log show."""
+    """Return those properties of a log that only its messages show."""
     found = lint_source(source)
     gaps = [each.value for each in found if each.kind == "gap"]
     findings = [
@@ -171,7 +171,7 @@ def catalog(
     """Describe logs in a table with a row per log, from their summaries.
 
     Args:
-        paths: folders of logs, which are searched with the folders in them; logs; or one catalog.
+        paths: folders, which are searched for logs together with their subfolders; logs; or one catalog.
         out: the catalog to write, a Parquet file; if it exists, only new and changed logs are read.
         deep: also read the messages, for gaps, the findings of `lint` and a hash of the file.
         where: a condition on columns, such as "fix_rate_hz > 4 and duration_s > 60".
@@ -234,8 +234,8 @@ def _row(log: str, found: Row, state: tuple[int, int, str], deep: bool) -> Row:
 def select(paths: Sequence[Path], where: str | None = None, group: str | None = None) -> Selection:
     """Find the logs of folders and catalogs, and single logs, that meet a condition.
 
-    Folders are searched with the folders in them, as by `catalog`. A log that several paths name is used
-    once, with the columns of the first path.
+    Folders are searched together with their subfolders, as by `catalog`. A log that is named by several
+    paths is used once, with the columns of the first path.
 
     Args:
         paths: logs, folders of logs, and catalogs.
@@ -257,7 +257,7 @@ def select(paths: Sequence[Path], where: str | None = None, group: str | None = 
 
 
 def logs_meant(paths: Sequence[Path], where: str | None = None) -> Selection:
-    """Find the logs that a command uses together: all logs in folders, or a selection of catalogs."""
+    """Find the logs that a command uses together: all logs in folders, or a selection from catalogs."""
     if where is None and not any(map(is_catalog, paths)):
         return Selection([log for path in paths for log in logs_in(path)])
     return select_together(paths, where)

@@ -19,7 +19,8 @@ class ConstraintParameters(Parameters):
         standing_hz: rate of messages that state whether the body is at rest; 0 for no messages.
         rolling_hz: rate of messages that state that the body, like a wheeled one, moves neither sideways
             nor up; 0 for no messages.
-        window_s: length of the window in which rest is detected; the window ends at the current time.
+        window_s: length of the window, ending at the current time, in which the body is tested for being
+            at rest.
         still_mps2: threshold for the standard deviation of the specific force. The body is at rest if
             both quantities are below their thresholds in the window.
         still_radps: threshold for the root mean square of the turn rate.

@@ -39,7 +39,7 @@ def is_prior(log: Log, topic: str) -> bool:
 
 @dataclass
 class Thinner:
-    """A filter that keeps the first stamp of every interval of a number of stamps or of a duration.
+    """A filter that keeps the first stamp of each interval, which is a number of stamps or a duration.
 
     `stamps` is the number of stamps in earlier blocks, and `last` is the index of the last stamp's
     interval.

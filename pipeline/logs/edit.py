@@ -341,7 +341,7 @@ def _shifted(stream: Stream, offset_ns: int) -> Stream:
 
 
 def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
-    """Return the new names of topics by old name, including topics that only metadata mention."""
+    """Return the new names of topics by old name, including topics that occur only in the metadata."""
     stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
     known = [
         *log.topics,

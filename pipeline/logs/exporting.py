@@ -196,7 +196,7 @@ def _new(to: To) -> Kind:
 
 
 def _lacking(empty: Stream, to: To) -> str:
-    """Return why a stream, regardless of its messages, has no poses; priors are not estimates."""
+    """Return why a stream cannot have poses, whatever its messages; priors are not estimates."""
     schema = empty.schema.full_name
     if to in BAGS and schema == schemas.GEODETIC_FIX.full_name:
         return ""

@@ -69,7 +69,7 @@ def mirrors(stream: Stream) -> Iterator[Mirror]:
 
 
 def left_out(log: Log) -> str:
-    """Describe the streams of a log without a Foxglove mirror, or return "" if all have one."""
+    """Describe those streams of a log that have no Foxglove mirror; return "" if all have one."""
     shown = {topic.metadata[MIRROR_OF] for topic in log.mirrors.values()}
     topics = [name for name, topic in log.topics.items() if topic.messages and name not in shown]
     return sentence_of(topics) if topics else ""

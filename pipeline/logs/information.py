@@ -107,7 +107,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 def main_span(log: Log) -> tuple[int, int] | None:
-    """Return the span of most messages if the others are years away from it; otherwise return None."""
+    """Return the time span of most messages if all others are years away; otherwise return None."""
     try:
         return LogSource(log).main_span
     except BadInput:
@@ -115,7 +115,7 @@ def main_span(log: Log) -> tuple[int, int] | None:
 
 
 def _findings(log: Log) -> list[Finding] | None:
-    """Check the log with lint; None if it is read by ranges; warn if it is damaged."""
+    """Check the log with lint and warn of damage; return None if it is read by ranges from a URL."""
     if isinstance(log.path, RemotePath):
         return None
     try:
@@ -160,7 +160,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
 def estimators_that_fit(log: Log) -> dict[str, list[str]]:
     """Find the estimators without a model, such as trackers, that fit a log, with their topics.
 
-    Values are not considered if the log is read by ranges.
+    Values are not considered if the log is read by ranges from a URL.
     """
     sources = [] if isinstance(log.path, RemotePath) else [LogSource(log)]
     found: dict[str, list[str]] = {}
@@ -295,7 +295,7 @@ def _quoted(path: Path) -> str:
 
 
 def rate(messages: int, duration_s: float) -> float | None:
-    """Return the messages per second of a topic; None without a duration."""
+    """Return the messages per second of a topic, or None if its messages span no time."""
     return messages / duration_s if messages > 1 and duration_s > 0 else None
 
 
@@ -309,7 +309,7 @@ def _say_run(run: RunMetadata) -> None:
 
 
 def _changed(run: RunMetadata) -> dict[str, Any]:
-    """Return the parameters that differ from the recorder's defaults, or all if it is unknown."""
+    """Return the parameters that differ from the recorder's defaults; all if the recorder is unknown."""
     try:
         described = describe(load("recorders", run.scenario, Recorder).parameters)
     except BadInput:

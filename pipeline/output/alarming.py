@@ -68,7 +68,7 @@ class _Range(NamedTuple):
 
 
 def unseen(judge: Judge) -> Iterator[Finding]:
-    """Find errors that innovations do not show: the NEES is too large, also relative to a usual NIS."""
+    """Find errors that innovations do not show: the NEES is too large, also in relation to the NIS."""
     for key, (_, high) in judge.bounds.items():
         estimator, quantity, case = split_metric(key)
         nees, nis = judge.metrics[key], judge.metrics.get(metric_key(estimator, NIS, case), np.inf)
@@ -303,7 +303,7 @@ def _of_measurements(coverage: Sequence[Row]) -> Iterator[Finding]:
 
 
 def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find estimators that cannot be compared because their gates differ and rejected measurements."""
+    """Find estimators that cannot be compared because different gates rejected measurements."""
     gates = {
         label: float(values["gate_probability"])
         for label, values in parameters.items()

@@ -143,7 +143,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Assign a colour to every label; `first` labels get theirs first, so charts can share them."""
+        """Assign a colour to each label, first to those in `first`, so that charts can share colours."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}

@@ -428,7 +428,7 @@ class _Reader(NamedTuple):
     def _compare(
         self, op: type[ast.cmpop], one: ast.expr, other: ast.expr, *, wanted: bool
     ) -> _Comparison:
-        """Compare two sides entry by entry; the measured side is the subject, the other the limit."""
+        """Compare two sides entry by entry; the measured side is the subject, the other is the limit."""
         if op in _MIRRORED and not self._is_measured(one) and self._is_measured(other):
             op, one, other = _MIRRORED[op], other, one
 

@@ -117,7 +117,7 @@ def run_written(path: Path) -> RunMetadata | None:
 
 
 def replaced(path: Path, before: RunMetadata | None, now: RunMetadata | None) -> str:
-    """Describe how the settings of a replaced log differ from the new ones; empty if they agree."""
+    """Describe how the settings of a replaced log differ from the new ones; return "" if they agree."""
     if before is None or now is None:
         return ""
     old, new = _settings_of(before), _settings_of(now)
@@ -142,7 +142,7 @@ def _shown(settings: Mapping[str, str], name: str) -> str:
 
 
 def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
-    """Return the run of a log that fuselog wrote and, unless `is_changed`, did not change; else None."""
+    """Return the run of a log that fuselog wrote (or edited, if `is_changed`); otherwise return None."""
     with suppress(BadInput):
         run = open_log(path).run if _is_log(path) else None
         return run if run is not None and (CHANGES in run.notes) == is_changed else None

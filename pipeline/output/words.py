@@ -178,7 +178,7 @@ class Scale(NamedTuple):
 
 
 def scale(unit: str, *values: float | None) -> Scale:
-    """Choose a unit for values shown together, in which the smallest has a digit before the point.
+    """Choose a common unit in which even the smallest value has a digit before the decimal point.
 
     >>> scale("m", 0.0162, 0.414).with_unit(0.414), scale("rad", 0.00544).with_unit(0.00544)
     ('41.4 cm', '0.312°')
@@ -246,7 +246,7 @@ def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Format numbers together, with the decimals of the largest; separately if they differ greatly.
+    """Format numbers with the same decimals as the largest, or separately if they differ greatly.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])

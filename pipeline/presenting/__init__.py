@@ -1,1 +1,1 @@
-"""Runs of results and folders of logs, reviewed as a dataset in Rerun; begin with `command`."""
+"""Review of runs, from results or folders of logs, as a dataset in Rerun; begin with `command`."""

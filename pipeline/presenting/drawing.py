@@ -56,7 +56,7 @@ def draw(segment: Segment, gap_limit_s: float, folder: Path) -> list[str]:
 
 
 def worst_times(judge: Judge) -> dict[tuple[str, str], float]:
-    """Return by estimator and case when its NEES or, without NEES, its error is largest, in s."""
+    """Return the time (s) of the largest NEES, or error if there is no NEES, by estimator and case."""
     found = [(each.estimator, each.case) for each in judge.moments]
     worst = {
         key: worst_of(each for each in judge.moments if (each.estimator, each.case) == key)
@@ -130,9 +130,9 @@ def _open_part(part: Part) -> tuple[Recorded, Recorded]:
 
 
 def runner_of(folder: Path, result: Result, point: int | None = None) -> Runner:
-    """Return what replays the runs of a result, or those at one point of a sweep.
+    """Return the runner that replays the runs of a result, or of one point of a sweep.
 
-    Raises BadInput if the settings do not state the runs and the estimators, or logs are gone.
+    Raises BadInput if the settings do not state the runs and the estimators, or if logs no longer exist.
     """
     runner = runner_again(folder, result)
     if point is None:

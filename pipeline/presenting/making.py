@@ -46,7 +46,7 @@ _READER = TypeAdapter(Runs)
 
 
 def runs_at(paths: Sequence[Path], gap_limit_s: float, *, recover: bool = False) -> Runs | None:
-    """Return the runs at paths, as they were listed before or from the results or logs.
+    """Return the runs at paths, from an earlier list if it is valid, else from the results or logs.
 
     Args:
         paths: results, folders of logs, or logs and estimates logs; see `list_runs`. A comparison is
@@ -232,7 +232,7 @@ def _refuse(place: Path) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can represent of a path, a segment or a part."""
+    """Convert a path, a segment or a part to values that JSON can represent."""
     return str(value) if isinstance(value, Path) else vars(value)
 
 

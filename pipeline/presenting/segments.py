@@ -102,7 +102,7 @@ def _together(given: Sequence[Runs]) -> Runs:
 
 
 def _distinct(paths: Sequence[Path]) -> list[str]:
-    """Return the names of paths, with those of the folders above them if names are equal."""
+    """Return the names of paths, preceded by the names of their parent folders if names are equal."""
     places = [str(path.absolute()).removesuffix(".mcap").removesuffix(".estimates") for path in paths]
     parts = [Path(os.path.normpath(place)).parts for place in places]
     lengths = range(1, max(map(len, parts), default=0) + 1)
@@ -222,7 +222,7 @@ def _of_logs(path: Path, files: Sequence[Path], gap_limit_s: float, *, recover: 
 
 
 def _judged(segment: Segment, gap_limit_s: float) -> "pd.DataFrame":
-    """Judge the estimates of a segment: a row per estimator and case."""
+    """Judge the estimates of a segment; return a row per estimator and case."""
     source, estimates, _ = open_run(segment)
     if not estimates.topics:
         import pandas as pd

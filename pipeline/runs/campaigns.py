@@ -60,7 +60,7 @@ class Work(Protocol):
 
     @property
     def files(self) -> Sequence[Path]:
-        """Return the logs that it reads."""
+        """Return the logs that the work reads."""
 
     @property
     def key(self) -> str:
@@ -165,7 +165,7 @@ class Pace:
 def judge(experiment: Experiment, setting: Setting) -> Pass:
     """Replay and judge all runs of an experiment cell by cell; write files to the setting's folder.
 
-    Raises BadInput if an estimator cannot replay any run, or workers die repeatedly.
+    Raises BadInput if an estimator cannot replay any run, or if workers die repeatedly.
     """
     cells = cells_of(experiment, setting)
     if len(cells) == 1 or setting.checkpoints is None:  # nothing to distribute or to resume

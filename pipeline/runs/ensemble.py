@@ -167,7 +167,7 @@ def replay_parts(
 ) -> Pass:
     """Replay an ensemble in parts, and send blocks to estimates logs, judge and timeline.
 
-    Memory holds the current blocks, and those runs of the part that were in memory before.
+    Memory contains only the current blocks, and those runs of the part that were in memory before.
 
     Args:
         parts: the runs.

@@ -125,7 +125,7 @@ def inline_pool() -> Iterator[WorkerPool]:
 
 @contextmanager
 def threads() -> Iterator[WorkerPool]:
-    """Open a pool of threads, one per core for kernels, for work whose kernels run in parallel."""
+    """Open a pool with a thread for each core that kernels may use, for work with parallel kernels."""
     count = core_count()
     with InlineExecutor() if count == 1 else ThreadPoolExecutor(count) as pool:
         yield WorkerPool(pool, count)
@@ -179,7 +179,7 @@ def _use_one_core() -> None:
 class DaskExecutor(Executor):
     """An executor that submits work to a Dask client, whose worker threads use one core each.
 
-    The limit of one core is applied with each task, so it also holds for workers that start later or
+    The limit of one core is applied with each task, so it also applies to workers that start later or
     restart.
     """
 

@@ -291,7 +291,7 @@ def experiment_of_logs(
 
 
 def _logs_of(stated: Logs, folder: Path, where: str) -> Logs:
-    """Find the logs that files, patterns and a catalog name."""
+    """Find the logs that are named by files, patterns and a catalog."""
     files = _found(stated.files, folder, where)
     if stated.catalog is None:
         if stated.where is not None:
@@ -307,7 +307,7 @@ def _logs_of(stated: Logs, folder: Path, where: str) -> Logs:
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
-    """Find the files that match patterns, without duplicates; raise BadInput if one has no match."""
+    """Find the files that match patterns, without duplicates; raise BadInput if a pattern has none."""
     files: dict[str, None] = {}
     for pattern in patterns:
         place = located(pattern)

@@ -78,12 +78,12 @@ def origins_of(
     order: Clock,
     gap_limit_s: float,
 ) -> list[Origin]:
-    """Find the initial state of each run; return [] if no start is requested.
+    """Find the initial state of each run; return [] if no initial state is requested.
 
     Args:
         sources: the runs.
         origins: "truth", or the estimates log of an earlier replay of each run.
-        sigmas: standard deviations by component, for starts from the truth; see `from_truth`.
+        sigmas: standard deviations by component, for initial states from the truth; see `from_truth`.
         order: the clock of the replay.
         gap_limit_s: the longest gap over which the truth is interpolated.
 
@@ -153,7 +153,7 @@ def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clo
 
 
 def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
-    """Start a run from its truth.
+    """Take a run's initial state from its truth.
 
     The covariance is the one of the log's prior. `sigmas` replace the standard deviations of some
     components, which are then uncorrelated with all others.
@@ -162,7 +162,7 @@ def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping
 
 
 def from_estimates(estimates: Source) -> Origin:
-    """Start a run from the last mean and covariance before the start, taken from an earlier replay.
+    """Take the initial state from an earlier replay: the last mean and covariance before the start.
 
     The estimate with the same label is used, or else the only estimate with the prior's components.
     """

@@ -88,7 +88,7 @@ def _digest(path: Path) -> str:
 def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: str) -> dict[str, bool]:
     """Test for each recording, by name, whether these files belong to it.
 
-    Raises BadInput with `where` if a recording has no hash.
+    Raises BadInput, naming `where`, if a recording has no hash.
     """
     digests = {name: recording.digest_of(files) for name, recording in recordings.items()}
     for name, digest in digests.items():

@@ -67,8 +67,8 @@ def record_ensemble(
 ) -> Ensemble[MemorySource]:
     """Record `runs` runs of a scenario, each with its own random stream of `seed`.
 
-    Raises BadInput if the size of the first run shows that memory cannot hold all runs, or if it cannot
-    hold the sums over time that judging them needs.
+    Raises BadInput if the size of the first run shows that the runs, or the sums over time needed to
+    judge them, do not fit into memory.
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()

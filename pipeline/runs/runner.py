@@ -54,7 +54,7 @@ class Runner:
 
         Args:
             parameters: scenario parameters that replace the experiment's.
-            seed: the seed of the runs, the seed of the runs, by default the experiment's.
+            seed: the seed of the runs, by default the experiment's.
             first_run: the number of the first run.
             runs: number of runs, by default the experiment's.
 
@@ -140,7 +140,7 @@ class Runner:
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """Replay each of the `cases`, which map names to different scenario parameters, as `run` does.
+        """Replay each case, as `run` does; `cases` maps names to different scenario parameters.
 
         Files are written to a folder per case. The first case's timeline is also the experiment's
         timeline.

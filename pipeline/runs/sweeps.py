@@ -1,4 +1,4 @@
-"""Sweeps, which run an experiment at many points of its parameters, on a grid or at samples."""
+"""Sweeps, which run an experiment at many points of its parameters, on a grid or sampled."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""An estimator over runs in memory, for repeated replays with other settings or altered runs."""
+"""An estimator with runs in memory, for repeated replays with other settings or altered runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """An estimator with its settings, over runs in memory that are replayed together.
+    """An estimator with its settings, and the runs in memory that it replays together.
 
     Attributes:
         label: the estimator's label.

@@ -69,7 +69,7 @@ def logs_under(folder: Path) -> Iterator[str]:
 
 
 def _is_made(folder: Path) -> bool:
-    """Test whether a folder is a result, or belongs to an unfinished or a viewed one."""
+    """Test whether a folder is a result, or belongs to an unfinished result or to a viewed one."""
     return folder.suffix in (".unfinished", ".segments") or (folder / "result.json").is_file()
 
 
@@ -131,7 +131,7 @@ def read_catalog(path: Path) -> "pd.DataFrame":
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> "pd.DataFrame":
-    """Make a table with the columns of a catalog, and those that rows have in addition."""
+    """Make a table with the columns of a catalog, and any additional columns of the rows."""
     import pyarrow as pa
 
     table = pa.Table.from_pylist(rows, schema())
@@ -201,7 +201,7 @@ def _seen(log: str, path: Path) -> str:
 
 
 def require_unchanged(table: "pd.DataFrame", catalog: Path) -> None:
-    """Raise BadInput if a log has another state than in its catalog."""
+    """Raise BadInput if the state of a log differs from the state in its catalog."""
     now = map(state_of_log, table["log"])
     then = zip(table["size_bytes"], table["modified_ns"], table["version"], strict=True)
     changed = [log for log, a, b in zip(table["log"], now, then, strict=True) if a not in (b, GONE)]
@@ -216,9 +216,9 @@ def require_unchanged(table: "pd.DataFrame", catalog: Path) -> None:
 def with_columns(table: "pd.DataFrame") -> "pd.DataFrame":
     """Add the columns that conditions may name: of each topic, model, parameter and note.
 
-    The topic `/robot1/odometry` has `robot1_odometry_messages` and `robot1_odometry_rate_hz`, the model
-    `robot` has `fits_robot`, the parameter `speed_mps` of the recorder `run_speed_mps`, and the note
-    `site` has `note_site`. A name that two of them would have is left out.
+    The topic `/robot1/odometry` adds `robot1_odometry_messages` and `robot1_odometry_rate_hz`, the model
+    `robot` adds `fits_robot`, the recorder's parameter `speed_mps` adds `run_speed_mps`, and the note
+    `site` adds `note_site`. A name that two of these columns would have is left out.
     """
     import pyarrow as pa
 
@@ -236,7 +236,7 @@ def with_columns(table: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def _without(name: str) -> Any:
-    """Return the value of an added column for a log without the topic or model."""
+    """Return the value of an added column for a log that lacks the topic or model."""
     return False if name.startswith("fits_") else 0 if name.endswith("_messages") else None
 
 

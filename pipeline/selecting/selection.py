@@ -18,7 +18,7 @@ MOST_NAMED = 3  # largest number of logs that notes name
 
 @dataclass(frozen=True)
 class Selection:
-    """The logs that the paths of a command mean.
+    """The logs to which the paths of a command refer.
 
     Attributes:
         logs: the logs that can be read.

@@ -108,7 +108,7 @@ def _check_kinds(node: ast.AST, table: "pd.DataFrame", condition: str) -> None:
 
 
 def _kind(node: ast.AST, table: "pd.DataFrame") -> str:
-    """Return what the value of an expression is; empty for a column without values."""
+    """Return the kind of an expression's value, or an empty text for a column without values."""
     import pandas as pd
 
     if isinstance(node, ast.Constant):

@@ -15,7 +15,7 @@ _FORCE, _RATE = "specific_force_mps2", "turn_rate_radps"
 
 
 class Density(NamedTuple):
-    """The noise of one field: the largest N and K of its axes, at a step."""
+    """The noise of one field: the largest N and K of its axes, and the sampling step."""
 
     white: float
     walk: float
@@ -101,7 +101,7 @@ def robot_localization(_: str, force: Density, rate: Density) -> str:
 def _of_unit(
     write: Callable[[str, Density, Density], str], mark: str = "#"
 ) -> Callable[[Densities], str]:
-    """Make a writer of an inertial unit's file; it returns "" without accelerometer or gyroscope."""
+    """Make a writer of an inertial unit's file; it returns "" if one of the two sensors is missing."""
 
     def written(found: Densities) -> str:
         force, rate = found.fields.get(_FORCE), found.fields.get(_RATE)

@@ -1,9 +1,9 @@
 """Likelihood of a sensor's noise from a Kalman filter: walk, Gauss-Markov noise, quantised angle.
 
 A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, the Gauss-Markov noise g, errors e
-of a quantised angle and white noise v. The start of the walk is exactly diffuse, so the first sample is
-not scored. Lost samples make a step longer. Columns after the samples are regressors, fitted by least
-squares.
+of a quantised angle and white noise v. The initial value of the walk is exactly diffuse, so the first
+sample is not scored. Lost samples make a step longer. Columns after the samples are regressors, fitted
+by least squares.
 """
 
 import math
@@ -60,7 +60,7 @@ def likelihood(samples: Samples, terms: Terms) -> Likelihood:
 
 
 def residuals(samples: Samples, terms: Terms) -> Floats:
-    """Compute the normalised innovations (n - 1,) of samples, without the regressors' part."""
+    """Compute the normalised innovations (n - 1,) of samples, without the effect of the regressors."""
     columns = samples.values.shape[1]
     moments, found = np.zeros((columns, columns)), np.zeros(samples.values.shape)
     _filtered(samples, terms, moments, found)

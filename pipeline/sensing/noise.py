@@ -148,7 +148,8 @@ def _numbers(stream: Stream) -> list[str]:
 def _read(source: Any, topic: str, fields: Sequence[str]) -> tuple[Grid, dict[str, Floats]]:
     """Read the grid of a topic, and those fields (components, n) that are not NaN throughout.
 
-    Every block is copied to its place, because many arrays of blocks would leave gaps in memory.
+    Every block is copied directly into the result, because many arrays of blocks would leave gaps in
+    memory.
     """
     most, count = source.topics[topic].messages, 0
     stamps, position = np.empty((2, most), np.int64)

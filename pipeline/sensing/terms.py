@@ -1,4 +1,4 @@
-"""The terms of a sensor's noise in IEEE Std 952-1997, annex C, whose Allan variances add.
+"""The terms of a sensor's noise in IEEE Std 952-1997, annex C; their Allan variances add up.
 
 The terms are white noise N, random walk K, Gauss-Markov noise with standard deviation s and time T, and
 a quantised angle Q. If the samples have the unit u, N is in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s,

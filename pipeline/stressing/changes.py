@@ -47,7 +47,7 @@ def _with(source: MemorySource, streams: Mapping[str, Stream]) -> MemorySource:
 
 
 def _group(stream: Stream) -> str:
-    """Return a topic's group; the topics of a scan form one group, with one sign and common drops."""
+    """Return a topic's group; a scan's topics form one, changed with one sign and dropped together."""
     is_of_scan = any(field.name == "scan_id" for field in stream.schema)
     return stream.topic.rpartition("/")[0] if is_of_scan else stream.topic
 
@@ -60,7 +60,7 @@ def _groups(source: MemorySource, inputs: Inputs) -> dict[str, list[str]]:
 
 
 def _shares(source: MemorySource, inputs: Inputs, seed: int) -> dict[str, float]:
-    """Draw a share from -1 to 1 for each topic, so that moved stamps of different groups differ."""
+    """Draw a factor from -1 to 1 for the topics of each group, so that groups' stamps differ."""
     groups = _groups(source, inputs)
     shares = np.linspace(1.0, -1.0, len(groups))
     drawn = np.random.default_rng(seed).permutation(shares).tolist()
@@ -132,7 +132,7 @@ def _by_an_ulp(column: NDArray[np.float64], rng: np.random.Generator) -> NDArray
 
 
 def _start(source: MemorySource, inputs: Inputs, size: float, seed: int) -> MemorySource:
-    """Move the start by START_SIGMAS sigmas of the prior along every axis, so that A = START_SIGMAS."""
+    """Shift the initial state by START_SIGMAS prior sigmas along every axis, so A = START_SIGMAS."""
     rng, streams = np.random.default_rng(seed), {}
     for topic in inputs.priors:
         stream = source.streams[topic]
@@ -165,7 +165,7 @@ def _moved(stream: Stream, kinds: list[str], by: NDArray[np.float64]) -> NDArray
 
 
 def _dropped(source: MemorySource, inputs: Inputs, _: float, seed: int) -> MemorySource:
-    """Drop messages with one draw per stamp and group, so that a scan is dropped with its detections."""
+    """Drop messages by one random draw per stamp and group: a scan is dropped with its detections."""
     streams = {}
     for number, topics in enumerate(_groups(source, inputs).values()):
         of_group = [source.streams[topic].publish_time_ns for topic in topics]

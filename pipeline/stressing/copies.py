@@ -1,4 +1,4 @@
-"""Replays of changed copies of a run, compared with the run by estimates, metrics and failures."""
+"""Comparison of a run with its changed copies, by the estimates, metrics and failures of replays."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -141,7 +141,7 @@ def compared(
 
 
 def _reach(found: Sequence[Parting], main: str) -> float:
-    """Return the largest distance of estimates, which limits the change of an RMSE at common stamps.
+    """Return the largest distance between estimates; an RMSE at common stamps cannot change by more.
 
     If a message is lost, the copy has no estimate at that message's stamp. The RMSEs of run and copy
     then also differ because run and copy cover different stamps, which must not count as a change.

@@ -1,8 +1,9 @@
-"""The distance between two replays, in sigmas of the first and in metres and degrees, and its beginning.
+"""The distance between two replays, in sigmas of the first, metres and degrees, and when it begins.
 
 A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
-replay. After a moved start, A never grows if the filter is linear: d' P^-1 d does not increase (Deyst
-and Price, Conditions for asymptotic stability of the discrete minimum-variance linear estimator, 1968).
+replay. If only the initial state is shifted, A never grows in a linear filter: d' P^-1 d does not
+increase (Deyst and Price, Conditions for asymptotic stability of the discrete minimum-variance linear
+estimator, 1968).
 """
 
 from collections.abc import Mapping, Sequence

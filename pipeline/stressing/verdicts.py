@@ -76,7 +76,7 @@ class Tried(NamedTuple):
 
     @property
     def is_wider(self) -> bool:
-        """Test whether moved stamps change a covariance by more than noise per second explains."""
+        """Test whether moved stamps change a covariance more than noise growing with time explains."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -172,7 +172,7 @@ class Stressed:
 
     @property
     def _jumps(self) -> bool:
-        """Test whether moving stamps by 1 us changes a sigma, and moving them by 0.5 us does equally."""
+        """Test whether moving stamps by 1 us and by 0.5 us changes a sigma about equally."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -180,7 +180,7 @@ class Stressed:
 
     @property
     def is_redrawn(self) -> bool:
-        """Test whether an ulp of the inputs changes a covariance; if so, stamps are not the cause."""
+        """Test whether one ulp in the inputs changes a covariance; if so, stamps are not the cause."""
         ulp = self.tried["ulp"].parting
         return ulp is not None and ulp.spread > PER_PREDICTION
 

@@ -49,7 +49,7 @@ def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
 
 
 def part_count(starts: Starts) -> int:
-    """Count the parts of a start; each part is replayed."""
+    """Count the parts into which a broad start is divided; each part is replayed."""
     return max(map(len, starts.values()), default=1)
 
 

@@ -89,7 +89,7 @@ def tune_logs(
 
 
 def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Reject or warn about logs for tuning that were probably meant to be held out.
+    """Reject, or warn about, logs for tuning that were probably meant to be held out.
 
     The shell expands `--validate test/*.mcap` to several words, and the option receives only the first.
     """

@@ -148,7 +148,7 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 
 
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
-    """Yield unit directions (m,) in which the cost rises too little, with the curvature there.
+    """Yield unit directions (m,) in which the cost rises too little, each with its curvature.
 
     The directions are eigenvectors of the curvature in useful units. The useful unit is a factor of 2.7
     for a positive parameter, and two useful standard errors for any other; for a parameter without a

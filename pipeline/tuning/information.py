@@ -1,4 +1,4 @@
-"""Information on a calibration that the motion in logs contains, computed before any search.
+"""The information that the motion in logs contains about a calibration, computed before any search.
 
 With the innovations v and their covariances S, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives of v with respect to the parameters. In useful units, a direction with an eigenvalue
@@ -151,7 +151,7 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """Compute differences of innovations (n m,), ahead minus behind, whitened as innovations in `here`.
+    """Compute differences of innovations (n m,), ahead minus behind, whitened like those in `here`.
 
     A delay changes the order of messages between topics, but never within one.
     """

@@ -520,7 +520,7 @@ def _failures(outputs: Mapping[str, Ragged]) -> list[str]:
 def until_last_measured(
     source: LogSource | MemorySource, bound: Sequence[Bound]
 ) -> LogSource | MemorySource:
-    """Cut a log a second after its last measurement if the controls continue for longer.
+    """Cut a log one second after its last measurement if the controls continue for longer.
 
     Missing estimates after this time are not a failure.
     """

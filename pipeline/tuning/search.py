@@ -123,7 +123,7 @@ def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[floa
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
-    """Return the start (k,) in coordinates, or a point of a grid between the bounds with lower cost.
+    """Return the start (k,) in coordinates, or the grid point between the bounds if its cost is lower.
 
     Raises BadInput if a bound is infinite or the grid has too many points.
     """

@@ -318,7 +318,7 @@ def _found(objective: Objective, free: Sequence[Parameter], grid: int) -> Search
 
 
 def _blocked(objective: Objective, free: Sequence[Parameter], values: Floats) -> dict[str, float]:
-    """Return the largest searched values of calibration parameters whose increase loses measurements.
+    """Return, for calibration parameters whose increase loses measurements, the largest tried values.
 
     An increase loses measurements if a delay moves a message to before the start of the filter.
     """
@@ -511,7 +511,7 @@ def _curvature(
     places: Sequence[int],
     steps: Floats,
 ) -> Floats:
-    """Compute the curvature (m, m), with double steps if the cost is corrected.
+    """Compute the curvature (m, m); if the cost is corrected, the steps are twice as long.
 
     A jump of the cost next to the point then has the same effect on the curvature as on differences of
     slopes over these steps.

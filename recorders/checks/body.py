@@ -1,8 +1,8 @@
 """The motion of a body according to its topics: positions, velocities, wheels, turns.
 
-All quantities are arrays over time, in seconds since the log's first stamp. Both held and sampled
-quantities are integrated over time, so topics without common stamps can be compared by the distances
-and turns in a window.
+All quantities are arrays over time, in seconds since the log's first stamp. Values that are valid until
+the next one, and samples, are both integrated over time, so topics without common stamps can be compared
+by the distances and turns in a window.
 """
 
 from collections.abc import Mapping, Sequence

@@ -37,8 +37,8 @@ _DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # where exact z
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find a value that stays the same far longer than usual, while other columns change.
 
-    A rounded column whose values before and after are at most two grid steps away was at rest, and not
-    frozen.
+    If the values of a rounded column before and after are at most two grid steps away, the body was at
+    rest, and the column was not frozen.
     """
     entries = list(_entries(stream))
     for field, name, column in entries:
@@ -169,7 +169,7 @@ def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find columns that are clipped at the end of a common sensor range, or at another value.
 
-    Values that are constant because the body rests, and exact zeros, are not reported.
+    Values that are constant because the body is at rest, and exact zeros, are not reported.
     """
     entries = list(_entries(stream, is_regular=False))
     for field, name, column in entries:
@@ -266,7 +266,7 @@ def resolution(values: Floats) -> float:
 
 
 def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, str, Floats]]:
-    """Yield field, name and values (n,) of each component of a measured, or only a regular, topic."""
+    """Yield field, name and values (n,) of each component, for regular or for all measured topics."""
     if stream.schema.full_name not in REGULARS if is_regular else not is_measured(stream):
         return
     for entry in stream.schema:
@@ -281,7 +281,7 @@ def _entries(stream: Stream, *, is_regular: bool = True) -> Iterator[tuple[str, 
 
 
 def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Test which runs of equal values result from rounding: both neighbours are few grid steps away."""
+    """Test which repeated values result from rounding: both neighbours are a few grid steps away."""
     steps = np.abs(np.diff(column[edges]))
     farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
     levels = np.unique(column[np.isfinite(column)])

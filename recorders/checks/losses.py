@@ -131,7 +131,7 @@ def is_measured(stream: Stream) -> bool:
 def _steps(
     stream: Stream, streams: Mapping[str, Stream]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the beginnings of steps between measurements, and their lengths in s, without outages."""
+    """Return the beginnings and lengths (s) of steps between measurements, without outages."""
     stamps_ns = np.unique(stream.publish_time_ns) if is_measured(stream) else np.empty(0, np.int64)
     steps_s = np.diff(stamps_ns) * 1e-9
     begin_ns = stamps_ns[:-1]
@@ -187,7 +187,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """Estimate the recorder's seconds per second of a topic's stamps; return None if uncertain."""
+    """Estimate the recorder's clock rate relative to a topic's stamps; return None if uncertain."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

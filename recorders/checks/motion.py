@@ -107,12 +107,12 @@ def _agree(value: float, usual: float) -> bool:
 
 
 def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Compute the angle of turns in windows according to a turn rate.
+    """Compute the angles turned in windows, by integrating a turn rate.
 
     Args:
         source: the turn rate in rad/s.
-        begin_s: (k,), beginnings of the windows, in s.
-        end_s: (k,), ends of the windows, in s.
+        begin_s: (k,), start times of the windows, in s.
+        end_s: (k,), end times of the windows, in s.
 
     Returns:
         (k,), in rad; NaN beyond the rate's stamps.
@@ -167,8 +167,8 @@ class BodyMotion:
     def delays_s(self) -> dict[str, float]:
         """Compute how late each topic's stamps are compared with most topics, if this is certain.
 
-        If two topics differ, the later one counts as delayed, since messages may be late, but never
-        early.
+        If two topics differ, the later one is assumed to be delayed, since messages may be late, but
+        never early.
         """
         late_s: dict[str, float] = {}
         if self.places is not None and self.speed_lags:
@@ -231,7 +231,7 @@ class BodyMotion:
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
-        """Compute how far positions move for each metre travelled according to a speed or velocity."""
+        """Compute the distance that positions move per metre integrated from a speed or velocity."""
         if self.places is None or source.topic == self.places.topic:
             return None
         if (moved := clear_moves(self.places)) is None:
@@ -249,7 +249,7 @@ class BodyMotion:
         return found if _agree(found.value, usual) else found._replace(likeness=0.0, spread=np.inf)
 
     def turn(self, source: Series) -> Slope | None:
-        """Compute the turn of the course per radian that is integrated from a turn rate.
+        """Compute the change of the course per radian integrated from a turn rate.
 
         If the turn rate correlates with the course without a lag, no lag is used, since half a period
         of a winding road would look like a lag. If several lags fit better, some with opposite signs,
@@ -267,13 +267,13 @@ class BodyMotion:
         return ratio if is_known else None
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
-        """Compute how much a heading turns for each radian turned according to a turn rate."""
+        """Compute the change of a heading per radian integrated from a turn rate."""
         angles = Series("", "", orientation.times_s, heading(orientation.values))
         windows = turned(angles, self.turn_span_s)
         return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
 
     def heading_course(self, orientation: Series) -> Slope | None:
-        """Compute how much a heading turns for each radian by which the course turns."""
+        """Compute the change of a heading per radian of change of the course."""
         if self.courses is None:
             return None
         windows = turned(self.timed(self.courses), self.turn_span_s)
@@ -281,7 +281,7 @@ class BodyMotion:
         return slope(windows.values, end - begin)
 
     def heading_offsets(self, orientation: Series) -> Floats:
-        """Compute headings (k,) minus course while the body moves clearly, forward or backward."""
+        """Compute heading minus course (k,) while the body clearly moves, forward or backward."""
         if self.courses is None:
             return np.empty(0)
         course = self.timed(self.courses)
@@ -293,7 +293,7 @@ class BodyMotion:
         return wrap_angle(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
-        """Compute how horizontal forces fit velocity changes; return None if this is impossible."""
+        """Compute how well horizontal forces fit velocity changes; return None if this is impossible."""
         if not self.body.velocities or self.courses is None:
             return None
         velocity = self.body.velocities[0]
@@ -326,7 +326,7 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 
     Args:
         orientation: quaternions (n, 4).
-        times_s: (k,), the other times, in s.
+        times_s: (k,), times at which to interpolate, in s.
 
     Returns:
         (k,), in rad, not wrapped; NaN before the first and after the last.

@@ -209,7 +209,7 @@ def _at(stream: Stream, times_ns: np.ndarray) -> np.ndarray:
 
 
 def _wheels(streams: Mapping[str, Stream], stream: Stream) -> Slope | None:
-    """Compute how far fixes move for each metre travelled according to the body's wheels."""
+    """Compute the distance that fixes move per metre measured by the body's wheels."""
     for body in bodies({**streams, stream.topic: stream}):
         if body.speeds and body.fixes and body.fixes[0].topic == stream.topic:
             return BodyMotion(body).speed(body.speeds[0])

@@ -134,7 +134,7 @@ def factors(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rest(motion: BodyMotion) -> Iterator[Finding]:
-    """Find stated variances that contradict the scatter of fixes at rest, if errors are white."""
+    """Find variances that contradict the scatter of a stationary body's fixes, if errors are white."""
     moving = [*motion.body.speeds, *motion.body.velocities]
     for fixes in motion.body.fixes:
         source = next((each for each in moving if each.topic != fixes.topic), None)
@@ -160,10 +160,10 @@ def rest(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def scatter(fixes: PlaceSeries, source: Series) -> tuple[float, int, float] | None:
-    """Compute the scatter of fixes while a speed shows that the body is at rest.
+    """Compute the scatter of fixes while a speed shows that the body is stationary.
 
     Returns the variance as a multiple of the stated one, its degrees of freedom, and the correlation of
-    successive errors; None if the body does not rest, or no variance is stated.
+    successive errors. Returns None if the body is never stationary, or no variance is stated.
     """
     half_s = max(0.5, 2.0 * float(np.median(np.diff(source.times_s))))
     moved = source.integral(fixes.times_s + half_s) - source.integral(fixes.times_s - half_s)

@@ -30,8 +30,8 @@ class Timing(NamedTuple):
         gain: gain of the source's clock, in s/s.
         likeness: correlation at this lag and gain, -1 to 1.
         evidence: log-likelihood with lag and gain, minus the log-likelihood without them.
-        is_needed: whether the lag still fits clearly better if a share `MISFIT` of the motion always
-            counts as unexplained.
+        is_needed: whether the lag still fits clearly better if a share `MISFIT` of the motion is always
+            treated as unexplained.
         tolerance_s: lags up to this size are ignored.
         spread_s: largest difference between equally likely lags, plus the tolerance.
         is_alone: whether only neighbouring lags explain the motion equally well, and no lag that is a
@@ -139,8 +139,9 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
 def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
     """Estimate the number of independent windows.
 
-    Only windows that do not overlap are counted. Windows count less if residuals persist from one window
-    to the next, as those due to a lever arm do; the reduction follows from a first-order autoregression.
+    Only windows that do not overlap are counted. Windows have less weight if residuals persist from one
+    window to the next, as those due to a lever arm do; the reduction follows from a first-order
+    autoregression.
     """
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)

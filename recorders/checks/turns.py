@@ -67,7 +67,7 @@ def _by_forces(motion: BodyMotion, source: Series) -> int:
 
 
 def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
-    """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else the sign."""
+    """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else a wrong sign."""
     assert motion.courses is not None
     course = motion.courses
     evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
@@ -317,7 +317,7 @@ def quaternions(motion: BodyMotion) -> Iterator[Finding]:
 
 
 def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
-    """Compare quaternions with turn rates: return rms differences (rad/s) by order, or {} at rest."""
+    """Compare quaternions with turn rates: return rms differences (rad/s) by order; {} without turns."""
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]

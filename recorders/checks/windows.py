@@ -1,4 +1,4 @@
-"""Windows of a motion: the distance and angle by which positions or other topics move in each."""
+"""Windows of a motion, and how far or by what angle positions or other topics move in each."""
 
 from dataclasses import dataclass, replace
 
@@ -42,7 +42,7 @@ def thinned(count: int, most: int) -> slice:
 
 
 def noise_of(places: Floats) -> float:
-    """Estimate the standard deviation of white noise of samples (n, 2) from second differences.
+    """Estimate the standard deviation of the white noise in samples (n, 2) from second differences.
 
     Acceleration adds to the differences, so the estimate is too large rather than too small.
     """
@@ -70,7 +70,7 @@ def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np
 
 
 def jumps(fixes: Series) -> NDArray[np.bool_]:
-    """Find the steps (n - 1,) between positions that are jumps of the receiver.
+    """Find which of the steps (n - 1,) between positions are jumps of the receiver.
 
     A jump is a single step that differs from its neighbours by more than the noise, and is longer than
     nearly all steps. Successive long steps in one direction, or frequent long steps, are motion and not
@@ -112,12 +112,12 @@ def chords(fixes: Series, span_s: float) -> Windows:
 
 
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Compute the distance in windows according to a speed or velocity, forward or backward.
+    """Compute the distance moved in windows, forward or backward, from a speed or velocity.
 
     Args:
         source: the speed or velocity in m/s.
-        begin_s: (k,), beginnings of the windows, in s.
-        end_s: (k,), ends of the windows, in s.
+        begin_s: (k,), start times of the windows, in s.
+        end_s: (k,), end times of the windows, in s.
 
     Returns:
         (k,), in m, not negative; NaN beyond the source's stamps.
@@ -127,7 +127,7 @@ def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 def _moves(fixes: PlaceSeries) -> bool:
-    """Test whether positions move farther than the stated errors of a receiver at rest explain."""
+    """Test whether positions move farther than the stated errors of a stationary receiver explain."""
     stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
     sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0
     away_m = np.linalg.norm(fixes.values - np.median(fixes.values, axis=0), axis=1)
@@ -135,7 +135,7 @@ def _moves(fixes: PlaceSeries) -> bool:
 
 
 def places_of(body: Body) -> Series | None:
-    """Return the body's positions: fixes, or integrated velocities; return None if it is at rest."""
+    """Return the body's positions: fixes, or integrated velocities; return None if it is stationary."""
     if body.fixes:
         return body.fixes[0] if _moves(body.fixes[0]) else None
     if body.velocities and body.speeds:

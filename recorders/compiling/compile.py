@@ -164,7 +164,7 @@ def _share(
 def _one_by_one(
     loop: Loop, arguments: Sequence[KernelArgument], per_run: Sequence[KernelArgument]
 ) -> Callable[[int, int], None]:
-    """Return a function that processes runs, passing each run its own last argument."""
+    """Return a function that processes runs, in which the last argument has a separate value per run."""
     by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}
 
     def through(first: int, end: int) -> None:

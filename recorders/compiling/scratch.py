@@ -37,5 +37,5 @@ class Scratch:
             return Memory(self._make())
 
     def take_back(self, memories: Sequence[Memory]) -> None:
-        """Take back memories that are no longer in use."""
+        """Return memories to the pool when they are no longer in use."""
         self._free += memories

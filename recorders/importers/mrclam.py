@@ -25,7 +25,7 @@ from fuselog.recorders.recording import Importer, Recording
 class MrclamParameters(Parameters):
     """Settings that the data do not state: the noise of odometry and sensor, and the prior's sigmas.
 
-    The values are the same for all sets and robots. The densities of the odometry describe its errors
+    The values are the same for all sets and robots. The noise densities describe the odometry's errors
     over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to 0.7),
     but a filter assumes that they are independent, so the standard deviations are a few times the
     scatter.

@@ -122,7 +122,7 @@ def main_span(stamps_ns: Iterable[NDArray[np.int64]]) -> tuple[int, int] | None:
 def main_span_of(
     extent_ns: tuple[int, int], blocks: Callable[[], Iterable[Mapping[str, Stream]]]
 ) -> tuple[int, int] | None:
-    """Compute `main_span` of a log; its blocks are read only if its ends are over a year apart."""
+    """Compute `main_span` of a log; its blocks are read only if the log is over a year long."""
     if extent_ns[1] - extent_ns[0] <= YEAR_NS:
         return None
     return main_span(each.publish_time_ns for block in blocks() for each in block.values())
@@ -153,7 +153,7 @@ class Rejections(dict[str, Counter[str]]):
 
 @lru_cache(maxsize=1024)
 def limit_of(name: str) -> float:
-    """Return the largest number that a field or component can be, by the unit in its name.
+    """Return the largest possible value of a field or component, by the unit in its name.
 
     >>> limit_of("range_m"), limit_of("covariance_m2"), limit_of("quaternion")
     (1000000000000.0, 1e+50, 1e+50)

@@ -63,7 +63,7 @@ def origin_of(parts: Sequence[str]) -> Origin | None:
 
 
 def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
-    """Return the origin that a topic's channel states, or None; without a height, it is at height zero.
+    """Return the origin that a topic's channel states, or None; a missing height is taken as zero.
 
     Raises BadInput if it is not a position on the earth.
     """

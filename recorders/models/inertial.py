@@ -133,7 +133,7 @@ def strapdown(
 
 
 def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """Compute the orientation with the force up and the field north; NaN if the two are parallel."""
+    """Compute the orientation in which force is up and field is north; NaN if the two are parallel."""
     up = unit(force)
     east = unit(cross(field, up))
     north = cross(up, east)

@@ -49,14 +49,14 @@ def range_bearing(pose: Components, target: Components) -> tuple[Component, Comp
 
 
 def into_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Compute the position (x, y) of a point in the frame of a sensor with pose (x, y, heading)."""
+    """Compute a point's position (x, y) in the frame of a sensor with pose (x, y, heading)."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = point[0] - pose[0], point[1] - pose[1]
     return cosine * dx + sine * dy, cosine * dy - sine * dx
 
 
 def out_of_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """Compute the position (x, y) of a point given in the frame of a sensor with this pose."""
+    """Convert a point from the frame of a sensor with this pose to coordinates (x, y) in the plane."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     return (
         pose[0] + cosine * point[0] - sine * point[1],

@@ -1,6 +1,6 @@
 """Detection of standstill from inertial samples.
 
-A body at rest measures constant gravity and no rotation. Skog, Handel, Nilsson and Rantakokko,
+A stationary body measures constant gravity and no rotation. Skog, Handel, Nilsson and Rantakokko,
 Zero-Velocity Detection - An Algorithm Evaluation, IEEE Transactions on Biomedical Engineering 57(11),
 2010: the variance of the specific force, and the energy of the turn rate.
 """

@@ -49,8 +49,8 @@ class Identity(NamedTuple):
         size: size in bytes; None if the server does not state it.
         version: ETag, time of modification and the like; if the server states none, a random text.
         is_stated: whether the server states the version.
-        has_ranges: whether parts of the file can be requested, as far as the server states it, and
-            belong together.
+        has_ranges: whether parts of the file can be requested one by one, as far as the server states
+            this, and a stated version shows whether they belong together.
     """
 
     size: int | None
@@ -198,13 +198,13 @@ def blocks_of(url: str, identity: Identity) -> Iterator[tuple[int, bytes]]:
 
 
 class _Opened(NamedTuple):
-    """A file, with its file system: an archive without references closes its files."""
+    """An open file and its file system: an archive to which nothing refers closes its files."""
 
     file: Any
     file_system: "AbstractFileSystem"
 
     def close(self) -> None:
-        """Close the file, also if its connection is lost."""
+        """Close the file, even if its connection is lost."""
         with suppress(Exception):
             self.file.close()
 
@@ -219,7 +219,7 @@ def _check_content(url: str, content: bytes, offset: int) -> None:
 
 
 def _open(url: str, *, is_whole: bool = False) -> "_Opened":
-    """Open a file at its beginning; `is_whole` requests all of it together, if it is on a web server."""
+    """Open a file at its beginning; `is_whole` requests the whole file at once from a web server."""
     file_system, path = _backend(url, None if is_whole else RANGE_S)
     options = {"block_size": 0} if is_whole and "http" in file_system.protocol else {}
     return _Opened(file_system.open(path, "rb", cache_type="none", **options), file_system)
@@ -230,7 +230,8 @@ def _backend(url: str, most_s: float | None = RANGE_S) -> "tuple[AbstractFileSys
 
     Args:
         url: the URL.
-        most_s: the longest time for a request to a web server; None if only silence ends a request.
+        most_s: time limit of a whole request to a web server; if None, a request fails only when the
+            server stays silent.
     """
     with extra("remote", masked(url)):
         import fsspec
@@ -255,7 +256,7 @@ def _backend(url: str, most_s: float | None = RANGE_S) -> "tuple[AbstractFileSys
 
 
 def _of_web(scheme: str, most_s: float | None) -> dict[str, Any]:
-    """Return the options for a web server: ours, and over them those of the user's configuration."""
+    """Return the options for a web server: fuselog's own, overridden by the user's configuration."""
     from aiohttp import ClientTimeout
     from fsspec.config import conf
 

@@ -37,16 +37,16 @@ _urls: dict[str, str] = {}
 
 
 class RemotePath(_LocalPath):
-    """The path of a log at a URL; to open it copies the log into the user's cache.
+    """The path of a log at a URL; opening it copies the log into the user's cache.
 
     It is shown without passwords and keys. A URL with `*` or a final `/` is a folder. The parent is the
-    current folder, where outputs are written that are next to a local log.
+    current folder, so outputs that would be written next to a local log are written there.
 
     Attributes:
         url: the URL, in one of the forms that fsspec knows.
         by_ranges: whether `open_binary` fetches only the requested bytes, without a copy.
-        ends: the first and last bytes of the file with their positions, once they have been fetched, for
-            the metadata and the summary of most logs.
+        ends: the first and last bytes of the file with their positions, once they have been fetched;
+            they suffice for the metadata and the summary of most logs.
     """
 
     url: str
@@ -70,7 +70,7 @@ class RemotePath(_LocalPath):
 
     @cached_property
     def identity(self) -> Identity:
-        """Ask for the version of the file, once: other versions are refused later."""
+        """Ask once for the version of the file; other versions are refused later."""
         if MASK in self.url:
             raise BadInput(f"{self}: was stored without its password or key; give the complete URL")
         if self.is_dir():
@@ -147,7 +147,7 @@ class RemotePath(_LocalPath):
         return self.glob("*")
 
     def rglob(self, pattern: str, **options: Any) -> Iterator["RemotePath"]:  # type: ignore[override]
-        """Yield the files in a folder whose names match, without those in other folders below it."""
+        """Yield the files in a folder whose names match, excluding its subfolders."""
         return self.glob(pattern, **options)
 
     def glob(self, pattern: str, **options: Any) -> Iterator["RemotePath"]:  # type: ignore[override] # noqa: ARG002
@@ -165,7 +165,7 @@ def _again(url: str, identity: Identity | None, by_ranges: bool) -> RemotePath:
 
 
 def _named(url: str) -> str:
-    """Return the path of a file in its file system, with the scheme, without user and query."""
+    """Return the path of a file in its file system, with the scheme but without user and query."""
     scheme, _, rest = url.partition("::")[0].partition("://")
     if scheme.lower() in ("http", "https"):
         parts = urlsplit(f"//{rest}")
@@ -192,7 +192,7 @@ def size_of(path: Path) -> int:
 
 
 def state_of(path: Path) -> tuple[int, int, str]:
-    """Return what changes with a file: size in bytes, modification time in ns, and a server's version.
+    """Return a file's size in bytes, modification time in ns, and version as the server states it.
 
     A remote file has no modification time, and no version if its server states none. Raises OSError or
     BadInput if the file cannot be reached.
@@ -245,7 +245,7 @@ def copy_whole(path: Path, reason: str) -> None:
 
 
 class RangeStream(io.RawIOBase):
-    """A remote file as a stream: a request for each read, except near the beginning and the end.
+    """A remote file as a stream; each read is a request, except near the beginning and the end.
 
     Raises NoRanges if the server can only send the whole file.
     """

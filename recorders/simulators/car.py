@@ -72,9 +72,9 @@ class CarParameters(Parameters):
     Attributes:
         duration_s: length of the drive.
         motion: kind of motion.
-        rest_s: time at rest, before 5 s of acceleration.
+        rest_s: duration of the initial standstill, which is followed by 5 s of acceleration.
         begin: "of the prior" draws the first pose from the prior, whose mean is zero; "any heading"
-            starts the car at zero in a random direction, which is the mean of the prior.
+            starts the car at the origin with a random heading, and this pose is the mean of the prior.
         prior_sigma_m, prior_sigma_rad: standard deviations of the position, per axis, and of the heading
             in the prior.
         odometry_step_s, fix_step_s, compass_step_s: times between messages.
@@ -121,7 +121,7 @@ class CarParameters(Parameters):
 
 
 class Truth(NamedTuple):
-    """The motion of the car: speeds and turn rates (n,) of each step, poses (n + 1, 3) between steps."""
+    """The motion of the car: speeds and turn rates (n,) in the steps, poses (n + 1, 3) at their ends."""
 
     step_s: float
     speed_mps: Floats
@@ -129,7 +129,7 @@ class Truth(NamedTuple):
     pose: Floats
 
     def at(self, times_s: Floats) -> Floats:
-        """Interpolate poses (m, 3) at any times, exactly; before the beginning the car rests."""
+        """Interpolate poses (m, 3) exactly at any times; before the start, the car is stationary."""
         step = np.clip(times_s // self.step_s, 0, len(self.speed_mps) - 1).astype(int)
         since_s = np.maximum(times_s - step * self.step_s, 0.0)
         return self.pose[step] + arcs(

@@ -85,7 +85,7 @@ class Sightings(NamedTuple):
         cuts: (runs + 1,) first sighting of each run.
         target: (n,) number of the target.
         range_m, bearing_rad: (n,).
-        outages_s: for each run, (k, 2) starts and ends.
+        outages_s: for each run, the starts and ends (k, 2) of the sensor's outages.
     """
 
     times_s: Floats
@@ -224,7 +224,7 @@ def _robot_streams(
 
 
 def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int] | None = None) -> None:
-    """Add to the streams of each run its part of a stream of all runs, by default equal parts."""
+    """Divide a stream of all runs, equally by default, and add each run's part to its streams."""
     if cuts is None:
         cuts = [run * len(of_runs) // len(streams) for run in range(len(streams) + 1)]
     for together, own in zip(streams, divide(of_runs, cuts), strict=True):
@@ -232,7 +232,7 @@ def _add(streams: list[list[Stream]], of_runs: Stream, cuts: Sequence[int] | Non
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drives, rngs_of: Rngs) -> list[list[Stream]]:
-    """Simulate fixes in the plane or on the earth with their covariance, and their outages, by run."""
+    """Simulate each run's fixes, in the plane or on the earth, with covariances and outages."""
     if receiver.rate_hz == 0:
         return [[] for _ in range(robot.poses.shape[1])]
     all_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
@@ -265,7 +265,7 @@ def _fix_streams(topic: str, receiver: Fixes, robot: Drives, rngs_of: Rngs) -> l
 def _targets(
     parameters: LandmarksParameters, number: int, drives: list[Drives], landmarks: Floats
 ) -> Mapping[int, Drives | Floats]:
-    """Return the possible targets of robot `number`, by number: moving robots, and points (runs, 2)."""
+    """Return what robot `number` may see, by target number: moving robots, and points (runs, 2)."""
     seen: dict[int, Drives | Floats] = {}
     if parameters.robots_see_each_other:
         seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
@@ -308,7 +308,7 @@ def _dead(
     duration_s: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Draw a sensor's outages (k, 2), start and end, and test which times (n,) are in one."""
+    """Draw a sensor's outages (k, 2), start and end, and test which times (n,) are in an outage."""
     count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
     if not count:
         return np.empty((0, 2)), np.zeros(len(times_s), np.bool_)
@@ -328,7 +328,8 @@ def _noisy(
 ) -> Floats:
     """Add noise to values (n,), and replace outliers by values anywhere between two ends.
 
-    The same numbers are drawn without outliers; those that have no effect are skipped.
+    The noise does not depend on whether there are outliers; without outliers, their random numbers are
+    skipped.
     """
     noise, place, chance = np.empty((3, len(exact)))
     for rng, (first, end) in zip(rngs, pairwise(cuts), strict=True):

@@ -77,7 +77,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
 
 
 def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
-    """Compute the spline through the way points, after a rest at the first, and the attitude on it."""
+    """Compute the spline through the way points, with an initial standstill, and its attitude."""
     points = np.array(parameters.way_points_m, float).reshape(-1, 3)
     if not len(points):
         points = _random_points(parameters, rng)
@@ -117,7 +117,7 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
 def _step(
     grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
 ) -> None:
-    """Add, in place, the bobbing and swaying of 1.9 steps per second, and slow turns to both sides."""
+    """Add, in place, bobbing and swaying at 1.9 steps per second, and slow turns to both sides."""
     phase, step = rng.uniform(0.0, 2 * np.pi, 4), 2 * np.pi * 1.9 * grid_s
     place[:, 2] += 0.03 * going * np.sin(step + phase[0])
     attitude[:, 0] += 0.8 * going * np.sin(0.5 * grid_s + phase[1])
@@ -315,9 +315,9 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 
 
 def _prior(parameters: NavigationParameters, truth: Floats, rng: np.random.Generator) -> Stream:
-    """Draw the prior by adding an error to the truth; the orientation's error is a turn and a tilt.
+    """Draw the prior by adding an error to the truth; an orientation's error is a yaw and a tilt.
 
-    The turn is about the vertical axis, so that an unknown heading does not affect the tilt.
+    The yaw is about the vertical axis, so that an unknown heading does not affect the tilt.
     """
     prior, unit = parameters.prior, parameters.unit
     sigma = np.repeat(

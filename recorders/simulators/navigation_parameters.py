@@ -49,7 +49,7 @@ class Receiver(Parameters):
 
     Attributes:
         rate_hz: positions per second.
-        velocity_rate_hz: velocities per second; 0 for no velocities.
+        velocity_rate_hz: rate of the messages with a velocity; 0 for no velocities.
         sigma_m: standard deviation of a position, per horizontal axis.
         sigma_up_m: standard deviation of a height.
         sigma_mps: standard deviation of a velocity, per horizontal axis.
@@ -59,7 +59,8 @@ class Receiver(Parameters):
         velocity_delay_s: time by which the stamps of velocities are late.
         outages_s: spans without messages.
         floats_s: spans with float solutions.
-        float_factor: factor by which the errors of float solutions and their stated sigmas are larger.
+        float_factor: factor by which the errors of float solutions, and the sigmas stated for them, are
+            larger.
         multipath_s: spans in which positions have the offset `multipath_m`, which their covariance
             ignores.
         multipath_m: offset of positions in the spans `multipath_s` (east, north, up).
@@ -85,13 +86,13 @@ class Carried(Parameters):
     """Further sensors that a body may carry.
 
     Attributes:
-        wheel_rate_hz: forward speeds per second from the wheels; 0 for no wheels.
+        wheel_rate_hz: rate of the wheels' messages with the forward speed; 0 for no wheels.
         wheel_sigma_mps: standard deviation of a forward speed.
         wheel_scale_sigma: standard deviation of the scale error of the wheels' speed, as a fraction.
         axle_m: position in the body at which the wheels measure the speed (forward, left, up).
-        compass_rate_hz: orientations per second from the compass; 0 for no compass.
+        compass_rate_hz: rate of the compass's messages with the orientation; 0 for no compass.
         compass_sigma_rad: standard deviation of the compass's heading.
-        barometer_rate_hz: heights per second from the barometer; 0 for no barometer.
+        barometer_rate_hz: rate of the barometer's messages with the height; 0 for no barometer.
         barometer_sigma_m: standard deviation of a height.
     """
 
@@ -106,7 +107,7 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """The prior in the log; its standard deviations of biases are the unit's.
+    """The prior in the log; the standard deviations of its biases are those of the inertial unit.
 
     Attributes:
         is_told: whether the log has a prior.
@@ -132,7 +133,7 @@ class NavigationParameters(Parameters):
     Attributes:
         carrier: type of the moving body.
         duration_s: length of the run.
-        rest_s: time at rest at the beginning.
+        rest_s: duration of the initial standstill.
         leg_s: time between random way points.
         speed_mps: speed along the path.
         way_points_m: points of the path (east, north, up); if empty, points are random.

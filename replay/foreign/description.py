@@ -22,8 +22,8 @@ class ForeignParameters(Parameters):
     """Settings of a foreign filter; the parameters in its description are added to them.
 
     Attributes:
-        time_limit_s: limit of the time for one message; a run that exceeds it fails.
-        memory_limit_mb: limit of the memory of the filter's process; a run that exceeds it fails.
+        time_limit_s: time limit for one message; a run that exceeds it fails.
+        memory_limit_mb: memory limit for the filter's process; a run that exceeds it fails.
         every_s: interval of additional estimates, which are made at multiples of this time.
         seed: seed of the filter's random numbers.
     """
@@ -47,7 +47,7 @@ class TopicRead(_Part):
         topic: name of the topic; a name without a leading slash is looked for under every prefix.
         fields: fields that the filter reads, in this order; `position_m[2]` is a vector of two numbers.
         message: schema of its messages, such as `fuselog.RangeBearing`; "" for any schema.
-        static: whether all messages of the topic are passed to the filter before the start, as for a
+        static: whether all messages of the topic are passed to the filter before it starts, as for a
             map.
         optional: whether the filter also runs on logs without the topic.
         estimates: whether the filter is asked for an estimate after each message of the topic.

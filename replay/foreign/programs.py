@@ -55,7 +55,7 @@ class ProgramParameters(StreamParameters):
     """Settings of a program that reads a log and writes estimates.
 
     Attributes:
-        time_limit_s: limit of the time for one run; a run that exceeds it fails.
+        time_limit_s: time limit for one run; a run that exceeds it fails.
         truth: topic of the truth; by default, the only truth in the log.
     """
 
@@ -371,7 +371,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
 
 
 def _components(names: list[str], truth: Topic | None) -> Components:
-    """Return components with the kinds that the truth states; without a truth, all are linear."""
+    """Return components with the kinds given by the truth; without a truth, all kinds are linear."""
     if truth is None:
         return dict.fromkeys(names, "linear")
     stated = stated_components(truth.metadata, {}, f"topic {truth.name}")

@@ -2,10 +2,10 @@
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, propagated back by
 the derivatives Phi of the motion along the smoothed trajectory. W is scaled to D W D with the prior's
-standard deviations D, so an eigenvalue of 1 means that the measurements contain the same information as
-the prior. Along an estimated trajectory, unobservable directions collect a little spurious information;
-therefore, eigenvalues below 10 are reported as weaker than the prior. F and H are the Jacobians of the
-extended Kalman filter.
+standard deviations D, so an eigenvalue of 1 means that the measurements contain as much information as
+the prior. Along an estimated trajectory, unobservable directions accumulate a small amount of spurious
+information; therefore, eigenvalues below 10 are reported as weaker than the prior. F and H are the
+Jacobians of the extended Kalman filter.
 
 Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
 """
@@ -241,7 +241,7 @@ class Observability(IteratedSmoother):
         return scales
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
-        """Return the number of each node's window; the last window includes the rest of the run."""
+        """Return the number of each node's window; the last window includes all remaining nodes."""
         run = run_of_rows(way.offsets)
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:

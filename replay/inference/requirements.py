@@ -1,4 +1,4 @@
-"""Descriptions of the requirements of models on logs, for lists and for errors about missing topics."""
+"""Descriptions of what models require of a log, for lists and for errors about missing topics."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -41,7 +41,7 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
-    """Explain that the prior matches a model whose control has another name in this log, or return "".
+    """Explain that the prior fits a model, but its control has another name in this log, or return "".
 
     An example is a log with several inertial units, from which the user must choose one.
     """
@@ -67,7 +67,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
 
 
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Requirement"]:
-    """Return the requirements of a model under the prefix at which the log satisfies most of them."""
+    """Return the requirements of a model under the prefix for which the log meets most of them."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
     return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
 

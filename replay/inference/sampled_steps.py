@@ -31,7 +31,7 @@ SETTLING = (3,)  # index of the argument of `SampledFunction.recentre` that diff
 
 
 class SampledFunction(NamedTuple):
-    """Function with v values of a state, noise and other arguments, evaluated at weighted samples.
+    """Function of a state, noise and other arguments, with v values, evaluated at weighted samples.
 
     The arguments of each graph are those of the step, (mean, covariance, ...), and those listed below.
 
@@ -189,7 +189,7 @@ def _by_block(
 
 @lru_cache(maxsize=8)
 def _difference(kind: str) -> TracedFunction:
-    """Trace the difference for one kind as a separate function, so that branches do not multiply."""
+    """Trace the difference for one kind as a separate function, to limit the number of paths."""
     width = WIDTHS[kind]
     subtract = boxminus((kind,) * width)
 
@@ -203,7 +203,7 @@ def _difference(kind: str) -> TracedFunction:
 
 @lru_cache(maxsize=8)
 def _recentred(kind: str) -> TracedFunction:
-    """Trace how a tangent vector changes with its centre; the first output is whether to repeat this."""
+    """Trace how a tangent vector changes with its centre; the first output is whether to iterate."""
     kinds = (kind,) * WIDTHS[kind]
     move, size = recentring(kinds), tangent_size(kinds)
 

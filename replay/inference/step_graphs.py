@@ -38,7 +38,7 @@ class Step(NamedTuple):
         return any(each == name for each, _ in self.outputs)
 
     def columns(self, name: str, rows: int) -> list[list[int]]:
-        """List the columns of a matrix that are not known to be zero, row by row."""
+        """List, for each row of a matrix, the columns whose entries are not known to be zero."""
         places = sorted(place for each, place in self.outputs if each == name)
         return [[place[1] for place in places if place[0] == row] for row in range(rows)]
 

@@ -135,7 +135,7 @@ class Diagnostics:
 
 
 def _wide_angles(estimates: Stream) -> dict[str, int]:
-    """Count the estimates whose standard deviation exceeds `WIDE_RAD`, by angle."""
+    """Count, for each angle, the estimates whose standard deviation exceeds `WIDE_RAD`."""
     components = stated_components(estimates.metadata, {}, estimates.topic)
     errors = tangent_components([*components], [*components.values()])
     size = len(errors)

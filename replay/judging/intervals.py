@@ -1,9 +1,9 @@
 """95 % intervals of means and root mean squares, by the rules in docs/judge.md.
 
-The unit is the run: errors within a run are correlated; runs are independent. A mean has Student's t
-interval. A root mean square has a percentile bootstrap interval over runs, widened for few runs like
-Student's t interval: Hesterberg, "What Teachers Should Know About the Bootstrap", The American
-Statistician 69 (2015).
+The unit of these statistics is the run: errors within a run are correlated, and runs are independent. A
+mean has Student's t interval. A root mean square has a percentile bootstrap interval over runs, widened
+for few runs like Student's t interval: Hesterberg, "What Teachers Should Know About the Bootstrap", The
+American Statistician 69 (2015).
 """
 
 import math
@@ -27,7 +27,8 @@ class Interval(NamedTuple):
 
     Attributes:
         value: the number.
-        low, high: the ends; NaN if there is no interval, and equal to the number if it is exact.
+        low, high: the ends of the interval; NaN if there is no interval, and equal to the number if the
+            number is exact.
         unit: unit of the number and both ends; may be empty.
         name: name of the number, if it is not clear from its context.
     """
@@ -78,7 +79,7 @@ def mean_interval(values: ArrayLike, fewest: int = FEWEST_RUNS) -> Interval:
     Args:
         values: one value per run.
         fewest: smallest number of runs for an interval. Only a study with a fixed number of units, such
-            as the robots in a recording, uses a different number than the default.
+            as the robots in a recording, sets a number other than the default.
     """
     from scipy.special import stdtrit
 
@@ -117,7 +118,7 @@ def root_mean_square(values: ArrayLike) -> float:
 
 
 def _with_finite_squares(values: Floats) -> tuple[Floats, float]:
-    """Scale numbers (n,) so that their squares are finite; return them and the scale, usually 1."""
+    """Scale numbers (n,) so that their squares are finite; also return the scale, which is usually 1."""
     largest = float(np.max(np.abs(values), initial=0.0))
     scale = largest if LARGE < largest < math.inf else 1.0
     return values / scale, scale

@@ -246,9 +246,9 @@ class Judge:
     def intervals(self, probability: float) -> dict[str, tuple[float, float]]:
         """Compute the intervals of the NEES and NIS of consistent estimators, by key.
 
-        Errors of the steps of a run are correlated, so the NEES has the interval of the mean of a single
-        step over the runs; innovations are uncorrelated, so the NIS has the interval of the mean of all
-        innovations. Each interval contains its metric with the given `probability`.
+        Errors of the steps of a run are correlated, so the interval for the NEES is that of the mean of
+        a single step over the runs; innovations are uncorrelated, so the interval for the NIS is that of
+        the mean of all innovations. Each interval contains its metric with the given `probability`.
         """
         sizes = self._sizes()
         return {key: _interval(*sizes[key], probability) for key in self.metrics if key in sizes}

@@ -22,10 +22,10 @@ def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
 
 def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
-    """Make a row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
+    """Make a table with a row for each step, over all runs: RMSE, mean NEES, and 95 % intervals.
 
-    If there are more than `judge.STEPS` steps, a row covers several, and `step` is the first of them. If
-    `bounds` has a bound over the ensemble, its values are used instead of the bounds along the
+    If there are more than `judge.STEPS` steps, each row covers several steps, and `step` is the first of
+    these. If `bounds` contains a bound over the ensemble, it replaces the averages along the
     trajectories.
     """
     errors, by_step = quantities.errors, quantities.by_step

@@ -29,8 +29,8 @@ class Consistency(StrEnum):
 class Comparison(StrEnum):
     """Verdict on whether a second estimator is better than a first.
 
-    For a metric without a target value, the verdict is only higher or lower. The verdict is withheld if
-    changes that should not matter move the metric by more than the difference.
+    For a metric without a target value, the verdict is only higher or lower. No verdict is given if
+    changes that should not matter change the metric by more than the difference.
     """
 
     BETTER = "better"
@@ -85,7 +85,7 @@ class Squares:
 
     @property
     def verdict(self) -> Consistency:
-        """Return the verdict from the intervals over the runs and of a consistent estimator."""
+        """Return the verdict from the interval over the runs and that of a consistent estimator."""
         low, high = self.usual
         if math.isnan(self.found.value):
             return Consistency.UNDECIDED

@@ -47,7 +47,7 @@ _ENTITY = "moments"  # of the worst moments, for the cursor of the viewer
 
 
 class Fan(NamedTuple):
-    """Distances between one copy and its estimate.
+    """Distances between an estimate and one copy of it.
 
     Attributes:
         estimate: the original estimate; the copies of one estimate share a plot.
@@ -63,7 +63,7 @@ class Fan(NamedTuple):
 
 
 def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
-    """Return the layout with a plot below it for each estimate that has copies."""
+    """Return the layout, extended by a plot for each estimate that has copies."""
     plots = []
     for estimate in dict.fromkeys(fan.estimate for fan in fans):
         plot = entity_path("plots", "stress", estimate)
@@ -77,9 +77,9 @@ def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Contain
 class Drawing:
     """Timeline of one run, drawn while the run is replayed.
 
-    A receiver gets every block immediately. A file is drawn at the end from the messages that were kept:
-    all messages of a short run, or a selection from a longer run, evenly spaced in time. Use the drawing
-    as a context manager, which finishes it at the end unless an exception was raised.
+    A receiver gets every block immediately. A file is drawn at the end of the run from the messages that
+    were kept: all messages of a short run, or a selection from a longer run, evenly spaced in time. Use
+    the drawing as a context manager, which finishes it at the end unless an exception was raised.
 
     Args:
         source: the run.
@@ -87,7 +87,8 @@ class Drawing:
         focus: the case that is shown first, such as `robot3`.
         save: the .rrd file to write.
         connect: URL of a receiver, rerun+http://HOST:PORT/proxy.
-        at: `worst` or `worst:ESTIMATOR`; without a focus, the case of this moment is shown first.
+        at: `worst` or `worst:ESTIMATOR`, which selects a moment; without a focus, the case of this
+            moment is shown first.
         sides: estimators whose scenes are shown side by side, with the differences of their errors.
         fans: distances of copies from their estimates.
         layout: file to which the layout of a dataset's segments is written; the layout also shows a text

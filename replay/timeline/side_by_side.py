@@ -42,7 +42,7 @@ def _split(layout: Board, estimators: Sequence[str]) -> Board:
 
 
 def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.View:
-    """Return a copy of a view that shows the scene without the other estimators."""
+    """Return a copy of a view that excludes the entities of other estimators."""
     shown = [str(each) for each in np.atleast_1d(np.asarray(view.contents))]
     roots = [each.removesuffix("/**") for each in shown if each.endswith("/**")]
     hidden = [

@@ -198,7 +198,7 @@ def c_lines(
             found[node] = text
 
     def branches(choice: Choice, level: Level) -> Iterator[str]:
-        """Yield the lines of a choice, whose sides are computed only if they are selected."""
+        """Yield the lines of a choice; each of its two branches is computed only if it is selected."""
         yield from lines_of(
             [each for each in needed(choice.members, known) if each not in choice.members], level
         )

@@ -1,8 +1,8 @@
 """Tracing of the functions of models for compiled kernels; plain Python calls the functions themselves.
 
 The arguments of a model's function are numbers, tuples of numbers, parameters (a NamedTuple of numbers),
-and sometimes arrays that it changes; the result is one number or a tuple of numbers. `Argument`
-describes the arguments. To trace a function, fuselog calls it once for every path through its
+and sometimes arrays that the function changes; the result is one number or a tuple of numbers.
+`Argument` describes the arguments. To trace a function, fuselog calls it once for every path through its
 conditions, and joins the results by selections.
 """
 
@@ -173,7 +173,7 @@ class Derivative:
 
     @cached_property
     def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
-        """Positions of the inputs that the derivatives need, and a function that computes these."""
+        """Positions of the inputs that derivatives need, and a function that computes derivatives."""
         nodes = list(self.entries.values())
         places = [node.value for node in needed(nodes) if node.operation == INPUT]
         names = {place: f"x{index}" for index, place in enumerate(places)}
@@ -202,10 +202,10 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """Write a call of a separate function that computes a graph's outputs from the inputs it needs.
+    """Write a call of a separate function that computes a graph's outputs from the necessary inputs.
 
-    Nodes that call a function and depend only on parameters are computed by another function, whose call
-    the compiler moves out of loops over samples or particles.
+    Nodes that contain a function call and depend only on parameters are computed by another function;
+    the compiler moves the call of that function out of loops over samples or particles.
     """
 
     def is_changing(place: Any) -> bool:
@@ -248,7 +248,7 @@ def _computed(
 
 
 def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any], place: Any) -> Number:
-    """Return the value at a position (index of an argument, entry of it) in a kernel."""
+    """Return the value at a position (index of an argument, index of its entry) in a kernel."""
     argument, entry = place
     value = arguments[argument]
     if isinstance(value, Array):
@@ -263,7 +263,7 @@ def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any
 
 
 def _at(arguments: Sequence[Any], place: Any) -> float:
-    """Return the value at a position (index of an argument, entry of it) in Python."""
+    """Return the value at a position (index of an argument, index of its entry) in Python."""
     argument, entry = place
     value = arguments[argument]
     if entry is None:
@@ -397,7 +397,7 @@ def traced(function: Any, *arguments: Argument) -> Any:
     A function is traced again if the values that it reads have changed or may have changed; see `reads`.
     None and functions that are already traced are returned unchanged.
 
-    Raises BadInput if the function cannot be traced, or has a different result when it is traced again.
+    Raises BadInput if the function cannot be traced, or if its result differs when it is traced again.
     """
     if function is None or isinstance(function, TracedFunction):
         return function

@@ -1,8 +1,8 @@
 """Expression graphs without duplicates and with folded constants.
 
 A node is an operation of Python or NumPy on other nodes; equal nodes are the same object.
-Simplifications preserve all bits with one exception: zero times anything is zero, so that an independent
-input costs nothing.
+Simplifications preserve all bits with one exception: zero times anything is zero, so that terms with a
+zero factor can be removed.
 """
 
 import math
@@ -185,7 +185,7 @@ def _power(base: float, exponent: int) -> float:
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
     """Return all nodes on which the outputs depend, including the outputs, in order of computation.
 
-    Known nodes are included, but not the nodes on which only known nodes depend.
+    Known nodes are included, but nodes that only known nodes need are not.
     """
     found: set[Node] = set()
     waiting = list(outputs)
@@ -198,7 +198,7 @@ def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
 
 
 class Choice(NamedTuple):
-    """Selections by one condition, and, for its yes and its no, the nodes that only this side needs."""
+    """Selections by one condition, and for each branch the nodes that only that branch needs."""
 
     condition: Node
     members: tuple[Node, ...]
@@ -212,7 +212,7 @@ Level = tuple[Choice, int] | None
 def choices(
     outputs: Collection[Node], known: Collection[Node] = ()
 ) -> tuple[dict[Node, Choice], dict[Node, Level]]:
-    """Find selections whose sides are worth a branch, by member, and the level of nodes inside them."""
+    """Find selections that are worth a branch, by member, and the level of the nodes inside them."""
     nodes, kept = needed(outputs, known), {*outputs, *known}
     users: dict[Node, list[tuple[Node, int]]] = {}
     grouped: dict[Node, list[Node]] = {}
@@ -248,7 +248,7 @@ def choices(
 
 
 def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:
-    """Find nodes to compute before a loop: constant in the loop, and with a function call.
+    """Find nodes to compute before a loop: constant in the loop and including a function call.
 
     Args:
         outputs: outputs of the loop.

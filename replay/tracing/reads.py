@@ -54,7 +54,7 @@ def pure(kind: type[Made]) -> type[Made]:
 
 
 class Reads(NamedTuple):
-    """Places that a function reads, and their values.
+    """Variables and functions that a function reads, and their values.
 
     Attributes:
         functions: the function and the functions that it calls, with their code and defaults.
@@ -67,7 +67,7 @@ class Reads(NamedTuple):
     names: list[tuple[Mapping[str, Any], str, Any]]
 
     def are_unchanged(self) -> bool:
-        """Test whether every place still has the same value."""
+        """Test whether everything that was read still has the same value."""
         for function, code, defaults in self.functions:
             if function.__code__ is not code or function.__defaults__ is not defaults:
                 return False
@@ -88,7 +88,7 @@ def reads_of(function: Any) -> Reads | None:
 
 
 def _sees(reads: Reads, value: Any) -> bool:
-    """Record the places that a value reads; return False if one of them may change unnoticed."""
+    """Record what a value reads; return False if any of it may change unnoticed."""
     if type(value) in _IMMUTABLE or id(value) in _PURE:
         return True
     if type(value) is tuple:

@@ -40,7 +40,7 @@ def refused(what: str) -> CannotTrace:
 
 
 def too_many_ways() -> CannotTrace:
-    """Make the error for too many conditions, which may be due to an endless loop."""
+    """Make the error for too many conditions, which an endless loop may cause."""
     return CannotTrace(
         f"there are more than {MOST_WAYS} paths through its `if`s and `while`s on numbers that are only "
         "known later; write np.clip or np.where, and a fixed number of iterations"

@@ -92,7 +92,7 @@ class CFilter(NamedTuple):
 
     @property
     def most(self) -> int:
-        """Return the number of components of the widest sensor."""
+        """Return the number of components of the sensor that has the most."""
         return max((len(sensor.measured) for _, sensor in self.sensors), default=1)
 
     @property

@@ -132,7 +132,7 @@ def _factorising(made: CFilter, columns: int) -> list[str]:
 
 
 def _pass_gap(made: CFilter) -> str:
-    """Write the prediction over a gap of the control, after which the filter continues."""
+    """Write the prediction over a gap in the controls, after which the filter continues."""
     step, t = made.steps.gap, made.tangent
     assert step is not None
     names, declared = Inputs(made, "motion").names(step, "control")

@@ -1,8 +1,8 @@
-"""Functions in C evaluated at weighted samples, as in `fuselog.replay.inference.kalman.regression`.
+"""C functions evaluated at weighted samples, as in `fuselog.replay.inference.kalman.regression`.
 
 Placeholders are those of `algebra`. SAMPLES is the largest number of samples, and DRAWN the largest
-number of entries in a sample. VALUES is the largest size of a function's value in tangent components,
-and PLACES its largest size in components.
+number of entries in a sample. VALUES is the largest number of tangent components of a function's value,
+and PLACES the largest number of its components.
 """
 
 import re
@@ -200,7 +200,7 @@ static void find_moments_on_axes(const drawn_samples *samples, int count, const 
 
 
 def samples_text(made: CFilter) -> list[str]:
-    """Write the tables of samples, and the functions of motion and sensors at samples."""
+    """Write the tables of samples, and the functions that evaluate motion and sensors at the samples."""
     functions = [each for each in made.steps.sampled if each is not None]
     if not functions:
         return []

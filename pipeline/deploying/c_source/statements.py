@@ -71,7 +71,7 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
 
 
 class Loops(NamedTuple):
-    """Calls of loops, with the declarations and the results of the graph that they need."""
+    """Calls of loops, with the declarations and the results of the graph that these calls need."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -136,7 +136,7 @@ def count_gains(step: Step) -> int:
 
 
 def turned_axes(made: CFilter) -> list[int]:
-    """List the first axes of the orientations with which the covariance is rotated."""
+    """List the first axis of each orientation whose correction also rotates the covariance."""
     model = made.filtering.bound_model.model
     blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
     return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]

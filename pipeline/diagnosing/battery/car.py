@@ -1,4 +1,4 @@
-"""Faults in logs of a car that drives after 10 s at rest, with or without a prior.
+"""Faults in logs of a car that is stationary for 10 s and then drives, with or without a prior.
 
 Faults of the car and of its inertial unit are selected by name. The faults change the columns directly,
 without the alterations that a diagnosis uses for corrections.

@@ -110,7 +110,7 @@ def tried(faults: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def _estimate(causes: Sequence[Cause], right: Right) -> Interval | None:
-    """Return the value that causes give for a planted fault under any name, for noise its logarithm."""
+    """Return the value that causes give a planted fault under any name; for noise, its logarithm."""
     for cause in causes:
         for each in (cause, *cause.others):
             for number in each.numbers:
@@ -144,7 +144,7 @@ def _seeds(experiment: Experiment, case: int) -> range:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Count named faults over all logs, over pairs and triples, and by planted faults."""
+    """Count named faults over all pairs of faults, over all triples, and for each set of faults."""
     metrics = dict[str, float]()
     for case, own in (("pairs", rows[rows["planted"] == 2]), ("triples", rows[rows["planted"] == 3])):
         metrics |= {

@@ -216,7 +216,7 @@ def noise_gain_over(
 
 
 def _lost(likelihood: Likelihood, trials: Sequence[Trial]) -> NDArray[np.float64]:
-    """Compute how much log-likelihood (pairs,) each pair of opposite noises in later trials costs."""
+    """Compute the mean loss of log-likelihood (pairs,) by opposite noises; the first trial has none."""
     without, *having = likelihood(trials)
     with np.errstate(invalid="ignore"):
         return without - np.mean(np.reshape(having, (-1, 2)), axis=1)

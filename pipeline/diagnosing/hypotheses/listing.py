@@ -1,6 +1,6 @@
 """List of all hypotheses on a run and the estimator that is bound to it.
 
-Those on starts, origins, stamps and swapped numbers or topics are made here.
+Hypotheses on initial states, origins, stamps and swapped numbers or topics are made here.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -364,7 +364,7 @@ def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
-    """Choose the parts with the largest mean NIS; choose no parts if no mean is too large."""
+    """Choose the parts with the largest mean NIS, or no parts if even the largest mean is acceptable."""
     means: dict[Any, float] = {}
     for name, stream in parts:
         degrees = np.isfinite(stream["innovation"]).sum()

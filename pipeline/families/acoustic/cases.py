@@ -245,7 +245,7 @@ def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
 
 
 def area_ratios(maps: Maps, label: str, aim: Place) -> tuple[Floats, Floats, Floats]:
-    """Compute, on a grid of shooter positions, the ellipse area of bearings only divided by a mode's."""
+    """Compute, on a grid of shooter positions, the bearings-only ellipse area divided by a mode's."""
     parameters = build(AcousticParameters, load_scenario(maps.scenario)[1], f"scenario {maps.scenario}")
     x, y = (
         np.arange(low, high + 0.5 * maps.step_m, maps.step_m)

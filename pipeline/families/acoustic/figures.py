@@ -92,7 +92,7 @@ def _sweep(
 
 
 def _maps(options: AcousticOptions) -> Figure:
-    """Draw ellipse areas of bearings only relative to those of another mode, figures 22 and 23."""
+    """Draw bearings-only ellipse areas relative to those of another mode, figures 22 and 23."""
     aims = options.maps.aims
     figure = Figure(figsize=(11, 4), layout="constrained")
     for axes, (label, aim) in zip(figure.subplots(1, len(aims)), aims.items(), strict=True):

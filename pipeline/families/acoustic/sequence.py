@@ -3,7 +3,7 @@
 Errors are computed at the last report of each shot. For filters and smoothers, the truth is the
 shooter's position at that time; for single-shot solutions, which have no motion model, it is the
 position at which the shot was fired. Estimators are compared by the mean of the log RMSE over runs, so
-that a lost run counts without dominating.
+that a lost run has an effect but does not dominate.
 """
 
 from typing import Annotated, Any

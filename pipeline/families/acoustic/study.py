@@ -141,7 +141,7 @@ def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_maps(maps: Maps) -> pd.DataFrame:
-    """Tabulate ellipse areas of bearings only relative to those of another mode, figures 22 and 23."""
+    """Tabulate bearings-only ellipse areas relative to those of another mode, figures 22 and 23."""
     parts = []
     for label, aim in maps.aims.items():
         x, y, ratio = area_ratios(maps, label, aim)

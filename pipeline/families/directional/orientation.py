@@ -250,7 +250,7 @@ def _measure_disturbances(
     options: OrientationOptions,
     outcome: Outcome,
 ) -> None:
-    """Measure false disturbances in undisturbed trials, and the timing errors of the magnet's spans."""
+    """Measure false detections in undisturbed trials, and the timing errors of the magnet's spans."""
     own = spans[spans["estimator"] == options.estimator]
     quiet = [name for name in sources if "undisturbed" in name.split("_")]
     if not quiet:

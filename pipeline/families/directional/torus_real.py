@@ -252,7 +252,7 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Return a measurement of the direction for every hour except the first, without the turn."""
+    """Return measurements of the direction, but not of the turn, for every hour except the first."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
@@ -325,7 +325,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
     Args:
         wind: (hours,), directions in rad.
-        half: number of first hours that are used to fit the width.
+        half: number of hours, counted from the first, that are used to fit the width.
 
     Returns:
         Two predictions by name, with wrapped normal noise only, and with occasional arbitrary jumps.
@@ -362,7 +362,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
 
 
 def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
-    """Return a filter's predictions of every hour except the first as estimates."""
+    """Return, as estimates, a filter's predictions for every hour except the first."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)
     return Ragged(stream, np.array([0, len(stream)]))

@@ -161,7 +161,7 @@ def _table_of_dilution(cases: list[Case]) -> pd.DataFrame:
 
 
 def _table_of_observability(cases: list[Case]) -> pd.DataFrame:
-    """Tabulate ranks for scheme 3, with all biases, other numbers of targets, and sensors in a line."""
+    """Tabulate ranks for scheme 3: with all biases, other numbers of targets, or sensors in a line."""
     rows = []
     for case in cases:
         if case.condition != cases[0].condition:

@@ -149,7 +149,7 @@ def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySou
 
 
 def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence[int]) -> pd.DataFrame:
-    """Tabulate RMSE and NEES of the position and bytes sent per second, by estimator and robot."""
+    """Tabulate, by estimator and robot, position RMSE and NEES, and the bytes sent per second."""
     sightings, span_s = 0, 0.0
     for source in sources:
         seen = [source.streams[f"/robot{number}/range_bearing"] for number in numbers]

@@ -141,7 +141,7 @@ def summarised(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 
 def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
-    """Tabulate errors and bytes per second and node, by run, estimator and sending policy."""
+    """Tabulate errors, and bytes per second per node, by run, estimator and sending policy."""
     policies = [(INTERVAL, "send_interval_s", value) for value in options.intervals_s]
     policies += [("when it has news", "send_divergence", value) for value in options.divergences]
     parts = []

@@ -1,9 +1,9 @@
 """Study of positions from ranges outdoors: uwb_outdoor, compared with published tracks.
 
-Published errors are for a part of each path, which begins and ends when the path enters given regions.
-The truth is interpolated linearly, after samples with a wrong height are removed (see `level_m`).
-Published tracks are evaluated at their own stamps, and our estimates are evaluated at the stamps of the
-truth.
+Published errors refer to a part of each path; this part begins and ends when the path enters given
+regions. The truth is interpolated linearly, after samples with a wrong height are removed (see
+`level_m`). Published tracks are evaluated at their own stamps, and our estimates are evaluated at the
+stamps of the truth.
 """
 
 import re

@@ -173,7 +173,7 @@ def _relative(found: Floats, wanted: Floats) -> float:
 def driven(
     experiment: Experiment, setting: Setting, name: str, drive: Record
 ) -> tuple[list[MemorySource], pd.DataFrame]:
-    """Record the runs of a drive, keep them in a folder with its name, and tabulate estimators and runs.
+    """Record a drive's runs, keep them in a folder named after it, and tabulate estimators and runs.
 
     Each row contains the state's dimension, the position RMSE, the mean NEES per component, and the CPU
     time in ms of all cores per second of a run, averaged over all runs.
@@ -202,7 +202,7 @@ def driven(
 
 
 def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
-    """Measure errors with intervals over functions, and log ratios of errors of `RATED` to others."""
+    """Measure errors with intervals over functions, and logs of `RATED`'s errors relative to others."""
     for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
         case = f"n{dimension}-{direction}"
         for quantity in ("mean_error", "covariance_error", "cross_error"):
@@ -253,7 +253,7 @@ def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
 
 
 def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
-    """Draw a line for each family of samplings, and a horizontal line for the EKF, which uses none."""
+    """Draw a line per family of samplings, and a horizontal line for the EKF, which has no samples."""
     x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
     panel = Panel(x=x, y=y, title=title)
     mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()

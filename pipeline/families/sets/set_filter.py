@@ -154,7 +154,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """Count right, wrong and missing decisions of a filter on whether a frame or its past is faulty."""
+    """Count right, wrong and missing decisions of a filter between a faulty frame and a faulty past."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())
@@ -173,7 +173,7 @@ def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]
 
 
 def _chart(summary: pd.DataFrame) -> Chart:
-    """Draw area and containment by robot."""
+    """Draw the sets' median area, and how often they contain the robot, by robot."""
     panels = []
     for quantity, label in (
         ("area_m2", "median area (m²)"),

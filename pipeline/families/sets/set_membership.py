@@ -1,7 +1,7 @@
-"""Study of set-valued fixes, by their areas, containment of the truth, and faults.
+"""Study of set-valued fixes: their areas, how often they contain the truth, and faults.
 
-The paper, Briechle, Hanebeck (2004), has figures without numbers. If the experiment is simulated, the
-scene of section V is recorded in addition to the experiment's own runs.
+The paper, Briechle, Hanebeck (2004), shows its results as figures, without numbers. If the experiment is
+simulated, the scene of section V is recorded in addition to the experiment's own runs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -70,9 +70,9 @@ def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
 def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
     """Measure the share of sets that contain the truth, the median area, and the number of violations.
 
-    A violation is a set without the truth although its bounds hold and the robot is in the arena; robots
-    outside the arena are counted separately. Metrics are per case and for all cases, over the frames
-    with a truth.
+    A violation is a set that does not contain the truth although its error bounds are met and the robot
+    is in the arena; robots outside the arena are counted separately. Metrics are computed for each case
+    and for all cases together, over the frames that have a truth.
     """
     metrics: dict[str, MetricValue] = {}
     together: dict[str, list[JudgedSets]] = {}
@@ -146,7 +146,7 @@ def _set_chart(replayed: Replayed, title: str) -> Chart:
 
 
 def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
-    """Draw containment and area by estimator."""
+    """Draw, by estimator, the area of the sets and how often they contain the truth."""
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
     labels = {
         "containment_share": "share of sets that contain the truth",

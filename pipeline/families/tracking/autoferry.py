@@ -33,7 +33,7 @@ from fuselog.replay.families.tracking.judging.errors import Judged, instants_of,
 
 
 class AutoferryOptions(Parameters):
-    """The comparisons, and the policies for late scans.
+    """The estimators to compare, and the policies for late scans to try.
 
     Attributes:
         compared: pairs of estimators to compare, the first with the second.
@@ -102,7 +102,7 @@ def _late_table(
     """Tabulate the results by estimator, policy for late scans, and scenario.
 
     `from_in_order_m` is the largest distance from the tracks in stamp order, after the last late scan;
-    it is infinite if the tracks have different numbers.
+    it is infinite if the track numbers differ.
     """
     tables = []
     known = experiment.estimators
@@ -135,7 +135,7 @@ def _last_late_ns(source: MemorySource) -> int:
 def _farthest(
     in_order: Mapping[str, Ragged], outputs: Mapping[str, Ragged], label: str, run: int, from_ns: int
 ) -> float:
-    """Compute the largest distance between the tracks of two replays after a time."""
+    """Compute the largest distance between the tracks of two replays, from a given time on."""
     sizes, tracks = sets_of(in_order, label, run)
     stamps = np.unique(sizes.publish_time_ns)
     stamps = stamps[stamps >= from_ns]

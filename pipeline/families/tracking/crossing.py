@@ -82,7 +82,7 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
-    """Measure how much differences in GOSPA between estimators grow from least to most clutter."""
+    """Measure how much GOSPA differences between estimators grow from the least to the most clutter."""
     for probability, rows in every.groupby("detection_probability", sort=False):
         by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
         for label, other in pairs:

@@ -27,10 +27,11 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """Return each file's topics and lines by its name: a file of tracks per tracker, and one of truths.
+    """Return the topics and lines of each file, by file name: a file per tracker, and one of truths.
 
     `topics` contains the wanted topics, or is empty for all. Raises BadInput if a requested topic does
-    not exist or has neither tracks nor truths in the plane, or if the log has no such topic.
+    not exist or has neither tracks nor truths in the plane, or if the log has no topic with tracks or
+    truths.
     """
     unknown = [topic for topic in topics if topic not in log.topics]
     if unknown:

@@ -117,7 +117,7 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
 def measure_changes(
     table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
 ) -> None:
-    """Measure the differences in quantities between the given pairs of estimators."""
+    """Measure the differences in quantities between the two estimators of each given pair."""
     for label, other in pairs:
         if {label, other} <= set(table["estimator"]):
             for quantity in [name for name in COMPARED if name in table]:

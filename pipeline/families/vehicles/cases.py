@@ -84,7 +84,7 @@ class Case(NamedTuple):
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
-    """Read the stamps (runs, steps) after the start, and true positions (runs, steps, vehicles, 2)."""
+    """Read stamps (runs, steps) and true positions (runs, steps, vehicles, 2), except the first step."""
     numbers = vehicle_numbers(sources[0].topics)
     topics = [f"/vehicle{number}/truth" for number in numbers]
     read = [source.read(topics) for source in sources]

@@ -58,7 +58,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """Growth of computing time with the number N of vehicles, over the larger half of the numbers."""
+    """Growth of computing time with the number N of vehicles, fitted to the larger half of all N."""
 
     power: float
     factor: float

@@ -64,7 +64,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """Compute the scores of all estimators, also slow ones, in the first `few_runs` runs of a case."""
+    """Compute the scores of all estimators, including slow ones, in a case's first `few_runs` runs."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]

@@ -109,7 +109,7 @@ class Findings:
         tables: the result's metrics by case.
         rows: a row per estimator, case and run, with quantities; may be empty.
         runs: the number of runs.
-        labels: the estimators in order, without bounds.
+        labels: the estimators in order, excluding bounds.
         bounds: labels of bounds, which cannot be chosen as estimators.
         stress: the effect of changes that should not matter, by estimator; empty if not tested.
         pairs: quantities that a study measured for pairs of estimators.
@@ -265,7 +265,7 @@ class Findings:
 
 
 def relation(found: Findings, first: str, second: str) -> Comparison | None:
-    """Compare the second estimator's error with the first's by run; return None if runs are too few.
+    """Compare the second estimator's error with the first's by run; return None for too few runs.
 
     With few runs, two errors within the margin count as a tie.
     """
@@ -306,7 +306,7 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
 
 
 def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
-    """Collect metrics of pairs of estimators, whose case begins with the second estimator's label."""
+    """Collect metrics of pairs of estimators; their cases begin with the second estimator's label."""
     labels = {split_metric(key)[0] for key in metrics}
     found: dict[str, list[Pair | None]] = {}
     for key, value in metrics.items():

@@ -26,7 +26,7 @@ GAP_LIMIT_S = 0.2
 
 @dataclass(frozen=True)
 class Followed:
-    """The errors of an estimator's position over time, next to the truth.
+    """The position errors of an estimator over time, together with the truth.
 
     Attributes:
         time_s: (n,) time since the first estimate.

@@ -118,7 +118,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
-    """Find start and length of the typical second (longer for rare estimates), or (0, 0) for too few."""
+    """Find the typical second's start and length (longer for rare estimates); (0, 0) if too few."""
     if not followed or min(len(each.time_s) for each in followed) < DOTS:
         return 0.0, 0.0
     step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)

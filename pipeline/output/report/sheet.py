@@ -35,7 +35,7 @@ GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
 
 
 class Cell(NamedTuple):
-    """A number in a table, with its small print, and whether it is the best or out of bounds."""
+    """A number in a table, with a note in small print, and whether it is the best or out of bounds."""
 
     text: str
     small: str = ""
@@ -71,7 +71,7 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """Make the table of a result, and one per case if there are several; (None, []) without numbers.
+    """Make the table of a result, and one for each of several cases; (None, []) if it has no numbers.
 
     The recommended estimator is in the first column, which is visible even if the table is wider
     than the page.

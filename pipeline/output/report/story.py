@@ -289,7 +289,7 @@ def _times(factor: float) -> str:
 
 
 def _claim(each: Evidence, runs: int) -> str:
-    """Compare errors with the covariance that the estimator states, in a few words."""
+    """Describe in a few words how errors compare with the covariance that the estimator states."""
     by = each.decisive
     if by is None:
         return "its covariance was not judged"

@@ -98,7 +98,7 @@ class Sweep:
         return self._findings(found, {"runs": pd.concat(rows)} if rows else {})
 
     def _findings(self, rows: Mapping[str, Mapping[Any, Any]], tables: Tables) -> Findings:
-        """Collect findings on rows of the table, by the key of the metric."""
+        """Collect findings from rows of the table; `rows` maps the keys of metrics to these rows."""
         metrics = {key: row["value"] for key, row in rows.items()}
         bounds = {
             key: (row["bound_low"], row["bound_high"])
@@ -183,7 +183,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
-    """Find the point with an estimator's smallest error, without overconfident points if possible."""
+    """Find the point with an estimator's smallest error, ignoring overconfident points if possible."""
     sure = [point for point in own.index if sweep.is_overconfident(label, int(point))]
     left = own.drop(sure) if len(sure) < len(own) else own
     return int(left.index[int(left.to_numpy().argmin())])

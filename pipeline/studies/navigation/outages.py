@@ -82,7 +82,7 @@ def rows_of(source: MemorySource) -> Rows:
 
 
 def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> list[Window]:
-    """Find the windows of a length with truth in all rows, including the rows before and after."""
+    """Find windows of this length in which all rows, and those just before and after, have a truth."""
     since_s = rows.since_s
     found = []
     for start_s in np.arange(first_s, since_s[-1] - length_s, every_s).tolist():

@@ -22,7 +22,7 @@ from fuselog.recorders.compiling.kinds import Value
 
 
 class Wider(Exception):
-    """A signal that a variable needs a wider numeric type than its first assignment has."""
+    """The exception raised if a variable needs a wider numeric type than that of its first value."""
 
 
 class Frame(Expressions):

@@ -2,8 +2,8 @@
 
 Statements are lowered here, expressions in `expressions`. A name that is assigned only once, before all
 of its uses, is replaced by its value; other names are variables in memory, which LLVM turns into
-registers. Known values are evaluated: an `if` with a known condition has one branch, and a loop over a
-tuple is unrolled.
+registers. Known values are evaluated: only the branch that is taken is lowered if the condition of an
+`if` is known, and a loop over a tuple is unrolled.
 """
 
 import ast
@@ -182,7 +182,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Lower `return`; outside of branches the value may stay known; inside, it is kept in memory."""
+        """Lower `return`: in a branch, its value is kept in memory; elsewhere, it may stay known."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it created; pass it an array to fill")

@@ -58,7 +58,7 @@ def delay_between(
     longest_s: float,
     weighting: Weighting = "phat",
 ) -> Delay:
-    """Measure the delay of `late` (samples,) relative to `early`, at most `longest_s` either way.
+    """Measure the delay of `late` (samples,) relative to `early`, from -`longest_s` to `longest_s`.
 
     The delay is the root of the equation sum w omega sin(remaining phase) = 0. Its variance is estimated
     from the remaining phases (the sandwich estimator of Huber, "The behavior of maximum likelihood

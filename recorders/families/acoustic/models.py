@@ -48,9 +48,9 @@ def fired_from(
 ) -> tuple[Component, Component]:
     """Find the position of a source when it emitted the sound that a sensor hears now.
 
-    The source is at `place` now. The travel time of the sound follows from the current distance, and is
-    corrected once. The remaining error is of second order in velocity over the speed of sound: 2 cm at 1
-    km and 1.5 m/s.
+    `place` is the current position of the source. The travel time of the sound follows from the current
+    distance, and is corrected once. The remaining error is of second order in the ratio of the velocity
+    to the speed of sound: 2 cm at 1 km and 1.5 m/s.
     """
     x, y = place
     for _ in range(2):
@@ -60,7 +60,7 @@ def fired_from(
 
 
 def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
-    """Find the side of the line of fire on which a sensor hears the shockwave: +1 or -1; 0 if unheard.
+    """Find the side of the line of fire on which a sensor hears the shockwave: +1, -1, or 0 if unheard.
 
     A sensor hears the shockwave at angles to the line of fire between 0 and 90 deg minus the Mach angle,
     both excluded (figure 2). Eq (7) agrees, except for angles that need wrapping.
@@ -75,7 +75,7 @@ def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) ->
 
 
 def measured_side(azimuth: Component, shockwave: Component) -> Component:
-    """Infer the side of the line of fire from the two directions of arrival only."""
+    """Infer the side of the line of fire using only the two directions of arrival."""
     return -np.sign(wrap_angle(azimuth - shockwave))
 
 

@@ -1,10 +1,10 @@
 """Shots of a moving shooter, heard by sensors at known positions, with some wrong detections.
 
-The velocity changes by white acceleration, and the direction of the shots by a random walk. Each shot is
-heard from the position at which it was fired, when its sound arrives. A sensor may miss a shot; it may
-mistake an echo, which comes later and from any direction, for the muzzle blast; or it may combine the
-muzzle blast with the shockwave of another shot. `/shooter/reports` contains the reports of all sensors
-to a fusion centre; `/sensors` contains the positions of the sensors.
+The velocity changes by white acceleration, and the direction of the shots by a random walk. The sound of
+each shot comes from the position at which the shot was fired, and is heard when it arrives. A sensor may
+miss a shot; it may mistake an echo, which comes later and from any direction, for the muzzle blast; or
+it may combine the muzzle blast with the shockwave of another shot. `/shooter/reports` contains the
+reports of all sensors to a fusion centre; `/sensors` contains the positions of the sensors.
 """
 
 from typing import Annotated, NamedTuple
@@ -89,7 +89,7 @@ def simulate(parameters: ShotSequenceParameters, rng: np.random.Generator) -> Re
     path, aims = _path(parameters, len(path_s), path_rng), _aims(parameters, path_rng)
 
     def state_at(times_s: Floats) -> Floats:
-        """Compute the states (n, 5); the aim is the aim of the last shot."""
+        """Compute the states (n, 5); the direction of aim is that of the last shot."""
         shot = np.searchsorted(shots_s, times_s, side="right") - 1
         x, y, vx, vy = (np.interp(times_s, path_s, column) for column in path.T)
         return np.stack([x, y, wrap_angle(aims[shot]), vx, vy], axis=1)

@@ -50,8 +50,7 @@ class SoundRecordingsParameters(Parameters):
             sampling rate.
         weighting: weights of frequencies in the correlation of two recordings: equal (phat), or by
             strength (none).
-        clipped_share: share of samples at the greatest value; a file with a larger share is reported as
-            clipped.
+        clipped_share: share of samples at the greatest value above which a file is reported as clipped.
         truth_m: true positions of sounds (x, y or x, y, z), by name.
     """
 
@@ -291,7 +290,7 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """Yield one sound's differences, and the truth if known; nothing if too few microphones hear it.
+    """Yield one sound's differences, and the truth if known, unless too few microphones hear the sound.
 
     The search window extends beyond the sound on both sides by the sound's travel time between the
     microphones. Files that do not cover the sound, or are silent during it, are skipped.

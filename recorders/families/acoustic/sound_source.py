@@ -30,8 +30,8 @@ class SoundSourceParameters(Parameters):
 
     Attributes:
         microphones_m: positions of the microphones (x, y, z).
-        reach_m: half the side of the box that contains the source, centred on the microphones' mean
-            position; if all microphones have the same height, the source has it too.
+        reach_m: half the side length of the box that contains the source, centred on the microphones'
+            mean position; if all microphones have the same height, the source has this height too.
         sound_s: length of the sound.
         rate_hz: sampling rate.
         band_hz: lowest and highest frequency of the sound, in Hz.

@@ -1,7 +1,7 @@
 """Simulated scores of two face and two finger matchers, similar to NIST BSSR1 set 1.
 
-A standard normal number per comparison is mapped to a score by a table of knots. The normal numbers are
-sums of a part for the probe's user, a part for the gallery's user and a remainder. The tables were
+A standard normal number per comparison is mapped to a score by a table of knots. Each normal number is
+the sum of a term for the probe's user, a term for the gallery's user and a remainder. The tables were
 fitted to the real scores.
 """
 
@@ -125,7 +125,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
-    """Draw users' effects: a few have poor fingers, all others better ones, to keep the marginals."""
+    """Draw users' effects: a few users get poor fingers, others better ones, to keep the marginals."""
     from scipy.stats import norm  # which takes long to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
@@ -181,7 +181,7 @@ def _user_correlation() -> Floats:
 
 
 def _rest_correlation() -> Floats:
-    """Find the correlation (4, 4) that both parts of the remainder share, given that of their sum."""
+    """Compute the correlation (4, 4) of each of the remainder's two terms from that of their sum."""
     correlation = np.full((4, 4), OTHER_REST_CORRELATION)
     for pair, value in REST_CORRELATION.items():
         row, column = ("CGLR".index(name) for name in pair)

@@ -25,7 +25,7 @@ def turn_together(
 def turn_on(
     direction: Component, turn: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """Compute the next direction and the next turn, without noise; a part of each turn persists.
+    """Compute the next direction and the next turn, without noise; a fraction of each turn persists.
 
     The turn is an angle too: a turn by more than half a revolution is the same as the opposite turn.
     """

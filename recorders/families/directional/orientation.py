@@ -20,13 +20,13 @@ from fuselog.recorders.recording import Recording, Simulator, simulation_stamps_
 
 
 class AxisParameters(Parameters):
-    """The paper's two-dimensional evaluation, (54)-(56); the true start differs from the prior's mode.
+    """The paper's two-dimensional evaluation, (54)-(56); the initial truth is not the prior's mode.
 
     Attributes:
         steps: number of time steps.
         step_s: length of a time step.
-        start: true orientation at the start, a unit vector.
-        prior: distribution of the orientation at the start, as filters assume it.
+        start: true initial orientation, a unit vector.
+        prior: distribution of the initial orientation, as filters assume it.
         system: distribution of the rotation in a step.
         measurement: distribution of the rotation error of a measurement.
     """

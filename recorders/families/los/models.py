@@ -20,7 +20,7 @@ def azimuth_elevation(x: Components) -> tuple[Component, Component]:
 
 
 def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
-    """Compute azimuth and elevation gradients in `x` (rad/m); eqs (71)-(76), with (74) corrected."""
+    """Differentiate azimuth and elevation with respect to `x` (rad/m); eqs (71)-(76), (74) corrected."""
     ground = np.hypot(x[0], x[2])
     squared = ground**2 + x[1] ** 2
     azimuth = (x[2] / ground**2, 0.0 * x[1], -x[0] / ground**2)
@@ -48,7 +48,7 @@ def line_of_sight(
 def line_of_sight_gradients(
     target: Components, sensor: Components, attitude: Components
 ) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
-    """Compute azimuth and elevation gradients for the target (rad/m) and yaw, pitch, roll (rad/rad).
+    """Differentiate azimuth and elevation with respect to target (rad/m) and attitude (rad/rad).
 
     The chain rule is applied backwards through the three rotations. The result equals eqs (45)-(103) of
     the appendix with the misprints in (67), (74), (89), (92) and (102) corrected.

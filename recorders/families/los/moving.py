@@ -1,6 +1,6 @@
 """Optical sensors on aircraft, with clock offsets and drifting attitude biases.
 
-Sensors fly at known poses, straight or weaving, and see the targets in turn, each sensor at its own
+Sensors fly straight or weave, with known poses. They see the targets in turn, each sensor at its own
 times. The frame is that of `fuselog.recorders.families.los.models`: y points up, and a sensor looks
 ahead, along its own z. The white noise that drives targets and biases is continuous, so the simulated
 values are exact at any time.

@@ -31,10 +31,10 @@ class OpticalParameters(Parameters):
     Attributes:
         sensor_position_m: positions of the sensors (x, y, z).
         target_position_m: positions of the targets (x, y, z).
-        nominal_attitude_deg: yaw, pitch and roll that each sensor states, one row per sensor or one row
+        nominal_attitude_deg: nominal yaw, pitch and roll of each sensor, one row per sensor or one row
             for all; 0 if not set.
-        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs, one row per sensor or
-            one row for all; 0 if not set.
+        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs from the nominal one,
+            one row per sensor or one row for all; 0 if not set.
         sigma_rad: standard deviation of azimuth and elevation.
         interval_s: time between sightings.
         passes: number of passes over all targets.
@@ -109,7 +109,7 @@ def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:
 
 
 def _mounting(number: int, place: Array, attitude: Array) -> list[Stream]:
-    """Make the streams of a sensor's position, known exactly, and of its nominal attitude."""
+    """Make the streams of a sensor's exactly known position and of its nominal attitude."""
     to_sensor = Rotation.from_euler("ZYX", attitude)
     start_ns = [SIMULATION_EPOCH_NS]
     return [

@@ -43,7 +43,7 @@ class Blocked(Parameters):
 
 
 class RangingParameters(Parameters):
-    """Tags on a moving trolley that measure ranges to anchors, and their errors.
+    """Tags on a moving trolley, the anchors to which they measure ranges, and the errors of the ranges.
 
     Anchors and tags are numbered from 0. All tags measure ranges to all anchors at the same time.
     Channels state only the white noise of ranges.

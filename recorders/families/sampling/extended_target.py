@@ -11,7 +11,7 @@ SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
 
 
 def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
-    """Compute a point of the rectangle; `scale` (-1 to 1 each) is in half sides from the centre."""
+    """Compute a point of the rectangle; `scale` (-1 to 1 per axis) is relative to the half sides."""
     return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
 
 

@@ -27,9 +27,10 @@ class ExtendedTargetParameters(Parameters):
         step_s: length of a time step.
         target: the true rectangle (half_x_m, half_y_m, x_m, y_m).
         point_variance_m2: variance of a measured point, per axis.
-        size_drift_m2: variance that a filter adds to half sides per step; the true rectangle has none.
-        position_drift_m2: variance that a filter adds to the position per step; the true rectangle has
-            none.
+        size_drift_m2: variance that a filter adds to the half sides per step; the true half sides are
+            constant.
+        position_drift_m2: variance that a filter adds to the position per step; the true position is
+            constant.
         prior_mean: mean of the prior (half_x_m, half_y_m, x_m, y_m).
         prior_variance_m2: variance of each component in the prior.
     """

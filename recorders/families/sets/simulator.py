@@ -1,7 +1,7 @@
-"""A robot at rest that measures relative bearings whose errors have a known bound.
+"""A stationary robot that measures relative bearings whose errors have a known bound.
 
-The scene is taken from Briechle and Hanebeck (2004), section V, or random. Every look measures all pairs
-of landmarks, or the given pairs.
+The scene is taken from Briechle and Hanebeck (2004), section V, or is drawn at random. Every look
+measures all pairs of landmarks, or the given pairs.
 """
 
 from typing import Annotated, Literal
@@ -30,13 +30,13 @@ class RelativeBearingsParameters(Parameters):
         bound_deg: bound of the error of a relative bearing; the channel states it.
         error_share: errors are uniformly distributed within this share of the bound.
         landmarks: number of landmarks of a random scene.
-        arena_m: side of the square arena that the log states, centred on the origin.
+        arena_m: side length of the square arena that the log states, centred on the origin.
         spread_m: largest distance of a random scene's landmarks from the centre in x and in y.
         robot_spread_m: largest distance of a random scene's robot from the centre in x and in y.
         looks: number of times that all pairs are measured.
         rate_hz: looks per second.
-        misidentified_probability: probability that a pair is measured with another landmark in place of
-            its first one.
+        misidentified_probability: probability that the first landmark of a pair is confused with another
+            one in a measurement.
         start_s: time of the first look, since the run's epoch.
     """
 

@@ -79,7 +79,7 @@ class Camera(Parameters):
         detection_probability: probability that a target is detected.
         clutter_per_rad: mean number of false detections in a scan, per angle.
         gate_probability: probability that a target's detection is inside its gate.
-        interval_s: time between the bearings that a track uses, since errors of bearings last for
+        interval_s: time between the bearings that a track uses, since bearing errors are correlated over
             seconds.
     """
 
@@ -207,7 +207,7 @@ def _scans(path: Path) -> Scans:
 
 
 def _places(measurement: Any, where: str) -> Floats:
-    """Read positions (n, 2) east and north: zero as [], one as [N, E], several as [[N ...], [E ...]]."""
+    """Read positions (n, 2) east and north: none as [], one as [N, E], several as [[N ...], [E ...]]."""
     if measurement == []:
         return np.empty((0, 2))
     rows = measurement if isinstance(measurement, list) else [measurement]

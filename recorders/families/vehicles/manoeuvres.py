@@ -22,7 +22,8 @@ Floats = NDArray[np.float64]
 class ManoeuvresParameters(Parameters):
     """A vehicle that drives straight, turns, stops and starts, and its position fixes.
 
-    A turn is one sixth to five twelfths of a circle to either side.
+    standard deviation of the acceleration that the prior's channel states for driving straight; the true
+    acceleration is zero then.
 
     Attributes:
         duration_s: length of the run.
@@ -90,7 +91,7 @@ def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Ge
     pose, speed = (0.0, 0.0, rng.uniform(-np.pi, np.pi)), parameters.speed_mps
 
     def after(part: Part, span_s: Floats) -> tuple[Floats, ...]:
-        """Compute poses and speeds at times after the beginning of a part."""
+        """Compute poses and speeds at durations after the beginning of a part."""
         mean_mps = speed + 0.5 * part.acceleration_mps2 * span_s
         moved = drive(pose, (mean_mps, part.turn_radps), span_s)
         return *moved, speed + part.acceleration_mps2 * span_s

@@ -52,8 +52,9 @@ class RosParameters(Parameters):
             become estimates, which `fuselog evaluate` judges, not measurements.
         mapping: TOML file with mappings of user-defined messages.
         distribution: distribution whose definitions are used for messages that the bag does not define.
-        clock_tolerance_s: largest difference between topics in the offset of the header's clock from the
-            bag's clock; if it is exceeded, the topics' clocks are unrelated, and the import stops.
+        clock_tolerance_s: each topic has an offset between the clocks of its headers and of the bag; if
+            the offsets of topics differ by more than this, the topics' clocks are unrelated, and the
+            import stops.
         origin: latitude and longitude (deg) and optionally height (m) of the origin of the local tangent
             plane of poses and positions, regardless of the names of their frames. It does not apply to
             transforms, nor to poses that odometry integrates.

@@ -78,7 +78,7 @@ class _Text(NamedTuple):
 
 @dataclass
 class Layout:
-    """The position of each field of a message, valid for equal lengths of texts and sequences.
+    """The positions of all fields in messages whose texts and sequences have the same lengths.
 
     Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` has
     the bytes of all lengths, by position; they are the same in every message of the layout.

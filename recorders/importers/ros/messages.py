@@ -196,7 +196,7 @@ def _magnetic(messages: Messages) -> Iterator[Part]:
 
 
 def _odometry(messages: Messages) -> Iterator[Part]:
-    """Yield the twist, for the plane and in full, and the pose that the robot integrated from it."""
+    """Yield the twist, in the plane and in space, and the pose that the robot integrated from it."""
     velocity, turn = vector(messages, "twist.twist.linear"), vector(messages, "twist.twist.angular")
     beside = np.abs(np.concatenate([velocity[:, 1:], turn[:, :2]], axis=1)).max(axis=1)
     spread = covariance(messages, "twist.covariance")

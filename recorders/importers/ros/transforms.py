@@ -143,7 +143,7 @@ class Chain:
             self.left_out += int((found.stamp_ns <= self._done_ns).sum()) if pair == self._leader else 0
 
     def composed(self, *, is_last: bool = False) -> Transforms | None:
-        """Compose the pair's poses since the last call, up to where the whole chain is known."""
+        """Compose the pair's poses since the last call, up to where all links of the chain are known."""
         if self._leader is None or not all(self._held.values()):
             return None
         held = {link: join(parts) for link, parts in self._held.items()}

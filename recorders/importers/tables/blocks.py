@@ -69,7 +69,7 @@ class Chunks(io.RawIOBase):
         self._chunks, self._rest = chunks, b""
 
     def readable(self) -> bool:
-        """Return True, which makes this a readable file."""
+        """Return True: this file can be read."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
@@ -126,7 +126,7 @@ def joined(opened: Callable[[Path], BinaryIO], paths: Sequence[Path]) -> Iterato
 
 
 class Tagged(NamedTuple):
-    """Rows of one kind: their beginnings, the marks around the cells, the columns and their units.
+    """Rows of one kind: the texts with which they begin, the marks around cells, the columns, the units.
 
     `invalid` matches rows that report no solution.
     """

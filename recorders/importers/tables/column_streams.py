@@ -359,7 +359,7 @@ _TRUE = r"(^|_)(ground_?truth|truth|gt|mocap|vicon|optitrack)(_|$)"
 
 
 def true_columns(columns: list[GuessedColumn], *, is_reference: bool) -> list[GuessedColumn]:
-    """Remove the columns named as truth from the list; return them, named without the word for truth.
+    """Remove the true columns from the list; return them under names without the word for truth.
 
     Args:
         columns: columns of a table.
@@ -446,7 +446,7 @@ def _truth(
 
 
 def _heading(table: GuessedTable) -> Iterator[str]:
-    """Write headings next to fixes; courses are not used, since they are undefined at rest."""
+    """Write headings next to fixes; courses are not used, since they are undefined without motion."""
     if not table.places or not (found := take(table.columns, _HEADING_ALONE, usual="rad")):
         return
     is_compass = is_ais(table) or bool(re.search("compass|course|heading|hdg", found[0].plain))

@@ -26,7 +26,7 @@ class GuessedColumn(NamedTuple):
         plain: name in lower case, without unit and frame.
         unit: unit that the name or a row of units states; empty if there is none.
         values: numbers (rows,).
-        unknown: text at the place of the unit, if it is not a known unit.
+        unknown: text found where the unit is expected, if it is not a known unit.
         frame: "ned" for axes north, east, down, "enu" for east, north, up; empty if unknown.
     """
 
@@ -122,7 +122,7 @@ def stated_unit(column: GuessedColumn, usual: str) -> str:
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """Choose the unit that gives a vector its expected length, or the first; return the reason too."""
+    """Choose the unit in which a vector has its expected length, or the first; return the reason too."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
@@ -263,7 +263,7 @@ def direction_of(
     """Determine a heading's unit and convention from the course of positions, or from its numbers.
 
     A heading may be unwrapped, so its largest value does not determine the unit. `usual` states whether
-    such a heading is usually a compass heading; it is used if the course is not clear.
+    such a heading is usually a compass heading; this is assumed if the course is not clear.
     """
     stated = stated_unit(heading, "rad")
     units = [stated] if stated else _angle_units(largest_of([heading]))

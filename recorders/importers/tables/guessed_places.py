@@ -295,7 +295,7 @@ def _degrees(name: str, values: NDArray) -> NDArray:
 
 
 def _by_speed(table: GuessedTable, pair: tuple[NDArray, NDArray], fitting: Sequence[str]) -> list[str]:
-    """Return the units in which positions agree with a column of speeds, or all if there is none."""
+    """Return the units in which positions agree with the column of speeds; all without such a column."""
     speed = column_named(table.whole, _SPEED)
     if speed is None or len(fitting) == 1:
         return list(fitting)

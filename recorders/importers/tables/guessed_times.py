@@ -443,7 +443,7 @@ def _toml(mapping: TimeMapping) -> str:
 
 
 def _dates(table: _Table, dated: set[str]) -> Iterator[tuple[TimeMapping, list[str]]]:
-    """Yield dates and times as texts, and add the names of their columns to `dated`."""
+    """Yield dates and times from columns of text, and add the names of these columns to `dated`."""
     plain = {name: parted(name)[0] for name in table.texts}
     days = [name for name in plain if re.fullmatch("(.*_)?(date|day)", plain[name])]
     days += [column.name for column in table.columns if re.fullmatch("(.*_)?date", column.plain)]
@@ -589,7 +589,7 @@ def _has_zone(kind: pa.DataType) -> bool:
 def _continuous(table: _Table, names: Sequence[str], stamps_by: Mapping[str, Stamps]) -> str:
     """Choose the format in which rows follow one another without jumps of months or years.
 
-    Raises BadInput if several formats do so equally well: the day is ambiguous.
+    Raises BadInput if several formats do so equally well, since the day is then ambiguous.
     """
     spans = {}
     for pattern, stamps in stamps_by.items():

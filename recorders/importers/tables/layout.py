@@ -140,7 +140,8 @@ def _delimiter(lines: Sequence[str]) -> str:
 def _first(rows: list[list[str]], has_header: bool | None, *, is_searched: bool) -> tuple[int, bool]:
     """Return the index of the table's first line, and whether it names the columns.
 
-    Lines above a header with another number of cells than the rows are not part of the table.
+    Lines above a header are not part of the table if all of them have another number of cells than the
+    rows.
     """
     if has_header is not None:
         return 0, has_header
@@ -169,7 +170,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _names_columns(head: list[str], below: Iterable[list[str]]) -> bool:
-    """Test whether a line names columns: words only, or words above values and 1 to 3-digit numbers."""
+    """Test whether a line names columns: only words, or words above values and 1 to 3-digit numbers."""
     is_word = [not _is_value(cell) and cell.lower() not in MISSING for cell in head]
     values = [cell for cell in head if _is_value(cell)]
     if not values:

@@ -87,9 +87,10 @@ class Attitude(Parameters):
     The quaternion rotates to a frame of east, north, up.
 
     Attributes:
-        heading: column of the angle clockwise from north; with it `pitch` is nose up, as for aircraft.
-        yaw: column of the angle anticlockwise from east, instead of a heading; with it `pitch` is nose
-            down.
+        heading: column of the angle clockwise from north; `pitch` is then positive with the nose up, as
+            for aircraft.
+        yaw: column of the angle anticlockwise from east, instead of a heading; `pitch` is then positive
+            with the nose down.
         pitch: column of the pitch.
         roll: column of the roll, positive with the right side down.
         unit: unit of the angles.
@@ -110,8 +111,8 @@ class TableStream(StreamMapping):
         delay_s: time from a message's measurement to its stamp.
         only_first: whether only the first row is used, as for a prior.
         every: number of rows in a group, of which only the first is used.
-        noise: standard deviation of white Gaussian noise to add, by field; this makes fixes from a known
-            path.
+        noise: standard deviation of white Gaussian noise to add, by field; this simulates fixes along a
+            known path.
     """
 
     topic: str = Field(pattern=r"^/\S+$")
@@ -448,7 +449,7 @@ def fitted(pattern: str, name: str) -> dict[str, str] | None:
 
 
 def _before(part: str, *, is_wild: bool, name: str, after: int) -> int:
-    """Find where a part may begin if it ends at one of the positions in `after`."""
+    """Find where a part of a pattern may begin if it ends at one of the positions in `after`."""
     if not is_wild:
         return sum(1 << place for place in _places(part, name) if after >> (place + len(part)) & 1)
     # bit k: character k is not a slash

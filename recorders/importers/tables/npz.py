@@ -38,7 +38,7 @@ class _Array(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """A column: its array, and its index there."""
+    """A column: its array, and its index in that array."""
 
     array: _Array
     number: int

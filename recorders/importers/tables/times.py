@@ -93,7 +93,7 @@ class TimeMapping(Parameters):
             started, and the counter's rate.
         rollover: number at which the counter rolls over to 0, such as 4294967296; it is then unwrapped.
         order: order of the rows; "rising" allows single late rows, and reverses a file whose rows are
-            newest first; "any" sorts rows whatever their times are.
+            newest first; "any" sorts rows regardless of their order.
         file: a file with the times of the rows, one in each line, instead of a column; a path relative
             to the given folder.
     """
@@ -466,7 +466,7 @@ def _from_zone(
 ) -> Stamps:
     """Convert stamps (n,) from a zone's local time to UTC.
 
-    If an hour occurs twice, rows belong to its second occurrence after their times go back. Raises
+    If an hour occurs twice, rows belong to its second occurrence once the times have jumped back. Raises
     BadInput for a time that the clocks skip.
     """
     known = np.flatnonzero(local_ns != NOT_A_TIME)

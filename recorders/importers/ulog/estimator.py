@@ -46,7 +46,7 @@ class _Sensor(NamedTuple):
 
 
 def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
-    """Describe a sensor along north, east and down; `fields` and `bits` are (horizontal, vertical)."""
+    """Describe a sensor of north, east and down; `fields` and `bits` are (horizontal, vertical)."""
     (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
     every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
@@ -54,7 +54,7 @@ def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -
 
 
 def _flu(name: str, unit: str, bits: tuple[int, ...], axes: str = "xyz") -> _Sensor:
-    """Describe a sensor along the body's forward, right and down axes, or only the first of them."""
+    """Describe a sensor along the body's forward, right and down axes, or the first two of them."""
     fields = tuple(f"{name}[{index}]" for index in range(len(axes)))
     names = tuple(f"{name}_{axis}_{unit}" for axis in axes)
     return _Sensor(fields, names, (-1.0, 1.0, 1.0)[: len(axes)], (bits,) * len(axes))

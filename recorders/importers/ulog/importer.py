@@ -70,7 +70,7 @@ class _Surroundings(NamedTuple):
 
 
 def _surroundings(path: Path) -> _Surroundings:
-    """Read a log until its filter has stated its origin, and a receiver both of its heights."""
+    """Read a log until the filter's origin and both heights of a receiver are known."""
     place: list[float] | None = None
     separation_m: float | None = None
     file = UlogFile(path)
@@ -276,7 +276,7 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """Describe the use of parameters, by subject: as metadata, as settings, or why they are unused."""
+    """Describe which parameters are metadata, which are settings, and why others are not used."""
     notes = {}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:

@@ -65,7 +65,7 @@ class Fields(NamedTuple):
     separation_m: float = 0.0
 
     def named(self, name: str) -> str:
-        """Name a stream that most logs have once; the name of another instance contains its number."""
+        """Name a stream that most logs have once; names of further instances contain their numbers."""
         return name if self.is_first else f"{name}_{self.rows.topic}_{self.rows.instance}"
 
     def has(self, name: str) -> bool:
@@ -141,7 +141,7 @@ def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
 
 
 def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
-    """Apply a sensor's time, which is relative to the row's; keep each of its messages only once."""
+    """Apply a sensor's time, which is relative to the row's; drop repetitions of its messages."""
     relative_us = fields.rows.data[f"{sensor}_timestamp_relative"].astype(np.int64)
     is_valid = relative_us != _INVALID_US
     time_us = part.time_us + np.where(is_valid, relative_us, 0)

@@ -92,7 +92,7 @@ class Contents(NamedTuple):
 
 
 def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[bytes, bytes]:
-    """Encode the Chunk record of `data`: everything before the compressed bytes, and these bytes."""
+    """Encode `data` as a Chunk record; return what precedes the compressed bytes, then these bytes."""
     packed = _COMPRESS[compression](data)
     name = b"" if compression == "none" else compression.encode()
     head = _CHUNK_HEAD.pack(*log_time, len(data), zlib.crc32(data), len(name))

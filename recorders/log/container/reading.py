@@ -116,7 +116,7 @@ class _Index(NamedTuple):
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """Return the index entry of the chunk at a place, if they match and the chunk is not empty."""
+        """Return the index entry of the chunk at `place`; None if they do not match or it is empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None

@@ -81,7 +81,7 @@ class Reading:
         delays: by topic, the parameter with the delay of the topic's messages.
         calibration: parameters of the mounting, scale, bias and delay of the model's sensors, each with
             the largest standard deviation at which its estimate is useful.
-        control_noise: control_noise(time in s for which a control message holds) -> by topic and index
+        control_noise: control_noise(time in s for which a control message applies) -> by topic and index
             of a component, the variance that the model states; empty if the model states no variance.
     """
 

@@ -50,7 +50,8 @@ class RunMonitor:
         seconds: computing time of the estimator in s, without one-time work such as compiling.
         usage: counts of how the estimator's measurements were used; None if they are not counted.
         static: the streams that the estimator starts from.
-        refused: the exception, if all runs raised one and they are only a part of an ensemble.
+        refused: the exception, if all of the given runs raised one and they are only a part of an
+            ensemble.
         plane: origin of the local tangent plane (ENU) of its estimates, if the runs state one.
     """
 

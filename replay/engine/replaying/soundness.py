@@ -84,8 +84,8 @@ def find_unsound(
 def are_clearly_sound(first: int, mean: Floats, covariance: Floats, work: Work) -> bool:
     """Test whether LANES estimates are finite, and their covariances symmetric and far from singular.
 
-    All of them are factorised together, without square roots, so that a step of one does not wait for
-    the step before it. If the result is False, `fault_of` decides.
+    All of them are factorised together, without square roots: while one factorisation waits for its
+    previous step, the processor works on the others. If the result is False, `fault_of` decides.
 
     Args:
         first: row of the first estimate.
@@ -119,7 +119,7 @@ def are_clearly_sound(first: int, mean: Floats, covariance: Floats, work: Work) 
 
 
 def fault_of(mean: Floats, covariance: Floats, factor: Floats) -> int:
-    """Return the index in `UNSOUND` of the fault of an estimate, apart from its stamp; -1 if sound.
+    """Return the index in `UNSOUND` of an estimate's fault, ignoring its stamp; -1 if it is sound.
 
     Args:
         mean, covariance: (d,), (t * t,) row-major.

@@ -105,7 +105,7 @@ class Usage:
                 self._note_maps(topic, ragged)
 
     def _note_maps(self, topic: str, ragged: Ragged) -> None:
-        """Record the landmark of the last run whose map states two positions for a landmark."""
+        """Find the last run whose map states two positions for a landmark, and record the landmark."""
         run, number = run_of_rows(ragged.offsets), ragged["landmark_id"]
         order = np.lexsort((number, run))
         run, number, place = run[order], number[order], ragged["position_m"][order]

@@ -102,7 +102,7 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
 
 
 def _renumbered(part: Stream, merged: list[str], metadata: Mapping[str, str]) -> Stream:
-    """Renumber a part's reasons by the merged list; indices outside its own list stay out of range."""
+    """Renumber a part's reasons by the merged list; invalid indices stay out of range."""
     places = np.array([*map(merged.index, _reasons(part)), len(merged)])
     numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
     columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}

@@ -1,4 +1,4 @@
-"""Measured vectors and their covariances, read by the components that streams state."""
+"""Measured vectors and their covariances, selected by the component names that streams state."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -48,8 +48,8 @@ class Vectors(NamedTuple):
 class MeasuredVectors(NamedTuple):
     """Measured vectors (n, d), their covariances (n, d, d), and which covariances are missing (n,).
 
-    A covariance that the log lacks (NaN, or a variance of zero) is computed from the given sigma;
-    without a sigma it is missing. Components of the vector that are NaN need no covariance.
+    If the log lacks a covariance (NaN, or a variance of zero), it is computed from the given sigma;
+    without a sigma, it is missing. Components of the vector that are NaN need no covariance.
     """
 
     value: Floats

@@ -38,7 +38,7 @@ def state_stream(
     Args:
         topic: topic of the stream.
         time_ns: (n,) stamps.
-        components: components components by name, with their kinds.
+        components: components by name, with their kinds.
         truth: topic of the truth; "" if there is no truth, None to leave the entry out of the metadata.
         mean: (n, d).
         covariance: (n, t, t).

@@ -91,7 +91,7 @@ class DerivedSource:
 
     @property
     def rejections(self) -> Rejections:
-        """Return the impossible messages that were left out of what it has read."""
+        """Return the impossible messages left out of everything read from the other source so far."""
         return self.of.rejections
 
 
@@ -299,7 +299,7 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the span of `topics`, by the clock `order`, as one block, not `block_messages`."""
+        """Yield the span of `topics` by the clock `order` as one block; ignore `block_messages`."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:

@@ -156,7 +156,8 @@ def subtract(estimate: Floats, truth: Floats, scalars: NDArray[np.int64], error:
 
     Args:
         estimate, truth: (n, components).
-        scalars: (m, 3), for each, its column, that of its error, and whether it is an angle.
+        scalars: (m, 3), for each component, its column, the column of its error, and whether it is an
+            angle.
         error: (n, tangent components), filled in these columns.
     """
     for row in range(len(error)):
@@ -179,7 +180,7 @@ def interpolate(
         state: (m, components).
         left, right: (n,).
         weight: (n,).
-        scalars: (m, 2), for each, its column, and whether it is an angle.
+        scalars: (m, 2), for each component, its column, and whether it is an angle.
         value: (n, components), filled in these columns.
     """
     for row in range(len(value)):

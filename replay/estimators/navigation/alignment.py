@@ -137,30 +137,31 @@ class AlignmentParameters(ModelParameters):
 
     The tilt is computed from the first samples. The body is assumed to be at rest until shortly before
     it first moves (`rest_margin_s`). The heading is the course at the first sufficient speed, minus the
-    turn that the gyro measured until then; without such a speed, the heading is unknown. Standard
+    rotation that the gyro measured until then; without such a speed, the heading is unknown. Standard
     deviations of the start that are not given are estimated from the data. Position and velocity are
     made so uncertain that their first messages determine them. The uncertainty of the tilt follows from
     the accelerometer's bias and the motion, the uncertainty of the gyro's bias from its mean at rest,
-    and the uncertainty of the heading from the differences between the course and the gyro's turn.
+    and the uncertainty of the heading from the differences between the course and the rotation that the
+    gyro measured.
 
     The mounting rotates the unit's axes to forward, left, up: by yaw about up, then pitch about left,
     then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: angles of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: relative excess of the measured over the true force,
-            per axis.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: relative excess of the measured over the true rate, per
-            axis.
+        force_scale_x, force_scale_y, force_scale_z: how much the measured force exceeds the true force,
+            as a fraction of the true force, per axis.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: how much the measured rate exceeds the true rate, as a
+            fraction of the true rate, per axis.
         fix_delay_s: delay of position fixes: time from the measurement to the stamp.
         velocity_delay_s: delay of velocities: time from the measurement to the stamp.
         inertial_delay_s: delay of inertial samples: time from the measurement to the stamp.
         level_s: duration of the first samples, from which the tilt is computed.
-        still_mps: speed above which the body counts as moving.
+        still_mps: speed above which the body is considered to be moving.
         rest_margin_s: the body is assumed to be at rest until this time before its first motion.
         course_mps: speed above which the course determines the heading.
-        course_s: duration over which courses are compared with the turn of the gyro to estimate the
-            heading's standard deviation.
+        course_s: duration over which courses are compared with the rotation that the gyro measured, to
+            estimate the heading's standard deviation.
         start_sigma_m: standard deviation of the position at the start, per axis.
         start_sigma_mps: standard deviation of a measured velocity at the start, per axis.
         unmeasured_sigma_mps: standard deviation of the velocity at the start if it is not measured, per
@@ -212,7 +213,7 @@ def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the start from the first fix in the samples' time span and the velocity nearest in time.
+    """Find the initial state from the first fix during the samples and the velocity nearest in time.
 
     Args:
         streams: streams: `inertial` (samples), `fix` (positions in the local tangent plane: east, north,
@@ -283,7 +284,7 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """Return a wide covariance (3, 3) for a start from a message that is also used as a measurement."""
+    """Return a wide initial covariance (3, 3); its message is also used as a measurement."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
@@ -312,7 +313,7 @@ def _first_place(
 ) -> tuple[int, Floats, Floats]:
     """Return time, position (3,) and covariance (3, 3) of the first fix within the samples.
 
-    A fix in the plane has the height of the origin. Raises BadInput if there is no such fix.
+    A fix without a height has the height of the origin. Raises BadInput if there is no such fix.
     """
     sigma = stated_or(parameters.sigma_fix_m, USUAL_SIGMA_M)
     places = read_fixes(fix, "position_m", "covariance_m2", SPACE, sigma)
@@ -355,7 +356,7 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
 def _bias(
     samples: ImuSamples, topic: str, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[Floats, float]:
-    """Return the mean turn rate (3,) at rest, or zeros if there is no rest, and its standard deviation.
+    """Return the mean turn rate (3,) at rest, or zeros if never at rest, and its standard deviation.
 
     The standard deviation is computed from the rotation of the earth and from the means over intervals
     of `level_s`, which differ because of noise and motion.
@@ -407,7 +408,7 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
 def _turned(
     samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the times (n,) in s from the start to later samples, and the turn about the vertical."""
+    """Return later samples' times (n,) in s since the start, and the rotation about the vertical."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
@@ -427,7 +428,7 @@ def _heading(
 ) -> tuple[float, float] | None:
     """Find the heading at the start and its standard deviation in rad, or None without motion.
 
-    The heading is the first course, minus the body's turn about the vertical axis until then. If the
+    The heading is the first course, minus the body's rotation about the vertical axis until then. If the
     body faces its direction of motion, all later courses give the same heading; their differences
     determine the standard deviation.
     """

@@ -1,9 +1,9 @@
 """Orientation of a body that is carried around, from gyro, accelerometer and magnetometer.
 
-The state is the rotation, the gyro's bias, the velocity, and the local magnetic field. The accelerometer
-drives the velocity, which stays small because the body is carried around. Over seconds, motion therefore
-averages out and gravity remains, as in Laidig and Seel, "VQF", Information Fusion 91, 2023, but here
-with a known uncertainty. The gate rejects disturbed fields.
+The state is the rotation, the gyro's bias, the velocity, and the local magnetic field. The velocity is
+integrated from the accelerometer; it stays small because the body is carried around. Over seconds,
+motion therefore averages out and gravity remains, as in Laidig and Seel, "VQF", Information Fusion 91,
+2023, but here with a known uncertainty. The gate rejects disturbed fields.
 """
 
 from collections.abc import Mapping
@@ -50,9 +50,9 @@ class AttitudeParameters(ModelParameters):
         gravity_mps2: acceleration of gravity.
         sigma_velocity_mps: standard deviation of the velocity, whose mean is zero.
         sigma_field_ut: standard deviation of the magnetic field, per axis.
-        inertial_gap_s: time without samples that counts as a gap, in which the body may turn.
+        inertial_gap_s: time without samples above which a gap is assumed, in which the body may rotate.
         gap_turn_radps: standard deviation of the turn rate in a gap.
-        rest_s: duration of the rest at the start.
+        rest_s: duration of the stationary period at the start.
         start_sigma_rad: standard deviation of the orientation at the start, per axis.
         gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
         start_sigma_mps: standard deviation of the velocity at the start, per axis.
@@ -75,7 +75,7 @@ class AttitudeParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the state after a step, given the mean of the samples at both ends."""
+    """Return the state after a step, given the mean of the samples at the step's two ends."""
     qw, qx, qy, qz, bx, by, bz, vx, vy, vz, north, up = state
     fx, fy, fz, wx, wy, wz = control
     half_s = 0.5 * duration_s
@@ -141,7 +141,7 @@ def read_velocity(stream: Stream) -> Floats:
 
 
 def read_field(stream: Stream) -> Floats:
-    """Return the first field sample (n, 3) of every period, also if the magnetometer is slower."""
+    """Return the first field sample (n, 3) of every period, even if the magnetometer is slower."""
     field = stream["magnetic_field_ut"]
     if field.shape[1:] != (3,):  # the magnetometer has a separate topic
         return np.full((len(stream), 3), np.nan)

@@ -56,7 +56,7 @@ class NavigationParameters(AlignmentParameters):
         gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
         origin_latitude_deg: latitude of the plane's origin.
         origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
-        inertial_gap_s: time without samples that counts as a gap.
+        inertial_gap_s: time without samples above which a gap is assumed.
         gap_acceleration_mps2: standard deviation of the acceleration in a gap.
         gap_turn_radps: standard deviation of the turn rate in a gap.
         gap_tilt_rad: standard deviation of the tilt after a gap.
@@ -64,7 +64,8 @@ class NavigationParameters(AlignmentParameters):
             (forward, left, up).
         axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle relative to the unit in body axes
             (forward, left, up).
-        wheel_scale: relative excess of the speed that the wheels measure over the true speed.
+        wheel_scale: how much the speed that the wheels measure exceeds the true speed, as a fraction of
+            the true speed.
         field_east_ut, field_north_ut, field_up_ut: local magnetic field by direction.
         range_delay_s: delay of ranges: time from the measurement to the stamp.
         standing_delay_s: delay of the messages that state whether the body stands still: time from the
@@ -121,7 +122,7 @@ def read_inertial(stream: Stream) -> Floats:
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Return the state after a step, given the mean of the samples at both ends."""
+    """Return the state after a step, given the mean of the samples at the step's two ends."""
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
     moved = strapdown(
         (px, py, pz, vx, vy, vz, qw, qx, qy, qz),

@@ -130,9 +130,9 @@ def _settled(
 ) -> tuple[Floats, Floats]:
     """Refine a position (n,) to a root of the cost's gradient; return it and the information (n, n).
 
-    A search for the lowest cost ends where rounding errors hide any further decrease, which is at
-    different points on different CPUs; the root does not have this problem. If the differences do not
-    determine the distance, the gradient is zero only at infinity; the position is then not changed.
+    A search for the lowest cost ends where rounding errors hide any further decrease, and this point
+    differs between CPUs; the root does not have this problem. If the differences do not determine the
+    distance, the gradient is zero only at infinity; the position is then not changed.
     """
 
     def cost(there: Floats) -> float:

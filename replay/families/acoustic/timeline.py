@@ -99,7 +99,7 @@ def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
 
 
 def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: float) -> Times:
-    """Draw the rays of each shot at the time when all sensors have heard it; return these times."""
+    """Draw each shot's rays at the time when all sensors have heard the shot; return these times."""
     detections, positions = (
         [gather([scene.read(f"/sensor{sensor}/{leaf}")]) for sensor in sensors]
         for leaf in ("detections", "position")

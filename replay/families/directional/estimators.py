@@ -75,10 +75,10 @@ class HeadingsFilterParameters(Parameters):
     """Parameters of the model of `headings`; by default, the values that the channel of the log states.
 
     Attributes:
-        coupling_rad: in each step, the first heading turns by this angle times the cosine of the
+        coupling_rad: in each step, the first heading changes by this angle times the cosine of the
             second, and the second by this angle times the sine of the first.
-        drift1_rad: additional turn of the first heading per step.
-        drift2_rad: additional turn of the second heading per step.
+        drift1_rad: additional change of the first heading per step.
+        drift2_rad: additional change of the second heading per step.
         system_sigma_rad: standard deviation of a heading's noise per step.
         system_correlation: correlation of the two headings' noises.
         measurement_sigma_rad: standard deviation of a measured heading.

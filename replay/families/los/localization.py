@@ -206,7 +206,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """Find the axis about which the change `unseen` rotates all sensors; None if axes differ."""
+    """Find the axis about which change `unseen` rotates all sensors; return None if axes differ."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])

@@ -3,10 +3,10 @@
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014
 (`fuselog.recorders.families.los.models`), but targets and sensors move, and the sensors are not
 synchronised. A message states the pose of its sensor, with a stamp by the sensor's own clock. If this
-clock is ahead by c, the sensor sees the targets at the time c before the stamp: (azimuth, elevation) =
-angles of R(bias) R(pose)' (target(t - c) - place). Biases and clock offsets can be estimated together
-with the state (see `fuselog.replay.inference.model.augmentation`); with `estimate_drift`, they are
-random walks.
+clock is ahead by c and the stamp is t, the sensor sees the targets at the time t - c: (azimuth,
+elevation) = angles of R(bias) R(pose)' (target(t - c) - sensor's position). Biases and clock offsets can
+be estimated together with the state (see `fuselog.replay.inference.model.augmentation`); with
+`estimate_drift`, they are random walks.
 """
 
 from typing import Any

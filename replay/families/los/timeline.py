@@ -151,7 +151,7 @@ def draw_rays(
         canvas, entity: the canvas, and the entity on it.
         shown_ns: sorted times at which rays are drawn.
         time_ns: (n,), sorted, the time of each ray, which is one of `shown_ns`.
-        rays: (n, 2, 3), in m, begin and end.
+        rays: (n, 2, 3), in m, the start and the end of each ray.
         colour: colour of the rays.
     """
     times = np.unique(shown_ns)

@@ -41,7 +41,7 @@ class Fusions(NamedTuple):
     By the Karush-Kuhn-Tucker conditions, no other weights improve the criterion (the logarithm of the
     trace, or the log determinant divided by n) by more than the gap. The gap is 0 for a rule without
     optimization. For a rule that fuses one estimate after another, weight i > 0 is the weight of the
-    fused estimates before i.
+    fusion of all estimates before i.
     """
 
     mean: Floats

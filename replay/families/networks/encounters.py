@@ -214,7 +214,7 @@ def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) ->
     Args:
         covariance, first: as for `fill_spread`.
         side: 0 for the observing robot, 1 for the observed robot.
-        work: scratch memory with `both`; `spread` and `square` of this side are overwritten.
+        work: scratch memory with `both`; `spread` and `square` of this robot are overwritten.
     """
     rows, trace = work.both[side], 0.0
     fill_spread(covariance, first, rows, work.spread[side])
@@ -257,13 +257,13 @@ def meet(
     """Update with a sighting; return False if a covariance is not positive definite.
 
     Args:
-        mean, covariance: (3 n,), (3 n, 3 n) of all robots, changed in place.
+        mean, covariance: (3 n,) and (3 n, 3 n), for the poses of all robots together; changed in place.
         robots: (2,), the observing robot and the observed robot, or -1 for a landmark.
         difference: the innovation (2,), see `look`.
         variance: variances of range and bearing, (2,).
         gate: largest squared distance at which a sighting is accepted.
         fusion: the method for using another robot's estimate.
-        work: scratch memory with `both` from `look`.
+        work: scratch memory in which `look` has filled `both`.
     """
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
     first, both = (3 * robots[0], 3 * robots[1]), robots[1] >= 0
@@ -300,7 +300,7 @@ def cooperate(
     results: RobotResults,
     work: RobotMemory,
 ) -> int:
-    """Predict the robots of an event to its time and process it, unless the sender's state is newer."""
+    """Predict an event's robots to its time, and process it unless the sender's state is newer."""
     events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)

@@ -100,7 +100,7 @@ def determinant(matrix: Floats) -> float:
 
 
 def put(given: Estimate, place: Estimate) -> None:
-    """Copy an estimate in loops, because slices take very long to compile."""
+    """Copy an estimate element by element in loops, because slices take very long to compile."""
     copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
     place.independent[:, :] = given.independent
 
@@ -118,11 +118,11 @@ def steps_for(tolerance: float) -> int:
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
     """Return the next position in (0, 1) of a golden-section search for a minimum.
 
-    The last step returns the middle of the remaining interval. Because of this form, the function to
-    minimize is called in only one place and is compiled once.
+    The last step returns the middle of the remaining interval. The caller evaluates the function to
+    minimize, so that its call appears only once and is compiled once.
 
     Args:
-        step, steps: number of this step, from 0, and number of all steps.
+        step, steps: index of this step, counted from 0, and the total number of steps.
         value: value at the previous position; ignored at step 0.
         section: (7,), state of the search: both ends, both inner positions, their values, and the index
             of the position of `value`.

@@ -2,7 +2,7 @@
 
 Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
 prediction (not x*) with the received x*, by a rule of `covariance_intersection`; update with the own
-measurement again. The log states when each message was sent and when it arrived. The content of the
+measurement again. The log records when each message was sent and when it arrived. The content of the
 messages is computed by the replay, so the same log can be replayed with any rule. The state is
 (positions, velocities).
 """
@@ -69,7 +69,7 @@ class NetworkParameters(Parameters):
             estimates with any correlation pass this gate with at least this probability.
         liar: number of the node that sends false estimates.
         lie_m: offset that the liar adds to its estimates.
-        lie_after_s: time from the start after which the liar adds the offset.
+        lie_after_s: time after the start of the run at which the liar begins to add the offset.
     """
 
     rule: Rule = "ci-trace"

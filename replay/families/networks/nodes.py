@@ -170,8 +170,8 @@ def observe(
 
     Args:
         mean, covariance: (n,), (n, n).
-        independent: (n, n), the part of the covariance due to the measurements since this part was
-            last set to zero.
+        independent: (n, n), the part of the covariance that is due to the measurements made since this
+            part was last set to zero.
         value, variance: (n,), NaN for components that are not measured.
     """
     size = len(mean)
@@ -296,7 +296,7 @@ def act(
     results: NodeResults,
     work: NodeMemory,
 ) -> bool:
-    """Let all nodes send, then receive and fuse, at one time; return False if a fusion fails.
+    """Make all nodes send, then receive and fuse, at the current time; return False if a fusion fails.
 
     Args:
         run: number of the run.

@@ -76,7 +76,7 @@ def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
 
 
 def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> float:
-    """Fuse two estimates with a weight; return the trace, or infinity if they cannot be fused."""
+    """Fuse two estimates with a weight; return the fused trace, or infinity if they cannot be fused."""
     is_fused = mix_split(weight, pair, fused) if is_split else mix_inverse(weight, pair, fused)
     if not is_fused:
         return np.inf

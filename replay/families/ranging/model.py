@@ -44,8 +44,8 @@ class RangingParameters(ModelParameters):
         start_s: duration of the initial span of ranges, from which the initial state is found.
         start_reach_m: distance from the anchors' centre to the positions, on all sides of it, at which
             the search starts.
-        start_sigma_m: standard deviation of the position at the start, per axis.
-        start_sigma_mps: standard deviation of the velocity at the start, per axis.
+        start_sigma_m: standard deviation of the initial position, per axis.
+        start_sigma_mps: standard deviation of the initial velocity, per axis.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -60,12 +60,12 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """Noise and start of the body's rotation.
+    """Noise of the body's rotation, and uncertainty of its initial heading and turn rate.
 
     Attributes:
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
-        start_sigma_rad: standard deviation of the heading at the start.
-        start_sigma_radps: standard deviation of the turn rate at the start.
+        start_sigma_rad: standard deviation of the initial heading.
+        start_sigma_radps: standard deviation of the initial turn rate.
     """
 
     turn_acceleration_density: NonNegativeFloat | None = None
@@ -145,7 +145,7 @@ def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Find the pose, assumed at rest, that best fits the first ranges; start from several headings.
+    """Find the pose of a stationary body that best fits the first ranges; start from several headings.
 
     Args:
         streams: `ranges`, the map of anchors, and the tags.
@@ -227,7 +227,7 @@ def around(anchors: Floats, parameters: Any) -> list[Floats]:
 
 
 def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
-    """Find the best of the robust least-squares fits from several starts.
+    """Find the best of several robust least-squares fits that begin at different points.
 
     Args:
         residuals: function that maps a position or pose (k,) to the residuals (n,) of ranges, in m.

@@ -26,7 +26,7 @@ class ExtendedTargetParameters(ModelParameters):
     """Variances added per step, and the variance of a measured point.
 
     Attributes:
-        size_drift_m2: variance that a step adds to each half side length.
+        size_drift_m2: variance that a step adds to half the length of each side.
         position_drift_m2: variance that a step adds to the position, per axis.
         point_variance_m2: variance of a measured point, per axis.
     """
@@ -73,7 +73,7 @@ def moments(
     spread: Floats,
     cross: Floats,
 ) -> None:
-    """Fill the exact moments of the quadratic measurement y = (m, m^2).
+    """Compute the exact moments of the quadratic measurement y = (m, m^2).
 
     Given the state, m is Gaussian with mean c and variance v = l^2 / 3 + r in each axis. So Cov(y) is
     the mean of Cov(y | state), where Var m^2 = 2 v^2 + 4 c^2 v and Cov(m, m^2) = 2 c v, plus the
@@ -115,7 +115,7 @@ def moments(
 def scatter(
     mean: Floats, covariance: Floats, axis: int, point_variance_m2: float
 ) -> tuple[float, float, float]:
-    """Compute the means of v, 2cv and 2v^2 + 4c^2 v for one axis, over the state; see `moments`.
+    """Average v, 2cv and 2v^2 + 4c^2 v of one axis over the state's distribution; see `moments`.
 
     These three quantities are Var m, Cov(m, m^2) and Var m^2 given the state.
 

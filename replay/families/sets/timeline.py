@@ -90,7 +90,7 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
 def _draw_allowed(canvas: Canvas, scene: Scene, robot: str, entity: str) -> list[str]:
     """Draw the positions that each single bearing and its bound allow; return the entities drawn.
 
-    The channel of a set states the topic with the bearings, and the bounds.
+    The metadata of a set's channel contains the topic of the bearings, and the bounds.
     """
     stated = [stream.metadata for _, stream in scene.outputs_of(robot, SIZE)]
     stated = [each for each in stated if {"measured", *Known._fields} <= {*each}]
@@ -119,7 +119,7 @@ def _single(pairs: Pairs) -> list[Pairs]:
 def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
 ) -> tuple[Floats, list[rrb.TimeSeriesView]]:
-    """Draw the sets of a case; return corners (2, 2) around most of them, and the plot of areas."""
+    """Draw the sets of a case; return a box (2, 2) around most of them, and the plot of areas."""
     plot, corners, areas = entity_path("plots", case, "area"), [], {}
     for estimator, sizes in scene.outputs_of(case, SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")

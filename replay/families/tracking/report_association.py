@@ -239,7 +239,7 @@ def ratio_of(
 
 
 def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings) -> int:
-    """Begin a track with a report; return the place of the track."""
+    """Begin a track with a report; return the index of the track."""
     place = tracks.used[run]
     tracks.used[run] = place + 1
     tracks.number[run, place] = tracks.met[run]

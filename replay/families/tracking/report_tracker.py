@@ -64,8 +64,8 @@ class ReportTrackerParameters(Parameters):
         usual_interval_s: time between reports that is assumed for a new track.
         slow_mps: speed below which a vessel may be at rest; a vessel at rest often repeats its last
             course.
-        course_width_deg: greatest difference at which a course counts as repeated, which is a sign of a
-            vessel at rest.
+        course_width_deg: greatest difference between two courses that are considered equal; repeated
+            courses indicate a vessel at rest.
         forget_s: time without a report after which a track ends.
     """
 

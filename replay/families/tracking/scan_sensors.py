@@ -25,7 +25,7 @@ def is_within(bearing_rad: Component, begin_rad: Component, end_rad: Component) 
 
 
 def between(range_m: Component, near: Component, far: Component, parameters: Any) -> Component:
-    """Return `near` up to the near range, `far` from the far range, and interpolate linearly between."""
+    """Return `near` below the near range, `far` above the far range; between, interpolate linearly."""
     if range_m <= parameters.near_range_m:
         return near
     if range_m >= parameters.far_range_m:
@@ -82,7 +82,7 @@ def place_clutter(detection: Any, parameters: Any) -> Component:
 def place_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return a target's position at a detection, its covariance, and the m^2 that one unit covers."""
+    """Return the position at a detection, its covariance, and the area in m^2 per measurement unit."""
     x = detection[0] - parameters.bias_x_m + origin[0]
     y = detection[1] - parameters.bias_y_m + origin[1]
     return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters), 1.0
@@ -136,7 +136,7 @@ def polar_clutter(detection: Any, parameters: Any) -> Component:
 def polar_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """Return a target's position at a detection, its covariance, and the m^2 that one unit covers."""
+    """Return the position at a detection, its covariance, and the area in m^2 per measurement unit."""
     range_m, bearing_rad = detection[0] - parameters.bias_range_m, detection[1] - parameters.bias_rad
     cosine, sine = np.cos(bearing_rad), np.sin(bearing_rad)
     x, y = origin[0] + range_m * cosine, origin[1] + range_m * sine

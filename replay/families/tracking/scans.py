@@ -16,8 +16,8 @@ from fuselog.replay.families.tracking.association.scans import Scans, ScanSensor
 class SensorTopics(NamedTuple):
     """Kinds, topics and frames of a log's sensors.
 
-    `origins` has the topics of the sensors' own positions; it is empty for a sensor without a stated
-    position.
+    `origins` has the topics of the sensors' own positions; it is empty for a sensor without such a
+    topic.
     """
 
     kinds: tuple[int, ...]
@@ -74,8 +74,8 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
 def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     """Sort detections by scan; return the order (n,), and the bounds of each scan in it (2, scans).
 
-    Raises BadInput if two scans of a run have the same number, if a scan does not have the number of
-    detections that it states, or if the scan of a detection is missing.
+    Raises BadInput if two scans of a run have the same number, if the number of a scan's detections
+    differs from the number in its message, or if the scan of a detection is missing.
     """
     keys, known = (
         (run_of_rows(each.offsets) << 32) + each["scan_id"].astype(np.int64)
@@ -114,7 +114,7 @@ def _measured(stream: Stream, kind: ScanSensor) -> Floats:
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Find a sensor's position (n, 2) at each scan: its last fix so far, otherwise the first known."""
+    """Find a sensor's position (n, 2) at each scan: the last fix so far, or else the first known."""
     found = np.empty((len(scans), 2))
     places = read_vectors(fixes.stream, "position_m", PLANE)
     for run, before in enumerate(known):

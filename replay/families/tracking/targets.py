@@ -38,7 +38,7 @@ class TargetParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Predict the state at constant velocity."""
+    """Predict the state, assuming constant velocity."""
     x, vx, y, vy = state
     return x + duration_s * vx, vx, y + duration_s * vy, vy
 
@@ -65,7 +65,7 @@ class Targets(NamedTuple):
     Attributes:
         bound_model: bound model of the targets, with one motion or with all modes.
         parameters: the parameters of the model; NaN for those that are not used.
-        newborn: a target whose position is known, but nothing else.
+        newborn: a target of which only the position is known.
     """
 
     bound_model: BoundModel
@@ -139,7 +139,7 @@ def _bound_model_of(where: str, model: Model, mode: str | None) -> BoundModel:
 
 
 def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats]:
-    """Return mean (n,) and sigmas (t,) of a target whose position is known, but nothing else."""
+    """Return mean (n,) and sigmas (t,) of a target of which only the position is known."""
     mean, sigma = unknown(model.state, model.start)
     for row, (name, _) in enumerate(tangent_components(list(model.state), model.kinds)):
         if name in POSITION:

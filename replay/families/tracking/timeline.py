@@ -190,7 +190,7 @@ class Joined(NamedTuple):
 def _joined(scan: Stream, seen: Stream) -> Joined:
     """Replace each chain of near detections of a scan by its mean, in order of their first detections.
 
-    The channel of the scans states the distance; see
+    The distance is read from the metadata of the scans' channel; see
     `fuselog.replay.families.tracking.association.scanning.join_near`.
     """
     row, place = rows_of(scan, seen), read_vectors(seen, "position_m", PLANE)

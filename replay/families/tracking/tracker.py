@@ -71,9 +71,9 @@ class TrackerParameters(Parameters):
 
     A detection begins a track if it is outside all gates and far enough from all confirmed tracks. With
     `undetected_per_m2`, any detection that may be the first of a target begins a track. The existence of
-    this track is the probability that the detection is a first one. `management` selects the method of
-    confirmation: "existence" uses the probability that the target exists, "hits" counts detections, and
-    "score" uses the log-likelihood ratio of target and clutter.
+    this track is the probability that the detection is the first of a target. `management` selects the
+    method of confirmation: "existence" uses the probability that the target exists, "hits" counts
+    detections, and "score" uses the log-likelihood ratio of target and clutter.
 
     A registration error is a constant error of all measurements of a sensor; it is estimated jointly
     from all tracks. A correlated error differs between tracks and changes over time. Both are components
@@ -93,7 +93,7 @@ class TrackerParameters(Parameters):
         acceleration_density: power spectral density of the acceleration of targets without a model, in
             m^2/s^3.
         birth_sigma_mps: standard deviation of a new track's velocity, per axis.
-        birth_distance_m: distance from all confirmed tracks that a new track must at least have.
+        birth_distance_m: minimum distance of a new track from all confirmed tracks.
         birth_existence: existence of a new track; with hits or score, existence of a track until it is
             confirmed.
         undetected_per_m2: density of targets that were never detected.
@@ -111,9 +111,9 @@ class TrackerParameters(Parameters):
             confirmed.
         silence_s: time without a detection after which a confirmed track ends.
         tentative_silence_s: time without a detection after which an unconfirmed track ends.
-        same_within_m: distance below which two tracks count as one target if their velocities also
+        same_within_m: distance below which two tracks are treated as one target if their velocities also
             agree.
-        same_within_mps: difference in velocity below which two tracks count as one target if their
+        same_within_mps: difference in velocity below which two tracks are treated as one target if their
             positions also agree.
         most_tracks: greatest number of tracks at a time.
         smoothed: whether the tracks are smoothed at the end of the run.
@@ -136,7 +136,7 @@ class TrackerParameters(Parameters):
         sector_to_rad: end of the sector, anticlockwise from the x axis.
         sector_detection_factor: factor on the probability of detection in the sector.
         sector_clutter_factor: factor on clutter in the sector.
-        joined_within_m: distance within which detections are joined and count as one target.
+        joined_within_m: distance within which detections are joined and treated as one target.
         sigma_rad: standard deviation of a bearing.
         sigma_across_m: additional standard deviation of a bearing across the line of sight, in m.
         bias_rad: bias of measured bearings, measured minus true.

@@ -1,4 +1,4 @@
-"""Association of the detections of an unordered scan with vehicles: the best map, or all maps.
+"""Association of the detections of an unordered scan with vehicles: the best assignment, or all.
 
 A map assigns each vehicle at most one detection of its own; unassigned detections are false. The weights
 of maps assume a detection probability p_D and Poisson clutter of uniform density.

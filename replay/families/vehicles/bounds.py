@@ -54,8 +54,8 @@ def follow_axis(
 class Bounds(NamedTuple):
     """Total errors of steady-state filters, in m, for each use of the infrastructure sensor.
 
-    Combinations of positions that the sensor measures have the error of a filter with fixes and sensor;
-    other combinations have the error of a filter with fixes only.
+    For the combinations of positions that the sensor measures, the error is that of a filter with fixes
+    and sensor; for the other combinations, it is that of a filter with fixes only.
     """
 
     topology: float

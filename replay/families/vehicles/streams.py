@@ -311,7 +311,7 @@ def _advance(
 
 
 def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
-    """Predict the joint states by durations (runs,); runs with equal durations form one group."""
+    """Predict the joint states over durations (runs,); runs with equal durations form one group."""
     for span_ns in np.unique(duration_ns):
         move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
         joint = where(duration_ns == span_ns, joint, move)

@@ -116,8 +116,9 @@ def update_root(
     Args:
         mean: mean before the update.
         root: X before the update.
-        measured: Z (..., m, k), the change of the measurement along the columns of X: H X, or its
-            deviations at samples. Complex rows represent their real and imaginary parts.
+        measured: Z (..., m, k): H X, the change of the measurement along the columns of X, or the
+            measurement's deviations at the samples. Complex rows represent their real and imaginary
+            parts.
         innovation: (..., m).
         factor: W (..., m, terms).
     """

@@ -238,7 +238,7 @@ def _unnamed(scene: Scene) -> Iterator[tuple[str, Points]]:
 def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
     """Return lines (n, 2, 2) from predicted positions to associated fixes, and their vehicles.
 
-    The lines are from the first estimator that states its associations.
+    The lines are from the first estimator that outputs its associations.
     """
     fixes = _points(scene, "/network/detection")
     rows: list[tuple[Times, Floats, NDArray[np.int64]]] = []

@@ -27,9 +27,9 @@ class VehicleParameters(ModelParameters):
 
     Attributes:
         turn_rate_radps: constant turn rate of the vehicle.
-        acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
-        manoeuvring_sigma_mps2: standard deviation of the acceleration of a time step in a manoeuvre, per
-            axis.
+        acceleration_sigma_mps2: standard deviation of the acceleration during a time step, per axis.
+        manoeuvring_sigma_mps2: standard deviation of the acceleration during a time step of a manoeuvre,
+            per axis.
         standing_sigma_mps: standard deviation of the velocity of a standing vehicle, per axis.
         manoeuvres_per_s: rate of transitions from driving to a manoeuvre.
         settles_per_s: rate of transitions from a manoeuvre to driving.
@@ -94,7 +94,7 @@ def position(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Return the variances of a fix whose message states none."""
+    """Return the variances of a fix whose message contains none."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 

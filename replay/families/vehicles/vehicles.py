@@ -50,7 +50,7 @@ def positions(motion: Motion, mean: Floats) -> Floats:
     """Return the positions (runs, vehicles, 2) of the vehicles.
 
     Args:
-        motion: motion of the vehicles, which states their number.
+        motion: motion of the vehicles, from which their number is known.
         mean: means of the joint states, (runs, n).
     """
     count = motion.vehicles
@@ -66,7 +66,7 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
-    """Predict the joint state by `duration_s`, with coordinated turns and white accelerations."""
+    """Predict the joint state over `duration_s`, with coordinated turns and white accelerations."""
     states = joint.mean.shape[1]
     transition, noise = np.eye(states), np.zeros((states, states))
     for vehicle in range(motion.vehicles):

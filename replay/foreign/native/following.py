@@ -61,10 +61,10 @@ class Filters(NamedTuple):
 
     Attributes:
         handle: (runs,) addresses; 0 if there is no filter.
-        time_ns: (runs,) stamp of the prior, then of the last message.
-        begun: (runs,) 0 before the start, then 1.
+        time_ns: (runs,) stamp of the prior or, after the first message, of the last message.
+        begun: (runs,) 0 until the filter has started, then 1.
         failure: (runs,) ALL_WELL, or a code; see `reason_of_code`.
-        mean, covariance: (runs, n), (runs, t, t) the priors.
+        mean, covariance: (runs, n) and (runs, t, t), means and covariances of the priors.
         has_prior: (runs,) 0 if the filter starts without a prior.
     """
 
@@ -229,7 +229,7 @@ def _loop() -> OverRuns:
 
 
 def reason_of_code(code: int, description: Description) -> str:
-    """Return the sentence for the code of a failure."""
+    """Return the message that explains a failure code."""
     if code in FAILURES:
         return FAILURES[code]
     number = code - OWN

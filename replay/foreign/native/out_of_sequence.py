@@ -161,7 +161,7 @@ def follow_all_as_arrived(
 
 
 def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
-    """List the out-of-sequence messages in blocks; state how many messages each one made reprocess."""
+    """List the out-of-sequence messages in blocks, and how many messages were reprocessed for each."""
     newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
     made = []
     for events in blocks:

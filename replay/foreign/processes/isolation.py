@@ -62,7 +62,7 @@ class Watch:
         self._since = time.monotonic()
 
     def look(self, progress: object, allowed_s: float | None = None) -> None:
-        """Raise Ended if the process exceeds a limit; time counts from the last change of `progress`."""
+        """Raise Ended if the process exceeds a limit; time runs from the last change of `progress`."""
         now, limit_s = time.monotonic(), allowed_s or self._limits.time_s
         if progress != self._seen:
             self._seen, self._since = progress, now
@@ -304,7 +304,7 @@ def in_threads(
     items: Sequence[Given],
     started: "Sequence[Workers | Program]",
 ) -> list[Found]:
-    """Process all items in threads; at the end, also end what they have `started` and wait for."""
+    """Process all items in threads; at the end, also end the processes in `started`."""
     with ThreadPoolExecutor(max(1, min(core_count(), len(items)))) as threads:
         try:
             return [each.result() for each in [threads.submit(work, item) for item in items]]

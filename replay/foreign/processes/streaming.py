@@ -1,7 +1,8 @@
 """Protocol for programs that read messages from standard input and write answers.
 
-Each frame is a length (4 bytes) and that many bytes: a letter for the kind of frame, and little-endian
-numbers. The program first sends its description; it then answers every frame except the first, in order:
+Each frame is a length (4 bytes), followed by a body of this length: a letter for the kind of frame, and
+little-endian numbers. The program first sends its description; it then answers every frame except the
+first, in order:
 
     D  program: the description, JSON, with the version of this protocol
     C  create: seed u64, parameters f64 each

@@ -60,8 +60,9 @@ class MethodParameters(Parameters):  # type: ignore[explicit-any]
     Attributes:
         every_s: interval of estimates in addition to those at the stamps of the sensors.
         mode: name of the motion to use, if the model has several.
-        estimate: names of parameters to add to the state; each starts from its value.
-        estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
+        estimate: names of parameters to add to the state; the initial estimate of each is its given
+            value.
+        estimate_sigma: initial standard deviation of such a parameter, in its unit, by name.
         estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
         estimate_time_s: time constant with which such a parameter returns to its value (Gauss-Markov
             process), in s, by name.

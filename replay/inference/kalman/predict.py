@@ -128,7 +128,7 @@ def motion_noise(model: Model, motion: Motion) -> AddMotionNoise:
 
 
 def nothing(*_: object) -> None:
-    """Do nothing, in place of a function that a model does not need."""
+    """Do nothing; this replaces a function that a model does not need."""
     return
 
 

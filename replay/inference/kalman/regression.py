@@ -300,7 +300,7 @@ def regression(
         noises: number of noise components.
         outputs: kinds of the function's values.
         is_motion: whether the function is a motion.
-        kept: tangent components of the state that the function returns unchanged, in the same place.
+        kept: tangent components of the state that the function returns unchanged, at the same indices.
 
     Returns:
         `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It fills
@@ -412,7 +412,7 @@ def sampled_motion(bound_model: BoundModel, number: int) -> Predict:
 
 
 def kept_components(motion: Motion, kinds: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the tangent components of linear components that a motion keeps, such as biases."""
+    """Return tangent components of linear components that a motion leaves unchanged, such as biases."""
     assert isinstance(motion.move, TracedFunction)
     returned = motion.move.result.returned
     return tuple(

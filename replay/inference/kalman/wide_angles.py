@@ -45,7 +45,7 @@ QUARTER_RAD = 0.5 * np.pi
 def turning(kinds: tuple[str, ...]) -> tuple[tuple[int, int, float], ...]:
     """List the angles, axes and rotations of a state: first tangent component, size, multiplicity.
 
-    An axis repeats after half a turn, so its angle counts twice.
+    An axis is the same after half a turn, so its multiplicity is 2.
     """
     return tuple(
         (tangent, width, 2.0 if kind == "axis" else 1.0)

@@ -344,11 +344,11 @@ def predict_constant_velocity(
     layout: tuple[int, int],
     noise: tuple[float, float, float],
 ) -> None:
-    """Predict positions and velocities at constant velocity, in place.
+    """Predict positions and velocities, assuming constant velocity, in place.
 
-    The index of the position along axis a is a * layout[0]; its velocity is layout[1] further. The noise
-    adds a variance of the position, a covariance of position and velocity, and a variance of the
-    velocity to each axis.
+    The index of the position along axis a is a * layout[0]; the index of its velocity is greater by
+    layout[1]. The noise adds a variance of the position, a covariance of position and velocity, and a
+    variance of the velocity to each axis.
 
     Args:
         mean: (n,).

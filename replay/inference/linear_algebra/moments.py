@@ -135,7 +135,7 @@ def _in_parts(states: int, values: int) -> list[range]:
 
 
 def _moments_of_some(states: int, places: tuple[int, ...], chosen: tuple[int, ...]) -> Moments:
-    """Make `moments` for the last values, with each other and with those before, in one loop."""
+    """Make `moments` for the last values, with each other and with earlier values, in one loop."""
     first = len(places) - len(chosen)
     pairs = tuple((i, j) for i in range(first, len(places)) for j in range(i + 1))
     own_places = tuple((places[i], places[j]) for i, j in pairs)

@@ -37,7 +37,7 @@ class Found(NamedTuple):
             `fuselog.replay.inference.run.initialization`.
         fallbacks: topics that replace some components of the control.
         origin: latitude, longitude (deg) and altitude (m) of the origin of the local tangent plane (3,),
-            if the log states it.
+            if the log contains it.
         frame: separate frame of the positions; empty if they are in the log's local tangent plane.
     """
 
@@ -302,7 +302,7 @@ def _found(model: Model, here: UnderPrefix) -> Found | None:
 def _suffices(
     model: Model, here: UnderPrefix, sensors: Sequence[tuple[Sensor, Topic]], *, has_prior: bool
 ) -> bool:
-    """Test whether a model can start from the prior or these sensors, and continue.
+    """Test whether a model can start from the prior or these sensors, and then has the inputs it needs.
 
     A log without a prior fits a model that can start without one, if a sensor measures the state itself.
     A log without usable sensors fits only if it also has none of their topics; sightings without a map,
@@ -321,7 +321,7 @@ def _suffices(
 
 
 def measures_state(model: Model, sensor: Sensor) -> bool:
-    """Test whether a sensor measures only components of the state, and states their covariance."""
+    """Test whether a sensor measures only state components and its messages contain the covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
 
 
@@ -329,7 +329,7 @@ def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, To
     """Determine the frame of the positions: the log's local tangent plane, or a separate frame.
 
     See also `Filter.start`. Raises BadInput if one sensor measures positions in a separate frame and
-    another on earth, or if fixes are used and channels state different origins.
+    another on earth, or if fixes are used and channels have different origins.
     """
     placing = [(sensor, topic) for sensor, topic in found.sensors if "x_m" in sensor.measured]
     if "x_m" not in model.state:

@@ -116,7 +116,7 @@ _KNOWN: dict[tuple[object, ...], tuple[object, object]] = {}
 
 
 def _same_again(part: Part, **changes: object) -> Part:
-    """Return a motion, sensor or model with these changes; equal changes give the same object."""
+    """Return a motion, sensor or model with these changes; repeated calls return the same object."""
     key = id(part), *((name, id(each)) for name, each in changes.items())
     known = _KNOWN.get(key)
     if known is None:

@@ -51,7 +51,7 @@ Derivatives = Callable[[Floats, Sequence[Floats]], dict[str, Floats]]
 
 
 class _Call(NamedTuple):
-    """Function of a model with a state and other inputs, as a method calls it.
+    """Function of a model that a method calls with a state and other inputs.
 
     Attributes:
         what: its name, file and line, for messages.
@@ -466,9 +466,9 @@ def _matrix(
 def _not_additive(
     model: Model, motion: Motion, numbers: Settings, states: Floats, rng: np.random.Generator
 ) -> list[str]:
-    """Describe components whose added variance differs between one step and two half steps.
+    """Describe components for which one step and two half steps add different variances.
 
-    Components to which other components pass on variance during the step are left out, because their
+    Components that receive variance from other components during the step are left out, because their
     noise may be an approximation of limited order.
     """
     whole, half = (

@@ -67,13 +67,14 @@ class Control:
     """Control of a model: the input that drives its motion.
 
     Attributes:
-        topic: name of its topic, under the prefix of the estimated object.
+        topic: name of the topic of the control, under the prefix of the estimated object.
         schema: schema of its messages.
-        components: names of its components, which are fields of the messages unless `read` is given.
+        components: names of the components of the control, which are fields of the messages unless
+            `read` is given.
         read: stream -> (n, components).
         interpolated: whether the control is linear between two messages, so that the motion uses the
             mean of its values at both ends of a step; otherwise, a message applies until the next one.
-        initial: control before the first message; zeros by default.
+        initial: value of the control before the first message; zeros by default.
         gap: parameter with the longest time, in s, for which an interpolated control may lack messages.
             In a longer gap the estimate ends, or is unknown until messages resume; see
             `Motion.gap_noise`.
@@ -108,9 +109,9 @@ class Motion:
         move: (state, control, duration_s, parameters) -> state; with `noises`, (state, control, noise,
             duration_s, parameters) -> state.
         noise: (state, duration_s, parameters) -> variances of the additive noise in the tangent space,
-            or the rows of the lower triangle of its covariance; with `noises`, the variances of the
-            noise components.
-        noises: number of noise components that are arguments of `move` instead of being added.
+            or the rows of the lower triangle of the covariance of this noise; with `noises`, the
+            variances of the noise components.
+        noises: number of noise components that `move` receives as arguments; this noise is not added.
         noise_block: number of components in the lower triangle, which is followed by the variances of
             the other components; zero means that the triangle contains all components.
         control_noise: (duration_s, parameters) -> variances of the control's error over the duration;
@@ -170,13 +171,13 @@ class Sensor:
             parameters). `reference` is the point of the map, or empty. A component that is undefined at
             this state, or has no derivative, is NaN, as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of the noise components. If `covariance` is given, this noise
-            applies only to messages that lack a covariance; if the noise is also missing, the message is
-            skipped and counted.
+            with `noises`, the variances of the noise components. If `covariance` is given, this noise is
+            used only for messages without a covariance. A message that has no covariance is skipped and
+            counted if this noise is also missing.
         vector: field with the measured components as a vector. The channel's metadata list the names of
             its entries in `components`, in any order; the components of a position need no names. By
             default, every component is a separate field.
-        noises: number of noise components that are arguments of `measure` instead of being added.
+        noises: number of noise components that `measure` receives as arguments; this noise is not added.
         covariance: field with the covariance of the vector; with `read`, stream -> (n, m, m), NaN if
             unknown.
         reference: map to whose points the messages refer, or several maps; every message then refers to
@@ -233,7 +234,7 @@ class Sensor:
 
     @property
     def control_start(self) -> int:
-        """Number of entries of `reference` before the control, which are the entries of the points."""
+        """Number of entries of `reference` before the control; these are the entries of the points."""
         return sum(each.size for each in self.maps)
 
     @property
@@ -296,7 +297,8 @@ class Model:
 
     Attributes:
         summary: description in one line.
-        state: components by name, with their kinds; the four components of a quaternion are adjacent.
+        state: names of the components, with their kinds; the four components of a quaternion are
+            adjacent.
         parameters: type of its parameters.
         sensors: all sensors that the model can use; a log fits if it has any of them. A model with a
             position (linear `x_m` and `y_m`, perhaps `z_m`) also uses position fixes; see `all_sensors`.
@@ -307,7 +309,7 @@ class Model:
         prior, truth: topics of the prior and of the true states, under the prefix.
         output: last part of the name of the estimates' topic.
         system: the `system` that a channel's metadata must name, if any.
-        needs_sensor: whether a log must have at least one of the model's sensors.
+        needs_sensor: whether a log fits only if it has at least one of the model's sensors.
         start: assumptions for a log without a prior; None if the model does not fit such a log.
         takes_fixes: whether the model can use position fixes.
         correct: correction of the state by an update; None if every component moves separately.
@@ -316,11 +318,11 @@ class Model:
         augmentable: parameters that can be added to the state, with their kinds (linear or angle): those
             that motion and sensors read, except noise. See
             `fuselog.replay.inference.model.augmentation`.
-        calibration: parameters of the mounting, scale, bias and delay of sensors, each with the largest
-            standard deviation of a useful estimate; an estimate with a larger one counts as
-            undetermined.
-        owned: topic and general name of each parameter that belongs to a single topic, by the name of
-            the parameter. See `fuselog.replay.inference.model.own_parameters`.
+        calibration: parameters for the mounting, scale, bias and delay of sensors, each with the largest
+            standard deviation of a useful estimate; an estimate with a larger standard deviation is
+            reported as undetermined.
+        owned: map from the name of each parameter that belongs to a single topic to this topic and the
+            name of the general parameter. See `fuselog.replay.inference.model.own_parameters`.
 
     An object that moves on a line; its distance from the origin is measured:
 
@@ -406,7 +408,7 @@ class Model:
 
     @property
     def finds_start(self) -> bool:
-        """Whether the model finds its start from messages; see `Start.find`."""
+        """Whether the model finds its initial state from messages; see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
     @cached_property

@@ -31,9 +31,10 @@ Tables = Mapping[str, Mapping[str, object]]
 def with_own_parameters(
     model: Model, found: Found, tables: Tables, parameters: Parameters
 ) -> tuple[Model, Found, CombinedParameters]:
-    """Return a model whose topics have separate parameters, with its topics and parameter values.
+    """Return a model whose topics have separate parameters; also return its topics and parameters.
 
-    A topic gets its own parameters if some are set for it, or if several topics serve the same sensor.
+    A topic gets its own parameters if parameters are set for this topic, or if several topics serve the
+    same sensor.
 
     Args:
         model: the model.
@@ -163,7 +164,7 @@ def _with_fields(
 
 
 def _sensor(sensor: Sensor, fields: Mapping[str, str]) -> Sensor:
-    """Return the sensor with functions that read the topic's own parameters."""
+    """Return the sensor with its functions changed to read the topic's own parameters."""
 
     def reading(function: OfModel | None, place: int = -1) -> OfModel | None:
         return function and _reading(function, place, fields)

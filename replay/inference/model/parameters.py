@@ -42,9 +42,9 @@ class ModelParameters(Parameters):  # type: ignore[explicit-any]
     Attributes:
         gate_probability: measurements whose NIS exceeds this quantile of the chi-square distribution are
             rejected; 1 accepts all.
-        gate_reopens_s: time since a sensor's last accepted measurement after which its gate opens; a
-            filter that has drifted, for example in an outage, then accepts the measurements that correct
-            it.
+        gate_reopens_s: time since a sensor's last accepted measurement after which its gate opens, so
+            that a filter that has drifted, for example in an outage, accepts the measurements that
+            correct it.
         inflate_nis: NIS above which the innovation covariance is inflated until the NIS has this value.
         student_freedom: degrees of freedom of the Student's t-distribution that is assumed for
             innovations.

@@ -148,7 +148,7 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
 
 
 def _same(reference: Numbers, numbers: Sequence[int]) -> float:
-    """Return 1 if a message is about these points, otherwise 0."""
+    """Return 1 if a message refers to these points, otherwise 0."""
     found = 1.0
     for index, number in enumerate(numbers):
         found = found * (reference[index] == number)

@@ -144,7 +144,7 @@ def _stated(
 
 
 def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
-    """List the coordinates of the tangent plane's origin that are neither given nor stated by channels.
+    """List the coordinates of the tangent plane's origin that neither parameters nor channels state.
 
     The coordinates are then taken from the origin of the tangent plane into which fixes are projected,
     so that, for example, gravity matches the position.
@@ -178,7 +178,7 @@ def placed_settings(
     origins: Floats | None,
     runs: int,
 ) -> Floats:
-    """Repeat settings (1 + sensors, fields) for each run, with the origin of its tangent plane.
+    """Repeat the settings (1 + sensors, fields) for each run; insert the origin of its tangent plane.
 
     Args:
         settings: see `settings_of`; or (runs, 1 + sensors, fields) if each run has its own.

@@ -1,4 +1,4 @@
-"""Start of a model in a log without a prior."""
+"""Initial state of a model in a log without a prior."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,12 +20,12 @@ class Align(Protocol):
 @renamed(suspect="check_prior")
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Assumptions about the start in a log without a prior, such as a log recorded for other purposes.
+    """Assumptions about the initial state in a log without a prior, such as a log for other purposes.
 
     The estimate starts at the first message that measures named components of the state and states their
     covariance, such as a fix or a pose. Other components are zero, with the uncertainty given here.
-    Without sensors, the estimate starts at zero, which defines the origin of its frame. Sensors that do
-    not measure the state itself need a prior.
+    Without sensors, the estimate starts with a state of zero, which defines the origin of its frame.
+    Sensors that do not measure the state itself need a prior.
 
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
@@ -36,9 +36,10 @@ class Start:
             and span `span_s`. The estimate starts just after the last fix, so that no fix is used twice.
             `align` is needed for a state that a single position does not determine.
         find: (streams, parameters) -> `Started`, for a state that must be found from several messages;
-            it is used instead of `align` or a start at one message. The streams are the first messages
-            of a run and the maps, by the topic names that the model uses. It raises BadInput if these
-            messages do not determine the state. A model with `find` needs a sensor.
+            it is used instead of `align` and instead of a state that one message measures. The streams
+            are the first messages of a run and the maps, by the topic names that the model uses. It
+            raises BadInput if these messages do not determine the state. A model with `find` needs a
+            sensor.
         check_prior: (streams, parameters) -> sentences on contradictions between the prior and the first
             messages, if the log has a prior. The sentences are reported, but do not end the replay.
     """
@@ -51,7 +52,7 @@ class Start:
 
 
 class Started(NamedTuple):
-    """Start of a run: stamp, mean (n,), covariance (t, t), and a description of the method."""
+    """Initial state of a run: stamp, mean (n,), covariance (t, t), and how they were found."""
 
     time_ns: int
     mean: Floats

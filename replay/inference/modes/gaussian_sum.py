@@ -55,10 +55,11 @@ AGREED = 0.1  # mean squared distance below which the members are merged
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type: ignore[explicit-any]
     """The filter that every member uses, and the number of members.
 
-    Members are adjacent, with a standard deviation of half their distance, so that their sum is smooth.
-    A narrower prior has fewer members; a prior that is no wider than a member is not split. The number
-    is odd: with an even number, every member has an exact opposite, and rounding would decide whether
-    the opposite is half a turn to the left or to the right, which changes the mean.
+    The standard deviation of a member is half the distance between neighbouring members, so that the sum
+    of all members is smooth. A narrower prior has fewer members; a prior that is no wider than a member
+    is not split. The number is odd: with an even number, every member has an exact opposite, and
+    rounding would decide whether the opposite is half a turn to the left or to the right; this decision
+    would change the mean.
 
     Attributes:
         filter: the filter of every member: ekf, iekf, ukf, lrkf, analytic or sqrt.
@@ -79,7 +80,7 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):  # type:
 
 
 class GaussianSumBelief(NamedTuple):
-    """Gaussians of all runs (the first axis); the remaining ones of the M members come first.
+    """Gaussians of all runs (the first axis); of each run's M rows, the remaining members are first.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
@@ -274,7 +275,7 @@ class GaussianSumFilter(MixtureFilter):
 
     @property
     def names(self) -> Sequence[str]:
-        """Names of the members, which state the angle from the prior's mean."""
+        """Names of the members, which state their angles relative to the prior's mean."""
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 

@@ -65,8 +65,9 @@ class InteractingMemory(NamedTuple):
     Attributes:
         filters: memory of every mode's filter.
         rates, transition: (M (M - 1),), and Pi (M, M) over the duration.
-        duration_s: (1,); NaN before the first one.
-        weights: (M, M) row j has the weights of all modes in the mixture of mode j.
+        duration_s: (1,) duration for which the transition was computed; NaN before the first
+            computation.
+        weights: (M, M) row j has the weights with which all modes enter the mixture of mode j.
         predicted: (M,) c, the predicted probabilities, or their logarithms if they are tiny.
         mixture: memory for the modes' Gaussians.
     """

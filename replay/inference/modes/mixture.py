@@ -90,8 +90,8 @@ def predicting(filters: Sequence[Steps]) -> PredictModes:
     """Make `predict(belief, ...)`, which predicts all modes' Gaussians and returns False on failure.
 
     Steps of a filter are called with the number of a run, and with Gaussians whose first axis is the
-    run. Here and in `mixture_update`, the first axis is the mode of one run, and the number of the mode
-    replaces the number of the run.
+    run. Here and in `mixture_update`, the first axis has the modes of one run, and the steps receive the
+    number of the mode instead of the number of the run.
     """
     predictions = tuple(each.predict for each in filters)
 

@@ -1,4 +1,4 @@
-"""The method of the particle filter, and the filter, which seeds each run by its first measurement."""
+"""Particle-filter method and filter; a run's first measurement seeds its random numbers."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -133,7 +133,7 @@ _draw_normals = compiled(fill_normals)
 
 
 class ParticleFilter(Filter):
-    """Particle filter; the first measurement of a run seeds and starts the run."""
+    """Particle filter; processing of a run begins when its first measurement arrives, which seeds it."""
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """Make the initial state of every run from its prior; see `Filter.start`."""
@@ -158,7 +158,7 @@ class ParticleFilter(Filter):
         return "all particles would have to be stored for every message of the window"
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
-        """Filter the events of runs that have a measurement; the events of other runs wait."""
+        """Filter the events of runs that have a measurement; keep the events of other runs for later."""
         if state.kept is not None:
             events = join_events(state.kept, events)
         sensed = np.flatnonzero(events.source >= 0)
@@ -196,7 +196,7 @@ class ParticleFilter(Filter):
     def finish(self, state: FilterState) -> list[Ragged]:
         """Filter the events that still wait for a control or a measurement.
 
-        A run without a measurement is seeded by its prior.
+        If a run has no measurement, its prior seeds the random numbers.
         """
         state, made = self.ended(state)
         if state.kept is None:

@@ -77,7 +77,7 @@ class SensorMemory(NamedTuple):
         innovation: innovation of the cloud as a whole.
         differences: (N, m) measured minus predicted.
         noise: (1 or N, m, m) covariance of the noise, later replaced by its factor; the first axis has N
-            entries if the noise differs between particles.
+            entries if the particles have different noise.
         determinant: (1 or N,) log det of the covariance.
         kept: (m,) indices of the components that are used.
     """
@@ -148,7 +148,7 @@ class Renew(Protocol):
 
 
 class Drive(Protocol):
-    """Function that returns the control (controls,) of a particle."""
+    """Function that returns the control (controls,) for a particle, including any random error."""
 
     def __call__(self, interval: Interval, drawn: Floats, memory: ParticleMemory, /) -> Numbers: ...
 
@@ -367,7 +367,7 @@ def _additive_noise(bound_model: BoundModel, first: int) -> SpreadParticles:
 
 
 def summing_up(model: Model) -> EstimateRun:
-    """Make the estimate: the intrinsic mean and covariance, and the particles if requested."""
+    """Make `estimate`, which computes intrinsic mean and covariance, and particles if requested."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, range_of(t))
     weighted_mean, straight = weighted_mean_of(range_of(n)), set(model.kinds) <= {"linear"}

@@ -92,7 +92,7 @@ def renewing(model: Model) -> Renew:
 
 
 class Look(Protocol):
-    """Function that prepares the likelihood after particles have moved.
+    """Function that prepares the computation of likelihoods after particles have moved.
 
     It returns the number of used components.
     """
@@ -134,8 +134,8 @@ def taking_in_parts(model: Model, look: Look, likelihood: Likelihood) -> Take:
 
     Args:
         model: model whose state the particles have.
-        look: `look(states, data, parameters, memory, kept)` prepares the likelihood after particles have
-            moved, and returns the number of used components.
+        look: `look(states, data, parameters, memory, kept)` prepares the computation of likelihoods
+            after particles have moved, and returns the number of used components.
         likelihood: log p at one particle; see `update.weighing`.
     """
     renew = renewing(model)

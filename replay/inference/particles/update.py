@@ -50,7 +50,7 @@ def weighing(bound_model: BoundModel, number: int, *, progressive: bool) -> Upda
 
     The recorded innovation, its NIS and the gate use the first two moments of the cloud; the
     log-likelihood is computed from the weighted particles. A component that no particle can predict is
-    left out, and a particle that cannot predict one of the other components keeps its share of the
+    left out. A particle that cannot predict one of the other components keeps its fraction of the total
     weight.
 
     Args:

@@ -1,8 +1,8 @@
-"""Starts that hardly depend on parameters, so that likelihoods can be compared.
+"""Initial states that hardly depend on parameters, so that likelihoods can be compared.
 
-A start may depend on the parameters. For example, an alignment with the first fixes uses more fixes if
-the noise parameters are larger; likelihoods for different parameters would then cover different
-messages.
+An initial state and its stamp may depend on the parameters. For example, an alignment with the first
+fixes uses more fixes if the noise parameters are larger; likelihoods for different parameters would then
+cover different messages.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -31,8 +31,8 @@ def broad_priors(
 ) -> list[Stream]:
     """Make the priors of all runs, one stream for each of the equally likely parts of an angle.
 
-    A filter is linear only in a small interval of a heading, so an angle of the state is divided into
-    PARTS.
+    A filter is approximately linear only within a small interval of a heading, so an angle of the state
+    is divided into PARTS.
 
     Args:
         model: model of the state.

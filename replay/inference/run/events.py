@@ -33,12 +33,12 @@ class Points:
 
     @cached_property
     def _places(self) -> Floats:
-        """The positions, and NaN, which is selected by row -1."""
+        """The positions of the points, followed by a row of NaN, so that row -1 selects NaN."""
         return np.concatenate([self.places, np.full((1, self.places.shape[1]), np.nan)])
 
     @cached_property
     def _by_number(self) -> Integers:
-        """The rows by run and number, or -1 (runs, numbers); empty if most of them would be missing."""
+        """The rows of points by run and number, -1 if missing; empty if most would be missing."""
         keys, first = np.unique(self.keys, return_index=True)
         runs, numbers = keys >> 32, keys & 0xFFFFFFFF
         shape = (runs.max(initial=-1) + 1, numbers.max(initial=-1) + 1)
@@ -109,7 +109,7 @@ def data_columns(bound_model: BoundModel) -> tuple[int, int]:
 def events_of(
     bound_model: BoundModel, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """Return the result of `filter_events`, which may be cached from an earlier replay of the block.
+    """Return the result of `filter_events`; it may be stored from an earlier replay of the same block.
 
     Args:
         bound_model, found, block, context, settings: as for `filter_events`.

@@ -87,9 +87,9 @@ class FilterState(NamedTuple):
         context: maps and origins to which messages refer.
         generators: random generators of samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
-        unsettled: events that wait for messages that may arrive later but were measured earlier.
+        unsettled: events that wait because messages with earlier measurement times may still arrive.
         kept: history of a smoother for its backward pass, or of a filter for reprocessing.
-        next_output: (runs,) number of the next additional estimate.
+        next_output: (runs,) number of the next output time.
     """
 
     carried: RecursionState
@@ -219,7 +219,7 @@ class Filter:
     def ready(
         self, state: FilterState, events: FilterEvents, *, is_end: bool
     ) -> tuple[FilterState, FilterEvents]:
-        """Return the events that need not wait, and a state that keeps the waiting events."""
+        """Return the events that need not wait, and a state that contains the waiting events."""
         next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
@@ -285,7 +285,7 @@ class Filter:
 
     @cached_property
     def beside_settings(self) -> Hashable:
-        """Key of the filter's definition, without settings that only the loop over the runs reads."""
+        """Key of the filter's definition; it excludes settings that only the loop over runs reads."""
         names = {*number_fields(self.bound_model.model.parameters)} - {"gate_probability"} | {
             "of_topics"
         }

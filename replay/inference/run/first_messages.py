@@ -18,7 +18,7 @@ WIDER = 30.0  # times a message's sigma: such a prior has a thousandth of its we
 
 
 class Begun(NamedTuple):
-    """Starts of runs, to be filled: stamps (runs,), FOREVER_NS if not known; means; covariances."""
+    """Initial states of runs, to fill: stamps (runs,), FOREVER_NS if unknown; means; covariances."""
 
     time_ns: Integers
     mean: Floats
@@ -26,7 +26,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """Sentence to report, its stamp in each run (runs,), and whether it applies to each run (runs,)."""
+    """Sentence to report, its stamp in each run (runs,), and whether it is true for each run (runs,)."""
 
     text: str
     time_ns: Integers
@@ -105,10 +105,10 @@ def heads_of_runs(ragged: Ragged, count: int) -> Ragged:
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """Assign the messages of a stream to the runs that have a message.
+    """Divide a stream into runs, given which of the runs have a message in it.
 
     Args:
-        stream: the messages, in the order of their runs.
+        stream: the messages, at most one per run, in the order of their runs.
         has_one: (runs,) whether a run has a message.
     """
     return Ragged(stream, np.append(0, np.cumsum(has_one)))

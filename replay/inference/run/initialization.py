@@ -83,7 +83,7 @@ class Initializer:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """Sensors that measure the state itself, with their indices."""
+        """Sensors that measure components of the state directly, with their indices."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
@@ -149,7 +149,7 @@ class Initializer:
         clock: Clock,
         times_ns: Sequence[int],
     ) -> list[Initialized]:
-        """Find equally likely starts of the runs at the given stamps; see `broad_priors`."""
+        """Find equally likely initial states of the runs at the given stamps; see `broad_priors`."""
         runs = run_count(first)
         origins = None if self.found.origin is None else np.tile(self.found.origin, (runs, 1))
         begun: dict[str, Ragged] = {}
@@ -278,7 +278,7 @@ class Initializer:
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Settings]:
-        """Return first messages and maps by the model's names of their topics, and the parameters."""
+        """Return first messages and maps by the topic names that the model uses, and the parameters."""
         model, control = self.bound_model.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -342,7 +342,7 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Start runs just after the first fixes that, with the path between them, determine the state.
+        """Start each run just after the fixes that, with the path between them, determine the state.
 
         If several topics serve the same sensor, the fixes of the first topic are used.
         """
@@ -410,7 +410,7 @@ class Initializer:
         return None
 
     def _parameters(self) -> Settings:
-        """Return the parameters; for each sensor, use the parameters of its first topic."""
+        """Return the parameters; those of each sensor are the parameters of its first topic."""
         model = self.bound_model.model
         names, numbers = number_fields(model.parameters), self.settings.copy()
         for number, (_, topic) in reversed([*enumerate(self.found.sensors, start=1)]):

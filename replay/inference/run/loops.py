@@ -71,9 +71,9 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
         process: `process(run, event, inputs, state, results, memory)` updates the state by an event and
             returns ALL_WELL or the number of a failure. A negative number does not end the run, but
             nothing is recorded for the event.
-        record: function with the same arguments, which is called if `process` returned ALL_WELL; it
-            fills the requested results.
-        fails: whether a run may fail; if not, the state needs no `failure`, and all events are
+        record: function with the same arguments that fills the requested results; it is called if
+            `process` returned ALL_WELL.
+        fails: whether a run can fail; otherwise, the state needs no `failure`, and all events are
             processed.
 
     Returns:

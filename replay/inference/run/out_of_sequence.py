@@ -62,7 +62,7 @@ class LateState(NamedTuple):
         history: the stored messages.
         window_ns: largest delay up to which a message is reprocessed.
         repeated: (n,) number of updates that were repeated because of each event.
-        row: (runs,) row of the stored message that each run is processing.
+        row: (runs,) for each run, the row of the stored message that is being processed.
     """
 
     carried: RecursionState
@@ -277,7 +277,7 @@ class OutOfSequenceFilter:
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: AnyFilterState) -> list[Ragged]:
-        """Return the innovations that waited because further messages could have changed them."""
+        """Return the innovations that were kept back because later messages could have changed them."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
@@ -311,7 +311,8 @@ def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
     """Set the log times of estimates to the arrival times of the events that requested them.
 
-    Each run has estimates for all of these events after its prior, or only for the earliest of them.
+    A run has estimates either for all of these events after its prior, or only for the first few of
+    them.
 
     Args:
         estimates: estimates of the filter.

@@ -216,7 +216,7 @@ def _control_noise(
 
 
 def _driving(bound_model: BoundModel, found: Found) -> list[tuple[str, int]]:
-    """For each component of the control, list its topic and its index in the topic's messages."""
+    """For each component of the control, list its topic and its index in that topic."""
     control = bound_model.model.control
     if control is None or found.control is None:
         return []

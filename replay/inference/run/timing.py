@@ -15,7 +15,7 @@ EARLY = 1000  # intervals of output: a prior that is older than this does not st
 
 
 def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
-    """Test whether each event (n,) requests an estimate; a stamp with only control messages may not."""
+    """Test whether each event (n,) requests an estimate; control-only stamps may be excluded."""
     control = bound_model.model.control
     if control is None or control.estimates or not bound_model.sensors:
         return events.wants_estimate
@@ -23,7 +23,7 @@ def where_wanted(bound_model: BoundModel, events: FilterEvents) -> Booleans:
 
 
 def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
-    """Test whether each event (n,) is the last of its stamp, and an event of this stamp is chosen.
+    """Select the last event of each stamp that has a chosen event; returns booleans (n,).
 
     Args:
         is_last: (n,) whether each event is the last of its stamp.
@@ -36,7 +36,7 @@ def at_stamps_of(is_last: Booleans, chosen: Booleans) -> Booleans:
 
 
 def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
-    """Compute the delays, from measurement to stamp in ns, by source of the event.
+    """Compute the delays in ns from measurement to stamp, by source of the event.
 
     Args:
         bound_model: the bound model, with the sensors of the log.
@@ -102,7 +102,7 @@ def output_times(
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
-    """Merge two sequences of events by time, run by run; ties keep the order of the sequences."""
+    """Merge two sequences of events by time, run by run; at ties, the first sequence is first."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     run = np.concatenate([run_of_rows(each.offsets) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
@@ -163,7 +163,7 @@ def interpolate_control(
     """Interpolate the control linearly at all events; return ready and waiting events.
 
     Events after a run's last control message wait for the next one, together with that message. During a
-    gap, the control is NaN, from just after the last message up to and including the next message.
+    gap, from just after the last message up to and including the next message, the control is NaN.
 
     Args:
         events: events in order; control messages have the control in their last columns.
@@ -205,11 +205,12 @@ def fill_control(bound_model: BoundModel, events: FilterEvents) -> FilterEvents:
 
 
 def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
-    """Use the last control for events that still wait at the end of a log, for at most `gap_ns`.
+    """Apply the last control to events still waiting at the end of a log, for at most `gap_ns`.
 
     Args:
-        events: waiting events; the first one of a run is its last message of the control, if any.
-        initial: control of runs without a message of the control.
+        events: waiting events; if a run has a control message, its last one is the first of these
+            events.
+        initial: control of runs without a control message.
         gap_ns: longest time without messages of the control.
     """
     data = events.data.copy()

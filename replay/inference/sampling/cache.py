@@ -38,7 +38,7 @@ class SetName:
     seed: int = 0
 
     def __str__(self) -> str:
-        """Return the name in an archive; the version must change if the computed sets change."""
+        """Return the name in an archive; change the version whenever the computed sets change."""
         kind = "symmetric" if self.symmetric else "free"
         return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
 

@@ -1,9 +1,9 @@
 """LCD sampling: equally weighted samples that are as close to N(0, I) as possible.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
-section V.A. The paper does not mention that the optimum's covariance is too small (eigenvalues of 0.82
-for 5 samples in two dimensions, 0.99 for 150), which degrades a filter: apply `moment_corrected` before
-use.
+section V.A. The paper does not mention that the covariance of the optimal set is too small (eigenvalues
+of 0.82 for 5 samples in two dimensions, 0.99 for 150), which degrades a filter: apply `moment_corrected`
+before use.
 """
 
 from collections.abc import Callable
@@ -43,11 +43,11 @@ def lcd_samples(
     Args:
         dimension: N.
         count: L.
-        generator: draws the starts from N(0, I); the optimum and its rotation depend on it.
+        generator: draws the initial sets from N(0, I); the optimum and its rotation depend on it.
         symmetric: whether the set contains the negative of every sample; with an odd count, one sample
             is at the origin.
         starts: number of local optima to find.
-        report: called with a message before each start.
+        report: function that is called with a message before each optimisation.
 
     Raises:
         BadInput: the set could not have a regular covariance, see `check_count`.

@@ -32,8 +32,8 @@ class Sampler:
 
     `draw(generator, batch)` returns points (*batch, count, dimension) and weights (*batch, count).
     Unless `redrawn` is true, points and weights are read-only views of one set, and the generator is not
-    used. Consecutive batches contain the same numbers as one batch of their total size, so a log can be
-    divided into blocks anywhere.
+    used. Consecutive batches contain the same samples as one batch of the total size, so the division of
+    a log into blocks does not matter.
     """
 
     dimension: int

@@ -1,7 +1,7 @@
 """Sample sets for compiled filters: one set for all steps, or a new set for each step.
 
-A randomised sampling uses a separate generator for each run, seeded by the data of the run, so that a
-run has the same estimates in an ensemble as by itself.
+A randomised sampling uses a separate generator for each run, seeded by the data of the run, so that the
+estimates of a run are the same in an ensemble and in a replay of this run alone.
 """
 
 import copy

@@ -6,8 +6,8 @@ d_k from these states, which are in a vector space:
     d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
 
 with the rotation E and the right Jacobian Jr, which are identities except for orientations. No inverse
-of Q is needed: if Q is singular, x_k is restricted to states that the noise can reach, and only the
-noise has a cost. A robust loss is applied by reweighting.
+of Q is needed: if Q is singular, x_k is restricted to states that the noise can reach, and the cost
+contains only the directions that have noise. A robust loss is applied by reweighting.
 
 Bell, SIAM J. Optim. 4(3), 1994.
 """
@@ -82,8 +82,8 @@ class Trajectory(NamedTuple):
             two passes are compared, the previous pass was at the states `kept`.
         kept: (nodes, n) states with the smallest cost so far.
         node: (events,) node of each event's stamp.
-        scale: (nodes, t) variances of the start; damping adds pseudo-measurements of the current states,
-            with these variances divided by the damping.
+        scale: (nodes, t) variances of the extended smoother; damping adds pseudo-measurements of the
+            current states, with these variances divided by the damping.
         loss: (2,) index in LOSSES, and scale of the loss.
         damping: (1,) damping of this pass.
         cost, held: (1,) costs of the trajectory with its own noise, and with the noise at `kept`.
@@ -130,7 +130,7 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
 
     Args:
         mean, covariance: (t,), (t, t) in the tangent space at the trajectory's state.
-        trajectory: trajectory with the damping and the variances of the start.
+        trajectory: trajectory with the damping and the variances of the extended smoother.
         node: index of the state.
     """
     damping, column = trajectory.damping[0], trajectory.column
@@ -274,7 +274,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
     Args:
         matrix: (t, t).
         factor: (t, t); its first `rank` columns are filled.
-        order: (t,), filled: row order[k] of the factor ends in column k.
+        order: (t,), filled: in row order[k] of the factor, the last nonzero entry is in column k.
         left: (t,) working memory.
 
     Returns:

@@ -185,16 +185,16 @@ def compose(
 
 
 class Later(NamedTuple):
-    """Node after a piece: whether each run has such a node, and the smoothed nodes, one row per run."""
+    """The node after a piece: whether each run has one, and the smoothed nodes, one row per run."""
 
     is_there: Integers
     nodes: Nodes
 
 
 class Smoothed(NamedTuple):
-    """Results of smoothing: nodes of run r before row stop[r] are written, starting at row start[r].
+    """Results of smoothing: the nodes of run r before stop[r] are written from row start[r] on.
 
-    Each estimate is smoothed from the last node within the lag.
+    The smoothing of each estimate begins at the last node within the lag.
     """
 
     stop: Integers
@@ -204,7 +204,7 @@ class Smoothed(NamedTuple):
 
 
 class BackMemory(NamedTuple):
-    """Working memory of the backward pass of one core: a Gaussian, its gain, and vectors of a step."""
+    """Working memory of one core for the backward pass: a Gaussian, its gain, and vectors of a step."""
 
     mean: Floats
     covariance: Floats
@@ -224,7 +224,7 @@ def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> 
 
 
 class GoBack(Protocol):
-    """Function that smooths the nodes of a run in a piece; afterwards, `later` has the first node."""
+    """Function that smooths the nodes of a run in a piece, and sets `later` to the first of them."""
 
     def __call__(
         self, run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory, /

@@ -1,9 +1,9 @@
 """Posterior Cramer-Rao bound from the information of the measurements along the true states.
 
-Each node (a stamp with an estimate) has the covariance of an extended Kalman filter that linearises at
-the truth, or of its smoother (`bound:smoother`), along this trajectory. No inverse of the process noise,
-which may be singular, is needed. The steps are also output; `fuselog.replay.judging.consistency.bounds`
-computes the bound over an ensemble from them.
+For each node (a stamp with an estimate), the result is the covariance of an extended Kalman filter that
+linearises at the truth, or of its smoother (`bound:smoother`), along this trajectory. No inverse of the
+process noise, which may be singular, is needed. The steps are also output;
+`fuselog.replay.judging.consistency.bounds` computes the bound over an ensemble from them.
 
 Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 """
@@ -41,7 +41,7 @@ class BoundParameters(MethodParameters):  # type: ignore[explicit-any]
     """Kind of bound, and interpolation of the truth.
 
     Attributes:
-        of: whether the bound of filters or of smoothers is computed.
+        of: whether to compute the bound for filters or the bound for smoothers.
         gap_limit_s: longest gap over which truth is interpolated.
     """
 
@@ -228,7 +228,7 @@ class BoundFilter(Filter):
     def begun(
         self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
     ) -> tuple[BoundHistory, Ragged]:
-        """Make the steps to the priors, for runs that reach their first node.
+        """Make the steps to the priors, for runs that have now reached their first node.
 
         The noise of such a step is the prior's covariance. If the first node has the stamp of the prior,
         the step to the prior replaces the step to that node.

@@ -19,10 +19,10 @@ from fuselog.replay.inference.smoothing.backward_pass import BackMemory, Nodes, 
 class Window(NamedTuple):
     """Steps within the lag of the first node that is not yet smoothed, as two stacks.
 
-    For a node up to `turned`, its row has the composition of its step and all later steps up to
+    The row of each node up to `turned` contains the composition of its step and all later steps up to
     `turned`; the steps from `turned` to `through` are composed in this object. The first axis is the
-    run; nodes count from the first stored one. A step is (G, b, A): deviations from the filter's means
-    are propagated back by d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
+    run; nodes are numbered from the first stored one. A step is (G, b, A): deviations from the filter's
+    means are propagated back by d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
     """
 
     turned: Integers
@@ -45,7 +45,7 @@ def sliding(kinds: tuple[str, ...]) -> RunOnce:
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
     ) -> None:
-        """Append a node's step to the window; in the row of the node, b replaces the prediction."""
+        """Append a node's step to the window; replace the node's prediction by the step's vector b."""
         shift, change = nodes.predicted[row], work.change[0]
         subtract(nodes.mean[row], shift, work.change, 0)
         for i in range(len(shift)):

@@ -51,7 +51,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e12
 
 
 class Plan(NamedTuple):
-    """Inputs of a search: priors of the runs, their stamps, and the control before its first message.
+    """Inputs of a search: the runs' priors and their stamps, and control before the first message.
 
     Further inputs are the first damping and the maximum number of passes.
     """

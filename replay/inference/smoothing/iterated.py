@@ -47,10 +47,10 @@ from fuselog.replay.inference.smoothing.smoothers import Smoother, SmootherParam
 
 
 class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
-    """Options of smoother:iterated: start of the search, damping, and loss for outliers.
+    """Options of smoother:iterated: initial trajectory, damping, and loss function for outliers.
 
     Attributes:
-        start: start of the search: smoother (result of the extended smoother), motion (the prior's mean,
+        start: initial trajectory: smoother (result of the extended smoother), motion (the prior's mean,
             propagated by the motion) or prior (the prior's mean at all stamps).
         damping: damping of the first step, in units of the information at the start; with 0, damping
             begins only when a step would raise the cost.
@@ -70,7 +70,7 @@ class IteratedParameters(SmootherParameters):  # type: ignore[explicit-any]
 
 
 class Way(NamedTuple):
-    """Runs from their priors to their ends, as processed by the extended smoother.
+    """Complete runs, from the prior to the last node, as processed by the extended smoother.
 
     Attributes:
         events: events up to the last node, without measurements that a gate rejected.
@@ -269,7 +269,7 @@ class IteratedSmoother(Smoother):
 
 
 def _solved_at_the_end(bound_model: BoundModel) -> Steps:
-    """Make the steps of the extended smoother, which computes the start."""
+    """Make the steps of the extended smoother, which runs once before the search."""
     return smoothing_steps(bound_model, FILTERS["ekf"].steps(bound_model))
 
 

@@ -129,7 +129,7 @@ class Smoother(Filter):
 
     @property
     def why_in_sequence(self) -> str:
-        """Reason why a smoother cannot reprocess messages: it uses later messages in any case."""
+        """Reason why a smoother cannot reprocess messages: its estimates use later messages anyway."""
         return "a smoother uses later messages anyway; replay it in the order of the stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:

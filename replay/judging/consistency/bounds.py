@@ -53,7 +53,7 @@ class Bounds:
         sums: sums of the products by step, rows of 4 t^2.
         stamps: (steps,) ns since the epoch.
         steps: number of steps of every run, by run number.
-        reason: why there is no mean over the ensemble; empty if there is one.
+        reason: reason why the mean over the ensemble does not exist; empty if it exists.
     """
 
     components: list[tuple[str, str]] = field(default_factory=list)
@@ -132,7 +132,7 @@ class Bounds:
         return UNALIKE if len(set(self.steps.values())) > 1 else ""
 
     def covariances(self) -> Floats | None:
-        """Compute the bounds (steps, t, t) after the prior; None without a bound over the ensemble."""
+        """Compute the bounds (steps, t, t) after the prior; None if the ensemble has no common bound."""
         if self.complaint or self.sums is None:
             return None
         _, count, sums = self.sums.filled()
@@ -190,9 +190,9 @@ def _add(state: Bounds, output: Output) -> Bounds:
 def root_mean_squares(state: Bounds) -> dict[str, float]:
     """Compute the lower bounds of RMSE over all steps, by the name of the RMSE.
 
-    The bounds are returned only if the bound over the ensemble exists; `over_ensemble` is then 1.
-    Otherwise, the average along the trajectories is computed in the same way as errors
-    (`metrics.ACCURACY`).
+    They are returned only if the bound over the ensemble exists, as indicated by `over_ensemble`, which
+    is 1 or 0. Otherwise, `metrics.ACCURACY` averages the bounds along the trajectories, as it does with
+    errors.
     """
     if not state.components:
         return {}

@@ -29,7 +29,7 @@ class Conditioning(NamedTuple):
         failed: number of samples that are not positive definite, even if rounding errors are allowed
             for.
         least: the smallest pivot.
-        run: number of the run with the smallest pivot in the ensemble, if that pivot has lost its
+        run: number of the run in the ensemble that has the smallest pivot, if that pivot has lost its
             digits.
         elapsed_s: time of this pivot since the run's epoch.
     """

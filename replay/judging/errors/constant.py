@@ -1,7 +1,8 @@
-"""Detection of constant errors, due to different origins or body points of truth and estimate.
+"""Detection of constant errors that arise if truth and estimate have different origins or body points.
 
 From position errors e_k, covariances P_k and headings h_k, two constants are estimated: d, which
-minimises e_k - d, and a lever arm l, which minimises e_k - R(h_k) l. Only mergeable sums are stored.
+minimises the residuals e_k - d, and a lever arm l, which minimises the residuals e_k - R(h_k) l. Only
+mergeable sums are stored.
 """
 
 from dataclasses import dataclass, field
@@ -44,7 +45,8 @@ class ConstantSums:
     """Sums of the position errors e of a stream of estimates, with weights W = P^-1 and times t.
 
     Attributes:
-        axes: number of position components; errors in the plane have no error and no weight in z.
+        axes: number of position components; for positions in the plane, errors and weights in z are
+            zero.
         count: number of errors.
         numbers: (4,) sums of e' e, e' W e, t and t^2.
         frames: (2, 15) sums in the fixed frame and in the body's: e, W e and t e, and xx, xy, xz, yy, yz
@@ -57,7 +59,7 @@ class ConstantSums:
     frames: Floats = field(default_factory=lambda: np.zeros((2, 15)))
 
     def add(self, errors: Errors) -> None:
-        """Add a block. Bounds have no errors; estimates without a position have no origin."""
+        """Add a block. Bounds and estimates without a position are skipped."""
         place = errors.position
         if errors.is_bound or len(place) < 2:
             return
@@ -82,8 +84,8 @@ class ConstantSums:
     def found(self) -> Constant | None:
         """Find a constant error, if any, in the frame in which it explains more of the error.
 
-        If the body never rotates, the frames cannot be distinguished, and the error is treated as a
-        different origin.
+        If the body never rotates, the frames cannot be distinguished, and the error is attributed to
+        different origins.
         """
         fixed, turned = self._constant(turns=False), self._constant(turns=True)
         if fixed is None or turned is None:

@@ -74,7 +74,8 @@ class Difference(NamedTuple):
         first, second: the means over the runs.
         more: second - first.
         margin: differences up to this value are unimportant.
-        verdict: verdict on the second estimator: whether the interval is beyond the margin or within it.
+        verdict: verdict on the second estimator, which depends on whether the interval is beyond the
+            margin or within it.
         sure: fraction of the resamples in which the difference has the sign of `more`.
         runs: number of runs.
     """
@@ -161,7 +162,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Comparison:
-    """Return the verdict on a difference; if neither is closer to a target value, only its sign."""
+    """Return the verdict on a difference; if neither is closer to the target, it is higher or lower."""
     if target in ("low", "high"):
         return Comparison.WORSE if (difference > 0) == (target == "low") else Comparison.BETTER
     if isinstance(target, float):

@@ -65,7 +65,7 @@ class Errors:
         case: name of the estimated object, such as `robot1`; may be empty.
         components: names of the d components of the tangent space.
         kinds: kind of each component: "linear", "angle" or "rotation" (about a body axis).
-        run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
+        run, step, time_ns: (n,); step numbers the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
         error: (n, d) estimate minus truth.
         covariance: (n, d, d) as stated by the estimator.
@@ -73,7 +73,7 @@ class Errors:
         without_truth: number of estimates at stamps where the truth cannot be interpolated.
         components_without_truth: components of the estimate that are not judged because the truth lacks
             them.
-        is_bound: whether these are bounds at the truth instead of estimates: the covariances are then
+        is_bound: whether the rows are bounds at the truth instead of estimates: the covariances are then
             the smallest possible squared errors.
         heading_rad: (n,) the true heading; None if truth and estimate have no heading.
         position_nees: (n,) NEES of the position; None if it was not computed together with `nees`.
@@ -442,7 +442,7 @@ def _truth_around(
 ) -> tuple[NDArray[np.int64], Floats]:
     """Return stamps (m,) and states (m, components) that determine the truth at the stamps (n,).
 
-    `reader` is the topic of the estimates, in the given plane; see `reference`.
+    `reader` is the topic of the estimates, and `plane` is their tangent plane; see `reference`.
     """
     truth = truths.around(topic, time_ns, gap_limit_s, reader)
     if len(truth) == 0:

@@ -1,4 +1,4 @@
-"""Transformation of targets' true positions into the estimates' frame, by that frame's true pose."""
+"""Transformation of targets' true positions into the estimates' frame, using the frame's true pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -51,7 +51,7 @@ def not_comparable(stated: Mapping[str, str], truths: Sequence[str], topics: Map
 def seen_in(
     frame: str, truths: Truths, topic: str, places: Floats, time_ns: Integers, gap_limit_s: float
 ) -> Floats:
-    """Transform the positions of a target into a frame; a pose that is stated once applies to all times.
+    """Transform the positions of a target into a frame; a pose that is stated only once is constant.
 
     Args:
         frame: see `frame_of`; `not_comparable` must be empty for it.

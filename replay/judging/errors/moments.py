@@ -103,5 +103,5 @@ def _main(errors: Errors) -> tuple[str, list[int], float]:
 
 
 def _size(moment: Moment) -> tuple[float, int, int]:
-    """Return the sort key of moments of one quantity; among equal values, the earliest comes last."""
+    """Return the sort key for moments of one quantity; of equal values, the earliest sorts last."""
     return moment.value, -moment.run, -moment.time_ns

@@ -49,9 +49,9 @@ def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | Non
 def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
     """Explain why estimates cannot be compared with the truth of some run, or return "".
 
-    Tangent planes with known origins can be compared. A truth that states no origin is in the tangent
-    plane of its log, if the log states one, unless the truth has a separate frame; estimates of a filter
-    with its origin at the first fix are not in this tangent plane.
+    Tangent planes with known origins can be compared. If a truth states no origin but its log does, the
+    truth is in the tangent plane of the log, unless the truth has a separate frame. Estimates of a
+    filter whose origin is the first fix are not in this tangent plane.
 
     Args:
         stream: the estimates.

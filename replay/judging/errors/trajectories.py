@@ -185,7 +185,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """Pair times with the nearest times in `among`, within a limit; return the indices of both."""
+    """Pair each time with the nearest time in `among`, within a limit; return the indices of both."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
@@ -298,9 +298,9 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
     """Estimate the offset, in s, of the estimate's stamps that minimises the distance to the truth.
 
     The offset is added to the stamps and minimises the RMSE of aligned positions. The local search
-    starts from the best of three kinds of offsets: those with the highest correlation between the speeds
-    of both trajectories, which no alignment changes; a grid of all offsets at which half of the poses
-    have truth; and zero.
+    starts from the best of these candidates: the offsets with the highest correlation between the speeds
+    of both trajectories, which no alignment changes; a grid of the offsets at which at least half of the
+    shorter time span overlaps the other; and zero.
 
     Raises BadInput if a trajectory has no stamps, or if its speed never changes.
     """

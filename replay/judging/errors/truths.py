@@ -53,8 +53,8 @@ class Truths:
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
         """Return the messages of a topic that determine the truth at some stamps.
 
-        `reader` identifies the caller. Messages before the stamps of all readers are dropped, and are
-        read again if a new reader needs them.
+        `reader` identifies the caller. Messages before the stamps that all readers still need are
+        dropped, and are read again if a new reader needs them.
         """
         if len(time_ns) == 0:
             return self.source.empty(topic)
@@ -141,7 +141,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """Subtract two truths by component, at those stamps of the first that the second spans."""
+    """Compute differences of two truths by component, at stamps of the first that the second spans."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

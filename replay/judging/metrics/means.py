@@ -44,7 +44,7 @@ class OutputDiagnostics(NamedTuple):
 
 
 def diagnostics_of(output: Output) -> OutputDiagnostics | None:
-    """Extract the diagnostics in an output that have a mean over time; None without diagnostics."""
+    """Extract those diagnostics of an output that can be averaged over time; None if there are none."""
     stream = output.rows.stream
     schema = stream.schema.full_name
     if schema == schemas.MODE_PROBABILITIES.full_name:

@@ -165,7 +165,7 @@ class MetricCollection:
     def finish(self, of: Callable[[str], bool] | None = None) -> dict[str, float]:
         """Compute the numbers of all keys, or those that `of` selects, as `estimator.quantity[.case]`.
 
-        Errors come first, then innovations. Raises BadInput if a metric raises.
+        Errors come first, then innovations. Raises BadInput if a metric raises an exception.
         """
         values: dict[str, float] = {}
         for place in sorted(self._states, key=lambda place: _RANKS.get(place[0], 2)):
@@ -186,7 +186,7 @@ _RANKS: dict[type, int] = {Errors: 0, Innovations: 1, Output: 3}
 def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> dict[str, float]:
     """Compute metrics of judged objects, one block each, with the keys `estimator.quantity[.case]`.
 
-    Raises BadInput if a metric raises.
+    Raises BadInput if a metric raises an exception.
     """
     measurement = MetricCollection(metrics)
     for number, each in enumerate(judged):

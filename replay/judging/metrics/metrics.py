@@ -191,7 +191,7 @@ def _nis(innovations: Innovations) -> Sums:
 
 
 def innovation(sums: Sums) -> dict[str, float]:
-    """Compute the mean NIS per measured component (expected: 1) and the share rejected by a gate."""
+    """Compute the mean NIS per measured component (expected: 1) and the fraction rejected by a gate."""
     if not sums.get("messages"):
         return {}
     gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
@@ -213,8 +213,8 @@ def _log_likelihoods(innovations: Innovations) -> Sums:
 def likelihood(sums: Sums) -> dict[str, float]:
     """Compute the log-likelihood of the measurements of a run under the predictions, averaged over runs.
 
-    Only accepted measurements count, so gates cannot be tuned by this metric. There is no result if the
-    estimator does not state all likelihoods.
+    Only accepted measurements are included, so gates cannot be tuned by this metric. There is no result
+    if the estimator does not state all likelihoods.
     """
     if not sums.get("runs") or not np.isfinite(sums["log_likelihood"]):
         return {}
@@ -233,7 +233,7 @@ def failures(sums: Sums) -> dict[str, float]:
 
 
 def covered(output: Output) -> Sums:
-    """Sum spans of runs, spans with estimates, unused measurements and ages of estimates.
+    """Sum durations of runs, durations with estimates, unused measurements and ages of estimates.
 
     The age of an estimate is the time from its stamp to its availability.
     """
@@ -253,7 +253,7 @@ def covered(output: Output) -> Sums:
 
 
 def coverage(sums: Sums) -> dict[str, float]:
-    """Compute the share of the span with estimates, the unused measurements, or the mean age."""
+    """Compute the fraction of time with estimates, the unused measurements, or the mean age."""
     if "age_s" in sums:
         return {"estimate_age_s": sums["age_s"] / sums["estimates"]} if sums["age_s"] > 0.0 else {}
     if "skipped" in sums:
@@ -263,7 +263,7 @@ def coverage(sums: Sums) -> dict[str, float]:
 
 
 def estimated_share(sums: Sums) -> float | None:
-    """Compute the share of the spans of runs that estimates cover; None without a span."""
+    """Compute the fraction of the time of runs that estimates cover; None if runs have no span."""
     return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
 
 
@@ -287,7 +287,7 @@ def solution(sums: Sums) -> dict[str, float]:
     """Compute the share of batch solutions that converged, and the largest number of iterations.
 
     If the channel states the start, the mean final cost is included. For streams of single iterations,
-    only the mean cost at the start is computed.
+    only the mean cost of the initial trajectory is computed.
     """
     if sums.get("starts"):
         return {"start_cost": sums["start_cost"] / sums["starts"]}

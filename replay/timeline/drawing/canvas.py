@@ -285,14 +285,14 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[Board], case: str) -> rrb.Container:
-    """Return a case's panel with its plots, if any, to the right; all strips are equally high."""
+    """Return a case's panel with any plots to its right; all strips have the same height."""
     shares = [float(strips_of(plot)) for plot in plots]
     columns = [board, rrb.Vertical(*plots, row_shares=shares)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
 
 
 def strips_of(board: Board) -> int:
-    """Count the views below each other in a part of a layout."""
+    """Count the views that a part of a layout shows below each other."""
     if not isinstance(board, rrb.Container):
         return 1
     within = [strips_of(each) for each in board.contents if isinstance(each, rrb.Container | rrb.View)]

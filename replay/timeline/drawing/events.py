@@ -55,7 +55,7 @@ Draw = Callable[[Canvas, Scene, str], list[Board]]
 class Happened(NamedTuple):
     """Events of an estimator or a sensor: a text for each time, all of one level.
 
-    `part` is an entity below the entity of `who`, if the events have a separate one.
+    `part` is an entity below the entity of `who`, for events that are drawn as a separate entity.
     """
 
     who: str
@@ -82,8 +82,8 @@ def draw_events(
 ) -> list[rrb.TextLogView]:
     """Draw the events of a case, one entity per estimator and sensor; return no view without events.
 
-    `not_drawn` has the reasons why topics have no drawing, in addition to unreadable topics; `also` has
-    events of the scenario family; `more` has other cases whose worst moments are included.
+    `not_drawn` states why topics are not drawn, in addition to unreadable topics; `also` contains events
+    of the scenario family; `more` contains other cases whose worst moments are included.
     """
     root = entity_path("events", case)
     reasons = {**scene.unread, **(not_drawn or {})}
@@ -210,7 +210,7 @@ def within(topic: str, case: str) -> str:
 
 
 def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
-    """Yield outages and gaps of sensors, and changes of the state of their solutions."""
+    """Yield outages and gaps of sensors, and changes in the status of their solutions."""
     for topic in scene.topics_near(case):
         if scene.source.topics[topic].schema_name in NOT_SENSED:
             continue
@@ -227,7 +227,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
-    """Yield changes of the solution's or body's state that a sensor reports; see STATES."""
+    """Yield changes in the status of the solution or body that a sensor reports; see STATES."""
     if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
         return
     for column, component in enumerate(stream.components):

@@ -35,7 +35,7 @@ def degrees_of(stream: Stream) -> Floats:
 
 
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
-    """Draw geodetic fixes as points connected by a thin line, without positions that are far off.
+    """Draw geodetic fixes as points connected by a thin line, omitting positions that are far off.
 
     Points are coloured by the stated standard deviation of the fixes, or with `colour` if no deviation
     is stated.

@@ -140,7 +140,7 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_scans(
     canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """Draw all points of a stamp together, until the next stamp.
+    """Draw all points of a stamp together; they are visible until the next stamp.
 
     Args:
         canvas, entity, time_ns, places: as for `draw_dots`, in order of time.
@@ -193,7 +193,7 @@ def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
 
 
 def draw_cloud(canvas: Canvas, entity: str, cloud: Cloud, colour: Colour) -> None:
-    """Draw all particles of a stamp until the next stamp."""
+    """Draw all particles of a stamp together; they are visible until the next stamp."""
     points = rr.Points2D.columns(
         positions=cloud.places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(cloud.weights)
     )
@@ -305,7 +305,7 @@ def draw_lines(
 ) -> None:
     """Draw all lines of one stamp together, as a scan.
 
-    The next scan replaces the lines; they disappear if the next scan is later than usual.
+    The next scan replaces the lines; if it is later than usual, they disappear before it arrives.
 
     Args:
         canvas, entity: the canvas, and the path of the entity.

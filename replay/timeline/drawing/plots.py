@@ -101,8 +101,8 @@ def draw_quality(canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 
     If there are more plots, errors are in tabs by quantity; if there are still too many, the other plots
     are in tabs too. Single estimates in the plane are first shown in a close-up, because their plots
-    over time are single points. There are no plots without errors or innovations. `legend` is False if a
-    scene has its own legend.
+    over time are single points. If there are no errors and no innovations, there are no plots. `legend`
+    is False if a scene has its own legend.
     """
     errors = draw_errors(canvas, scene, case)
     nees = draw_nees(canvas, scene, case, legend=legend)
@@ -435,7 +435,7 @@ def plot_view(
     legend: bool = True,
     zoom_lock: bool = True,
 ) -> rrb.TimeSeriesView:
-    """Plot everything below an entity over the whole run, titled with quantity, unit and note.
+    """Plot everything below an entity over the whole run; the title has quantity, unit and note.
 
     A given range is locked by default.
     """

@@ -108,7 +108,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Find the rows to keep in their cells; in the widest cell, keep only rows of the last stamp."""
+        """Find the rows to keep in each cell; cells of the largest width keep only their last stamp."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
@@ -207,7 +207,7 @@ class Thin:
 
 @dataclass(frozen=True)
 class Held(DerivedSource):
-    """Source with some topics already in memory, thinned or incomplete."""
+    """Source of which some topics are already in memory, thinned or incomplete."""
 
     streams: Mapping[str, Stream]
 
@@ -229,7 +229,7 @@ class Held(DerivedSource):
         }
 
     def empty(self, topic: str) -> Stream:
-        """Return the topic without its messages."""
+        """Return the stream of a topic without its messages."""
         return self.of.empty(topic)
 
     def blocks(

@@ -1,4 +1,4 @@
-"""Search for the files of a bag: one file, or the files of a folder, split and compressed as in ROS."""
+"""Search for the files of a bag: one file or a folder's files, which ROS may split and compress."""
 
 import re
 from collections import Counter
@@ -66,7 +66,7 @@ def looks_like_bag(path: Path) -> bool:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag; raise BadInput if the path is no bag, or if none of its files can be read.
+    """Open a bag; raise BadInput if the path is not a bag, or if none of its files can be read.
 
     Files that are compressed as a whole are decompressed to a temporary folder.
     """

@@ -175,7 +175,7 @@ class Ros1File:
 
 
 def _record_at(file: BinaryIO, position: int, size: int) -> _Record | None:
-    """Read the record at a position; return None if it is truncated, except for a chunk's data."""
+    """Read the record at a position; return None if it is truncated, unless only a chunk's data are."""
     file.seek(position)
     head = file.read(_LENGTH.size)
     length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else size

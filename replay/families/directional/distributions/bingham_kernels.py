@@ -153,7 +153,7 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
     """Compute the eigenvalues, ascending, and eigenvectors of a symmetric matrix.
 
     The method is cyclic Jacobi rotations. For d <= 4 they are faster than LAPACK, and small eigenvalues
-    keep their digits.
+    keep their relative precision.
 
     Args:
         matrix: (d, d), destroyed.
@@ -286,8 +286,8 @@ def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
 def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
     """Predict x (+) w in place by algorithm 1, whose second input is Z^w, not the printed Z^v.
 
-    The computation is in the frame of the mode, in which small moments keep their digits next to large
-    ones.
+    The computation is in the frame of the mode, in which small moments keep their precision next to
+    large ones.
 
     Args:
         axes: principal axes (d, d) in columns, the mode last.
@@ -320,7 +320,7 @@ def inverse(x: NDArray, out: NDArray) -> None:
 def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> None:
     """Compute the moments along the axes, and the second moment in the frame of the mode.
 
-    In that frame, small moments keep their digits next to large ones.
+    In that frame, small moments keep their precision next to large ones.
 
     Args:
         axes, z: as for `predict`.

@@ -1,8 +1,8 @@
 """Maximum-likelihood mixtures on the torus: wrapped normals and von Mises densities.
 
-Angles are (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximization over
-components and turns. A mixture of bivariate von Mises densities is fitted by L-BFGS-B, starting at the
-mixture of wrapped normals.
+Angles are (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximization over the
+components and the numbers of full turns. A mixture of bivariate von Mises densities is fitted by
+L-BFGS-B, starting at the mixture of wrapped normals.
 """
 
 from typing import Literal, NamedTuple

@@ -204,8 +204,8 @@ def product_mixture(
 ) -> int:
     """Compute the product of two wrapped normal densities, which is exactly a wrapped Gaussian mixture.
 
-    The mixture has one component for each number of turns between the two means, computed by a Kalman
-    update. Returns the number of components.
+    The mixture has one component for each number of full turns between the two means; a Kalman update
+    computes the component. Returns the number of components.
 
     Args:
         mean, covariance, other_mean, other: means (2,) and covariances (2, 2) of both densities.

@@ -39,8 +39,8 @@ class InertialParameters(Parameters):
     """Noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
-        rest_s: duration of the rest at the start; if not set, it is detected in the log and is at most
-            20 s.
+        rest_s: duration of the stationary period at the start; if not set, it is detected in the log and
+            is at most 20 s.
         block_s: averaging time, in s, of an attitude from accelerometer and magnetometer.
         attitude_sigma_deg: standard deviation of the attitude from accelerometer and magnetometer, in
             deg.
@@ -70,7 +70,7 @@ class GyroParameters(InertialParameters):
     """Noise and averaging of inertial samples, and treatment of the gyro's bias.
 
     Attributes:
-        unbiased: whether the gyro's mean during the rest is subtracted.
+        unbiased: whether the gyro's mean during the stationary period is subtracted.
     """
 
     unbiased: bool = True

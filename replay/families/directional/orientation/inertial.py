@@ -4,10 +4,11 @@ The module also has a baseline, the attitude from every single sample. Dead reck
 is in `reckoning`.
 
 The filter was made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021).
-The body rests first; the mean of the gyro during the rest is its bias. Then, for each block of time, the
-samples of accelerometer and magnetometer are rotated to the end of the block by the gyro's turn and
-averaged, which separates gravity from motion. The TRIAD attitude of the averages is a quaternion
-measurement for the filter. Quaternions rotate vectors from body axes to east, north, up.
+At first the body is stationary; the mean of the gyro during this period is the gyro's bias. Then, for
+each block of time, the samples of accelerometer and magnetometer are rotated into the frame at the end
+of the block, by the rotation that the gyro measured, and averaged, which separates gravity from motion.
+The TRIAD attitude of the averages is a quaternion measurement for the filter. Quaternions rotate vectors
+from body axes to east, north, up.
 """
 
 import math
@@ -45,7 +46,7 @@ class InertialModel(NamedTuple):
     """Assumptions of the filter, the same for all logs.
 
     Attributes:
-        rest_s: longest duration of the rest at the start.
+        rest_s: longest duration of the stationary period at the start.
         block_s: averaging time of one attitude.
         attitude_sigma_rad: standard deviation of a block's attitude about each axis.
         drift_sigma_rad: standard deviation, about each axis, of dead reckoning over one second.
@@ -83,7 +84,7 @@ class InertialState(NamedTuple):
     Attributes:
         time_ns: stamps of the first sample, the last sample and the start of the block, (runs, 3); -1
             before they exist.
-        rate_sum: sum of the gyro's samples during the rest, (runs, 3).
+        rate_sum: sum of the gyro's samples during the stationary period, (runs, 3).
         rest_samples: number of samples in rate_sum, (runs,).
         axes: axes of the Bingham distribution at the start of the block, (runs, 4, 4).
         concentrations: (runs, 4), all 0 while the orientation is unknown.
@@ -93,7 +94,7 @@ class InertialState(NamedTuple):
         force: sum of the accelerometer's samples in the block, rotated into the frame of the last
             sample, (runs, 3).
         field: sum of the magnetometer's samples in the block, rotated in the same way, (runs, 3).
-        rest_s: duration of the rest if it is shorter than in the model, (runs,).
+        rest_s: duration of the stationary period if it is shorter than in the model, (runs,).
     """
 
     time_ns: Integers
@@ -123,7 +124,7 @@ def start_inertial_filter(runs: int, rest_s: Floats | None = None) -> InertialSt
 
     Args:
         runs: number of runs.
-        rest_s: (runs,), durations of rests that are shorter than in the model.
+        rest_s: (runs,), durations of stationary periods that are shorter than in the model.
     """
     return InertialState(
         np.full((runs, 3), -1),
@@ -226,11 +227,11 @@ def _inertial_run(
 def _accumulate(
     model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
 ) -> float:
-    """Add one sample to the rest and to the block, in place.
+    """Add one sample to the sums of the stationary period and of the block, in place.
 
     Returns the time in s since the start of the block, or NaN if the sample is skipped because it is not
-    finite. If only the field is not finite, as between two samples of a slower magnetometer, the rest of
-    the sample is used.
+    finite. If only the field is not finite, as between two samples of a slower magnetometer, force and
+    turn rate are still used.
     """
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]

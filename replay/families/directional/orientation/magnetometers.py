@@ -66,7 +66,7 @@ def with_magnetometer(estimator: Estimator[Any]) -> Estimator[Any]:
 
 
 def _magnetometer(unit: str, units: list[str], topics: Mapping[str, Topic]) -> str:
-    """Find a unit's magnetometer: in the unit's namespace, or the only one if there is only one unit."""
+    """Find a unit's magnetometer: in its namespace, or the only magnetometer if there is one unit."""
     own = f"{unit.rpartition('/')[0]}/magnetic_field"
     kind = schemas.MAGNETIC_FIELD.full_name
     there = [name for name, topic in topics.items() if topic.schema_name == kind]

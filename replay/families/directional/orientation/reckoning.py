@@ -1,4 +1,4 @@
-"""Dead reckoning with the gyro only, starting at the attitude of the initial rest; see `inertial`."""
+"""Dead reckoning with the gyro only, starting at the attitude of the unit at rest; see `inertial`."""
 
 from typing import NamedTuple
 
@@ -23,11 +23,11 @@ class ReckoningState(NamedTuple):
     """State of dead reckoning between samples; the first axis is the run.
 
     Attributes:
-        orientation: (runs, 4), zero until the rest is over, NaN after a gap.
+        orientation: (runs, 4), zero until the stationary period is over, NaN after a gap.
         time_ns: stamps of the first and the last sample, (runs, 2); -1 before they exist.
-        sums: sums of gyro, accelerometer and magnetometer during the rest, (runs, 3, 3).
+        sums: sums of gyro, accelerometer and magnetometer during the stationary period, (runs, 3, 3).
         rest_samples: number of samples in the sums, (runs,).
-        rest_s: duration of the rest if it is shorter than in the model, (runs,).
+        rest_s: duration of the stationary period if it is shorter than in the model, (runs,).
     """
 
     orientation: Floats
@@ -42,7 +42,7 @@ def start_reckoning(runs: int, rest_s: Floats | None = None) -> ReckoningState:
 
     Args:
         runs: number of runs.
-        rest_s: (runs,), durations of rests that are shorter than in the model.
+        rest_s: (runs,), durations of stationary periods that are shorter than in the model.
     """
     none_yet = np.full((runs, 2), -1)
     return ReckoningState(
@@ -64,7 +64,7 @@ def run_dead_reckoning(
 ) -> tuple[ReckoningState, OrientationEstimates]:
     """Integrate the gyro from the attitude at rest; if `unbiased`, subtract the gyro's mean at rest.
 
-    There are no estimates before the end of the rest or after a gap. Args and errors as for
+    There are no estimates before the end of the stationary period or after a gap. Args and errors as for
     `run_inertial_filter`.
     """
     samples, estimates = prepared(model, samples, estimates)

@@ -1,7 +1,7 @@
-"""Detection of a unit's initial rest from its gyro, specific force and magnetic field.
+"""Detection of a unit's initial stationary period from gyro, specific force and magnetic field.
 
-The mean of the gyro during the rest is its bias. Means over short windows are compared with the mean of
-all previous windows: the rest ends when a window differs by more than its noise explains.
+The mean of the gyro during this period is the gyro's bias. Means over short windows are compared with
+the mean of all previous windows: the period ends when a window differs by more than its noise explains.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ LARGEST_BIAS_RADPS = 0.35
 
 
 def resting(stream: Stream) -> int:
-    """Count the samples of a unit's initial rest of at most `LONGEST_S`; 0 if it moves immediately.
+    """Count the samples before a unit first moves, for at most `LONGEST_S`; 0 if it moves immediately.
 
     Args:
         stream: inertial samples in time order.
@@ -82,10 +82,10 @@ def _differing(values: Floats, of_window: Any, count: int, *, is_rate: bool) -> 
 
 
 def of_nine_axes(estimator: Estimator[Any]) -> Estimator[Any]:
-    """Return the estimator with automatic detection of its unit's initial rest.
+    """Return the estimator with automatic detection of its unit's initial stationary period.
 
-    The rest is detected if the estimator has a parameter `rest_s` that is not set. The samples of the
-    rest are passed to the estimator's `start` under the name `REST`.
+    The period is detected if the estimator has a parameter `rest_s` that is not set. The samples of the
+    period are passed to the estimator's `start` under the name `REST`.
     """
 
     def bind(name: str, topics: Mapping[str, Any], values: Any) -> list[Bound]:
@@ -106,7 +106,7 @@ def _find(
     static: Mapping[str, Ragged],
     clock: Clock,
 ) -> Initialized:
-    """Find the initial rest of every run.
+    """Find the initial stationary period of every run.
 
     Raises BadInput if a unit moves within `LEAST_S` of its first sample.
     """
@@ -137,7 +137,7 @@ def _first_ns(samples: Stream) -> int:
 
 
 def rests_of(given: Mapping[str, Ragged], runs: int) -> Floats:
-    """Return each run's duration of rest (runs,) in s, or infinity if no rest was detected."""
+    """Return the duration (runs,) in s of each stationary period, or infinity if none was detected."""
     if REST not in given:
         return np.full(runs, np.inf)
     rest = given[REST]

@@ -40,7 +40,7 @@ class JudgedSets:
 
     @property
     def violations(self) -> int:
-        """Count sets that miss the truth although bounds and arena are right; 0 for guaranteed sets."""
+        """Count sets that miss the truth although bounds and arena are valid; 0 for guaranteed sets."""
         return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
 
     @property

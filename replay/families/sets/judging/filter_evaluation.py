@@ -57,7 +57,7 @@ class JudgedFilter:
 
     @property
     def violations(self) -> int:
-        """Count the sets that miss the truth although they must contain it; 0 for guaranteed sets."""
+        """Count the sets that must contain the truth but do not; 0 for guaranteed sets."""
         return int((self.guaranteed & ~self.sets.inside).sum())
 
 
@@ -132,7 +132,7 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Compute the odometry's errors of displacement (m) and turn (rad) between true poses, (n, 2).
+    """Compute the odometry's errors of displacement (m) and rotation (rad) between true poses, (n, 2).
 
     Args:
         odometry: odometry of the robot.

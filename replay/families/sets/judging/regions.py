@@ -82,7 +82,7 @@ def inside(regions: Sequence[Sequence[Floats]], places: Floats) -> NDArray[np.bo
 
     Args:
         regions: n lists of rings, (vertices, 2) in m each.
-        places: (n, 2), in m; NaN is in no region.
+        places: (n, 2), in m; no region contains a NaN position.
 
     Returns:
         (n,) booleans.

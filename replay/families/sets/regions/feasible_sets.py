@@ -241,7 +241,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
-    """Find the real roots (..., 2) of quadratics without cancellation; NaN or infinite if missing."""
+    """Find real roots (..., 2) of quadratics without cancellation; missing ones are NaN or infinite."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(linear**2 - 4.0 * quadratic * constant)
         half = -0.5 * (linear + np.where(linear < 0, -root, root))
@@ -249,7 +249,7 @@ def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
 
 
 def area(border: Arcs) -> float:
-    """Compute the area inside by Green's theorem, from chords and circular segments."""
+    """Compute the enclosed area by Green's theorem, from chords and circular segments."""
     end = border.at(border.length)
     chords = border.start[:, 0] * end[:, 1] - border.start[:, 1] * end[:, 0]
     turn = border.curvature * border.length
@@ -309,7 +309,7 @@ def signed_area(ring: Floats) -> float:
 
 
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """Compute vertices along an arc, without its end; on convex arcs, they are where tangents meet."""
+    """Compute vertices along an arc, except its end; on convex arcs, they are tangent intersections."""
     length, curvature = border.length[index], border.curvature[index]
     pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
     pieces = max(pieces, int(np.ceil(abs(length * curvature))))
@@ -330,7 +330,7 @@ def to_blame(pairs: Pairs, arena: Arena) -> Integers:
     """Find the pairs that contradict all other pairs, worst first; none if the exact set is not empty.
 
     These are the pairs that are violated at the point in the arena with the fewest violations. This
-    point is chosen among the intersections of the circles; among equals, the total excess decides.
+    point is one of the intersections of the circles; ties are resolved by the smallest total excess.
     """
     if len(exact_set(pairs, arena).length):
         return np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""Frames of bounded bearings, with the bounds that their channels state."""
+"""Frames of bounded bearings, with the bounds from the metadata of their channels."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -87,7 +87,7 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
 
 
 def _maximum_range_m(stream: Stream, known: Known) -> float:
-    """Return the stated range of the sensor or, without one, the longest range that it measured."""
+    """Return the sensor's maximum range if it is given, or else the longest range that it measured."""
     if known.maximum_range_m is not None:
         return known.maximum_range_m
     if "range_m" not in stream.columns:

@@ -46,14 +46,14 @@ ALL_HEADINGS = Headings(0.0, np.pi)
 
 
 class Odometry(NamedTuple):
-    """Poses (n, 3) by odometry only, and velocities (n, 2) that apply from each stamp to the next."""
+    """Poses (n, 3) from odometry alone, and velocities (n, 2) that apply from each stamp to the next."""
 
     time_ns: Integers
     pose: Floats
     velocity: Floats
 
     def pose_at(self, time_ns: Integers) -> Floats:
-        """Compute poses (m, 3) at any stamps; before the first stamp the robot is at rest."""
+        """Compute poses (m, 3) at any stamps; before the first stamp the robot is stationary."""
         row = np.maximum(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0)
         duration_s = np.maximum((time_ns - self.time_ns[row]) * 1e-9, 0.0)
         return np.stack(drive(self.pose[row].T, self.velocity[row].T, duration_s), axis=1)
@@ -88,7 +88,7 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
     Args:
         time_ns: (n,), the stamps.
-        velocity: (n, 2), forward in m/s and turn in rad/s.
+        velocity: (n, 2), forward velocity in m/s and turn rate in rad/s.
     """
     duration_s = np.diff(time_ns, append=time_ns[-1:]) * 1e-9
     heading = np.concatenate([[0.0], np.cumsum(velocity[:, 1] * duration_s)])[:-1]
@@ -102,7 +102,7 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
 
 def relative_pose(first: Floats, second: Floats) -> Floats:
-    """Compute a second pose relative to a first one: displacement and turn, not wrapped.
+    """Compute a second pose relative to a first one: displacement, and rotation without wrapping.
 
     Args:
         first: (..., 3), x, y in m and heading in rad.

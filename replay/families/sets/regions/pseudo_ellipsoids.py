@@ -112,7 +112,7 @@ def _least_on_axis(pairs: Pairs) -> Floats:
 
 
 def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
-    """Compute lower bounds (k,) of the functions over the arena; only those of discs are not tight."""
+    """Compute lower bounds (k,) of the functions over the arena; all are tight except those of discs."""
     x, y = np.meshgrid(*np.stack(arena, axis=1))
     corners = evaluate(constraints, np.stack([x.ravel(), y.ravel()], axis=1)).min(axis=0)
     with np.errstate(divide="ignore"):
@@ -288,7 +288,7 @@ def _shares(logarithms: Floats) -> Floats:
 def _area_over(rings: Floats, weights: Floats, arena: Arena, order: Order) -> Size:
     """Make a function that computes the area of the fused set for weights near the given weights.
 
-    The area is computed in a window; a set that extends beyond it counts as larger than the window.
+    The area is computed in a window; a set that extends beyond it is treated as larger than the window.
     """
     window = _window(lambda points: _fused(rings, weights, points, order), arena, SEARCH_NODES)
     grid = _grid(window, SEARCH_NODES)

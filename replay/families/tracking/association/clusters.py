@@ -33,10 +33,10 @@ class AssociationMemory(NamedTuple):
     Attributes:
         rows, columns: the tracks and detections of a cluster.
         is_seen: whether a detection is already in a cluster.
-        pair, alone, spare: weights of pairs of item and slot, of items without a slot, and of slots
-            without an item.
-        forward, backward: sums over the assignments of the first items and over those of the other
-            items, by the set of occupied slots.
+        pair, alone, spare: weights of item-slot pairs, of items without a slot, and of slots without an
+            item.
+        forward, backward: sums over the assignments of the items so far, and over those of the remaining
+            items, for each set of occupied slots.
         message: messages from detections to tracks.
         price, row_of, distance, before, is_done: quantities of the columns of an assignment problem;
             those of the rows are `potential` and `column_of`.
@@ -90,9 +90,9 @@ def jpda(
     """Fill the marginals (tracks, 1 + detections) over all joint associations; column 0 is a miss.
 
     Tracks are independent if they share no detection, either directly or through other tracks. Each
-    cluster of connected tracks is summed separately: exactly if it has at most MOST_ENUMERATED tracks or
-    at most that many detections, and by belief propagation otherwise. Returns the number of tracks in
-    clusters with approximated marginals.
+    cluster of connected tracks is summed separately: exactly if the number of its tracks or the number
+    of its detections is at most MOST_ENUMERATED, and by belief propagation otherwise. Returns the number
+    of tracks in clusters with approximated marginals.
 
     Args:
         weights: weights of pairs and of misses.
@@ -126,7 +126,7 @@ def gather_cluster(
     probability: Floats,
     memory: AssociationMemory,
 ) -> tuple[int, int]:
-    """List the tracks and detections that are connected with a track; return how many there are of each.
+    """List the tracks and detections that are connected with a track; return both numbers.
 
     Args:
         first: index of the track.

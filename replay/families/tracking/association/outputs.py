@@ -21,11 +21,11 @@ class TrackOutputs(NamedTuple):
     """Outputs of a tracker after every scan.
 
     Attributes:
-        end: (runs, 2), the numbers of rows that a run has filled: of tracks, and of associations.
+        end: (runs, 2), the numbers of rows of tracks and of associations that each run has filled.
         confirmed: (scans,), number of confirmed tracks; NEVER if the scan was too old to be used.
         approximated: (scans,), number of tracks in clusters too large for enumeration.
-        turned_away: (scans,), number of detections that could not begin a track because there was no
-            room.
+        turned_away: (scans,), number of detections that could not begin a track because all places for
+            tracks were occupied.
         number, mean, covariance, probability, existence: (runs, rows, ...), values of confirmed tracks;
             `probability` has the probabilities of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), their probability.

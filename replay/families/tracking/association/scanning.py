@@ -47,7 +47,7 @@ class ScanMemory(NamedTuple):
         motion: memory of the motion of tracks, see `fuselog.replay.inference.kalman.steps.Steps`.
         step: memory of the derivatives of sensors.
         pool: memory of the errors that all tracks share.
-        place: (detections, 2), the detections of a scan after near ones are joined.
+        place: (detections, 2), the detections of a scan after those close to each other are joined.
         group: (detections,), the group with which each detection is joined.
         clutter: (detections,), density of clutter and of targets that were never detected.
         undetected: (detections,), density of targets that were never detected.
@@ -134,7 +134,7 @@ def target_of(model: Model) -> Callable[[Numbers], Numbers]:
 
 @lru_cache(maxsize=64)
 def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
-    """Make the model's sensor for a kind of scan sensor; functions may read the parameters `names`."""
+    """Make the model's sensor for a kind of scan sensor; its functions may read parameters `names`."""
     target, inner = target_of(model), kind.measure
 
     def measure(state: Numbers, reference: Numbers, parameters: Settings) -> Numbers:

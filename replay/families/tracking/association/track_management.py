@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
 
 
 def is_silent(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether a sensor that begins tracks has not detected the track for too long."""
+    """Test whether the track has not been detected for too long by any sensor that begins tracks."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
     longest_s: float = p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s
     is_over: bool = silent_s > longest_s
@@ -79,7 +79,7 @@ def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Setti
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Update the existence by Bayes' rule; confirmation ends below `keeping_existence`."""
+    """Update the existence by Bayes' rule; below `keeping_existence`, a track is no longer confirmed."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
     needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
@@ -95,7 +95,7 @@ def does_not_exist(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
 
 
 def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Settings) -> None:
-    """Count chances and hits; a miss counts only if a detection was probable."""
+    """Update the numbers of chances and hits; a miss is a chance only if a detection was probable."""
     is_hit = evidence.probability[0] < 0.5
     if is_hit or evidence.detectable >= CHANCE:
         tracks.chances[run, place] += 1
@@ -137,7 +137,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Set
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Settings) -> bool:
-    """Test whether a track is silent or its score too low: far below 0 or, if confirmed, its best."""
+    """Test whether a track is silent or has a score far below 0 or, if confirmed, below its maximum."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

@@ -46,7 +46,7 @@ class Tracker(NamedTuple):
 
 
 class Newborn(NamedTuple):
-    """New target whose position is known, but nothing else.
+    """New target of which only the position is known.
 
     Attributes:
         mean, covariance: mean (n,) and covariance (t, t); the entries of the position are placeholders.

@@ -217,7 +217,7 @@ def processing(tracker: Tracker) -> TakeDetections:
     def process(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Settings, memory: ScanMemory
     ) -> None:
-        """Update the states and the management of all tracks by the associations."""
+        """Update the states and the management data of all tracks with their associations."""
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
         for place in range(tracks.used[run]):
             probability = memory.probability[place, : 1 + count]

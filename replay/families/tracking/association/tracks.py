@@ -25,8 +25,8 @@ class Tracks(NamedTuple):
         number, existence, is_confirmed: (runs, places).
         mean, covariance: (runs, places, modes, ...).
         mode, log_mode: (runs, places, modes), the modes' probabilities, and their logarithms.
-        hits, chances: (runs, places), numbers of scans since the birth in which the track was, or could
-            have been, detected.
+        hits, chances: (runs, places), numbers of scans since the track's birth that detected it, and
+            that could have detected it.
         score, best_score: (runs, places), the log-likelihood ratio of a track since its birth, and the
             maximum of this ratio.
         seen_ns: (runs, places), time at which a sensor that begins tracks last detected the track.
@@ -94,7 +94,7 @@ def no_tracks(
 
 
 def drop(run: int, place: int, tracks: Tracks) -> None:
-    """Remove a track and move up those after it."""
+    """Remove a track, and shift all later tracks by one place."""
     tracks.used[run] -= 1
     for at in range(place, tracks.used[run]):
         for counts in (tracks.number, tracks.hits, tracks.chances, tracks.seen_ns):

@@ -242,7 +242,7 @@ def figures_of_whole_tracks(
 ) -> dict[str, float]:
     """Compute HOTA and IDF1 with a cutoff of 20 m.
 
-    By default, all tracks count. If truths cover only some targets, tracks count only if they come
+    By default, all tracks count. If truths cover only some targets, tracks are used only if they come
     within the cutoff of a target at some instant, and the metrics have other names.
 
     Args:

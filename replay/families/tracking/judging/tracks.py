@@ -1,7 +1,7 @@
 """Evaluation of tracks by the share of each target's reports that are in one track.
 
 Each track is assigned to at most one target and vice versa, such that the number of reports in the track
-of their target is largest. A track that contains two targets counts for only one of them.
+of their target is largest. A track with reports from two targets is assigned to only one of them.
 """
 
 import operator
@@ -89,7 +89,7 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
     Args:
         time_ns: (n,), sorted stamps of the reports.
         numbers: (n,), number of the sender of each report.
-        live_s: time for which a sender counts after its last report, in s.
+        live_s: time for which a sender is counted as live after its last report, in s.
     """
     order = np.lexsort((time_ns, numbers))
     sorted_ns, sorted_numbers = time_ns[order], numbers[order]
