@@ -248,10 +248,15 @@ def work_off(
             pending: dict[Future[Any], int] = {}
             lost: BaseException | None = None
             while following < len(cells) and lost is None:
-                while waiting and len(pending) < pool.workers:
-                    number = waiting.popleft()
-                    place = checkpoints.place_of(keys[number]).absolute()
-                    pending[pool.executor.submit(cells[number].packed, place)] = number
+                try:
+                    while waiting and len(pending) < pool.workers:
+                        place = checkpoints.place_of(keys[waiting[0]]).absolute()
+                        future = pool.executor.submit(cells[waiting[0]].packed, place)
+                        pending[future] = waiting.popleft()
+                except BrokenExecutor as broken:  # a worker died since the last result
+                    lost = broken
+                    died[waiting[0]] += not pending
+                    break
                 left = checkpoints.read(keys[following])
                 if left is not None:
                     pace.done += cells[following].runs

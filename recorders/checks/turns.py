@@ -70,7 +70,7 @@ def _mirrored(motion: BodyMotion, source: Series, ratio: Slope, witness: int) ->
     """Report a mirrored frame if another sensor confirms the rate (`witness` > 0), else a wrong sign."""
     assert motion.courses is not None
     course = motion.courses
-    evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
+    evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad per rad of this turn rate"
     if witness > 0:
         field = course.field
         yield Finding(

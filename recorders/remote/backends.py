@@ -219,7 +219,7 @@ def _check_content(url: str, content: bytes, offset: int) -> None:
 
 
 def _open(url: str, *, is_whole: bool = False) -> "_Opened":
-    """Open a file at its beginning; `is_whole` requests the whole file at once from a web server."""
+    """Open a file at its beginning; `is_whole` requests all of it together from a web server."""
     file_system, path = _backend(url, None if is_whole else RANGE_S)
     options = {"block_size": 0} if is_whole and "http" in file_system.protocol else {}
     return _Opened(file_system.open(path, "rb", cache_type="none", **options), file_system)

@@ -178,7 +178,7 @@ TABLE: dict[str, tuple[str, ...]] = {
         "is 2",
         "less than or equal to 1",
     ),
-    "replay log.mcap -e ukf --set kappa=-5": ("kappa", "more than -3"),
+    "replay log.mcap -e ukf --set kappa=-5": ("kappa", "above -3"),
     "run landmarks --set duraton_s=1": ("--set duraton_s", "did you mean 'duration_s'"),
     "run landmarks --set efk.gate_probability=1": ("--set efk", "did you mean 'ekf'"),
     "run landmarks --set ekf.gate=1": ("estimator ekf", "'gate'"),

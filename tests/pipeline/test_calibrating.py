@@ -147,9 +147,8 @@ def test_bounds_above_zero_leave_a_parameter_its_intervals() -> None:
 
 def test_what_cannot_be_calibrated_is_refused() -> None:
     log = recorded(drive(None, duration_s=3.0))
-    with pytest.raises(
-        fl.BadInput, match="lever_z_m: not a calibration parameter; choose from forward_"
-    ):
+    refused = "--fixed lever_z_m: not a calibration parameter; choose from forward_"
+    with pytest.raises(fl.BadInput, match=refused):
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
     with pytest.raises(fl.BadInput, match="calibrate: by is an option of tune only"):
         fl.calibrate(log, "ekf", by="rmse")

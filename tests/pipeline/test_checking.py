@@ -77,7 +77,7 @@ def test_a_change_in_the_seventh_digit_is_found_at_its_first_stamp(
         "relative difference 2e-07, allowed 1e-12",
         first,
     )
-    assert bits.startswith(f"bits of {INNOVATION} differ from {first_ns} ns on")
+    assert bits.startswith(f"the bits of {INNOVATION} differ from {first_ns} ns on")
     assert "NIS" in innovation
     assert str(first_ns) in innovation
     page = (Path(__file__).parents[2] / "docs" / "compare.md").read_text(encoding="utf-8")

@@ -157,7 +157,7 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     assert "ekf" not in names
     monkeypatch.setattr(candidates, "replay", changed)
     found = fl.compare(result, estimators=["dead-reckoning", "ekf"])
-    [note] = [each for each in found.notes if "replayed now" in each]
+    [note] = [each for each in found.notes if "in a new replay" in each]
     assert "of ekf" in note
     rows = found.groups[0][1].rows
     stored = pd.read_parquet(result / "tables" / "runs.parquet").query("estimator == 'ekf'")

@@ -76,7 +76,7 @@ def test_interacting_modes_err_less_than_each_single_motion() -> None:
     page = (Path(__file__).parents[4] / "docs" / "your-model-more.md").read_text(encoding="utf-8")
     position, velocity = worth
     assert position == velocity
-    printed = f"errors of position and velocity are {position} % smaller than those of the best"
+    printed = f"errors of position and velocity are {position} % smaller than with the best"
     assert printed in " ".join(page.split())
     assert 3.0 < found[name].nees.mean() < 5.0
 
