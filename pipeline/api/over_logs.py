@@ -7,7 +7,6 @@ log and estimator, also for a log that could not be read or replayed, with the r
 
 import hashlib
 import math
-import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,7 +40,7 @@ from fuselog.pipeline.runs.executors import PoolFactory, pool_for
 from fuselog.pipeline.selecting.selection import Selection
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
-from fuselog.recorders.remote.paths import RemotePath
+from fuselog.recorders.remote.paths import seen_from
 from fuselog.replay.engine.streams.sources import LogSource
 from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import (
@@ -117,9 +116,7 @@ class Replaying:
         plan = plan_replay([source], estimators, **self.options)
         places = []
         if self.place is not None:
-            there = (self.place / "estimates").resolve()
-            is_remote = isinstance(log, RemotePath)
-            places = [(path, log if is_remote else path.parent / os.path.relpath(log.resolve(), there))]
+            places = [(path, seen_from(path, self.place / "estimates" / path.name, log))]
         return plan.replay(places)
 
 

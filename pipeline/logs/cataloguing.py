@@ -24,7 +24,7 @@ from fuselog.pipeline.selecting.catalog import (
     logs_in,
     logs_under,
     read_catalog,
-    require_unchanged,
+    read_current,
     rows_in,
     schema,
     state_of_log,
@@ -37,7 +37,7 @@ from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, read_span
 from fuselog.recorders.log.impossible import YEAR_NS
-from fuselog.recorders.remote.paths import located, partly
+from fuselog.recorders.remote.paths import is_url, located, partly
 from fuselog.replay.engine.streams.linting import lint_source
 from fuselog.replay.engine.streams.sources import LogSource
 
@@ -214,7 +214,7 @@ def _logs_of(paths: Sequence[Path]) -> list[str]:
 
 def _place(log: str) -> str:
     """Return what identifies a log: its URL or absolute path."""
-    return log if "://" in log else os.path.normpath(Path(log).absolute())
+    return log if is_url(log) else os.path.normpath(Path(log).absolute())
 
 
 def _rows(logs: Sequence[str], *, deep: bool = False) -> "pd.DataFrame":
@@ -226,7 +226,7 @@ def _rows(logs: Sequence[str], *, deep: bool = False) -> "pd.DataFrame":
 
 
 def _row(log: str, found: Row, state: tuple[int, int, str], deep: bool) -> Row:
-    folder = PurePosixPath(log).parent if "://" in log else Path(log).absolute().parent
+    folder = PurePosixPath(log).parent if is_url(log) else Path(log).absolute().parent
     own = {"log": log, "folder": folder.name, "is_deep": deep}
     return own | dict(zip(STATE, state, strict=True)) | found
 
@@ -244,13 +244,7 @@ def select(paths: Sequence[Path], where: str | None = None, group: str | None = 
 
     Raises BadInput if no log meets the condition, or a log changed after it was catalogued.
     """
-    tables = []
-    for path in paths:
-        if is_catalog(path):
-            tables.append(table := read_catalog(path))
-            require_unchanged(table, path)
-        else:
-            tables.append(_rows(_logs_of([path])))
+    tables = [read_current(path) if is_catalog(path) else _rows(_logs_of([path])) for path in paths]
     table = table_of([row for table in tables for row in rows_in(table)])
     table = with_columns(table[~table["log"].map(_place).duplicated()])
     return selected(table, str(paths[0]), where, group)

@@ -21,7 +21,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import LogWriter, open_log
 from fuselog.recorders.parameters import build, merge
 from fuselog.recorders.recording import import_run
-from fuselog.recorders.remote.paths import RemotePath, reference_to
+from fuselog.recorders.remote.paths import seen_from
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory, memory_source
 from fuselog.replay.foreign.naming import of_file
@@ -189,8 +189,7 @@ class Runner:
 
     def _as_seen_from(self, path: Path, log: Path) -> Path:
         """Return a path to a log that is valid after the folder has been moved to its final path."""
-        there = self.setting.place / path.relative_to(self.setting.folder)
-        return log if isinstance(log, RemotePath) else path.parent / reference_to(log, there)
+        return seen_from(path, self.setting.place / path.relative_to(self.setting.folder), log)
 
     def _places(self, folder: str, run: int) -> tuple[Path, Path]:
         """Return the paths of a run's log and estimates."""

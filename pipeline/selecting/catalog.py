@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.errors import BadInput, check_format
 from fuselog.recorders.parameters import flat
-from fuselog.recorders.remote.paths import RemotePath, located, state_of
+from fuselog.recorders.remote.paths import RemotePath, is_url, located, state_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,7 +92,7 @@ def logs_in(path: Path) -> list[Path]:
 
 def recordings_in(folder: Path) -> list[Path]:
     """List the logs in a folder by name, without estimates logs; return [] for any other path."""
-    return [each for each in sorted(folder.glob("*.mcap")) if not each.match("*.estimates.mcap")]
+    return [each for each in sorted(folder.glob("*.mcap")) if _is_log(each.name)]
 
 
 def is_catalog(path: Path) -> bool:
@@ -191,26 +191,26 @@ def is_written(path: Path) -> bool:
 
 def _stored(log: str, path: Path) -> str:
     """Return the path of a log relative to the folder of its catalog; URLs are stored as they are."""
-    if "://" in log:
-        return log
-    return Path(os.path.relpath(log, path.parent)).as_posix()
+    return log if is_url(log) else Path(os.path.relpath(log, path.parent)).as_posix()
 
 
 def _seen(log: str, path: Path) -> str:
-    return log if "://" in log else os.path.normpath(path.parent / log)
+    return log if is_url(log) else os.path.normpath(path.parent / log)
 
 
-def require_unchanged(table: "pd.DataFrame", catalog: Path) -> None:
-    """Raise BadInput if the state of a log differs from the state in its catalog."""
+def read_current(path: Path) -> "pd.DataFrame":
+    """Read a catalog as `read_catalog` does; raise BadInput if a log changed after it was catalogued."""
+    table = read_catalog(path)
     now = map(state_of_log, table["log"])
     then = zip(table["size_bytes"], table["modified_ns"], table["version"], strict=True)
     changed = [log for log, a, b in zip(table["log"], now, then, strict=True) if a not in (b, GONE)]
     if changed:
         others = f", like {len(changed) - 1} others" if len(changed) > 1 else ""
         raise BadInput(
-            f"{changed[0]}: changed after it was catalogued{others}; update {catalog} with fuselog "
-            f"catalog FOLDER -o {catalog}"
+            f"{changed[0]}: changed after it was catalogued{others}; update {path} with fuselog "
+            f"catalog FOLDER -o {path}"
         )
+    return table
 
 
 def with_columns(table: "pd.DataFrame") -> "pd.DataFrame":

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fuselog.pipeline.selecting.catalog import read_catalog, require_unchanged, with_columns
+from fuselog.pipeline.selecting.catalog import read_current, with_columns
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput, choices, some_of
 from fuselog.recorders.remote.paths import located
@@ -60,9 +60,7 @@ def table_of(left_out: Mapping[Any, str]) -> "pd.DataFrame":
 
 def of_catalog(path: Path, where: str | None = None) -> Selection:
     """Select logs from a catalog; see `selected`."""
-    table = read_catalog(path)
-    require_unchanged(table, path)
-    return selected(with_columns(table), str(path), where)
+    return selected(with_columns(read_current(path)), str(path), where)
 
 
 def selected(

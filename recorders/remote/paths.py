@@ -173,11 +173,16 @@ def _named(url: str) -> str:
     return f"{scheme}://{rest}"
 
 
+def is_url(text: str) -> bool:
+    """Test whether a text is a URL or the text of a `RemotePath`, not a local path."""
+    return _URL.match(text) is not None
+
+
 def located(name: str | Path) -> Path:
     """Return the path of a file, which may be given as a URL or as the text of a `RemotePath`."""
     if isinstance(name, Path):
         return name
-    return RemotePath(_urls.get(name, name)) if _URL.match(name) else Path(name)
+    return RemotePath(_urls.get(name, name)) if is_url(name) else Path(name)
 
 
 def partly(path: Path) -> Path:
@@ -211,9 +216,14 @@ def reference_to(log: Path, beside: Path) -> str:
     return os.path.relpath(log.resolve(), beside.resolve().parent)
 
 
+def seen_from(path: Path, place: Path, log: Path) -> Path:
+    """Return a path to a log to which the file `path` can refer, also after it is moved to `place`."""
+    return log if isinstance(log, RemotePath) else path.parent / reference_to(log, place)
+
+
 def referred_to(text: str, beside: Path) -> Path:
     """Find the log to which the file `beside` refers with a text of `reference_to`."""
-    if _URL.match(text):
+    if is_url(text):
         return located(text)
     if not isinstance(beside, RemotePath):
         return (beside.parent / text).resolve()
