@@ -39,7 +39,9 @@ class Loop(Protocol):
         ...
 
 
-def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def compiled(
+    function: Callable[Parameters, Result], *, for_sizes: bool = False
+) -> Callable[Parameters, Result]:
     """Compile a function of arrays and numbers, with all functions that it calls, at its first call.
 
     Use this for a function that Python calls directly. If a kernel calls the function, it is compiled
@@ -50,6 +52,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     Args:
         function: plain Python function of arrays and numbers.
+        for_sizes: whether the code is specialised for the sizes of all axes but the first; loops over
+            small matrices are then faster, but other sizes are compiled separately.
 
     Returns:
         The compiled function.
@@ -59,7 +63,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     def kernel() -> Callable[Parameters, Result]:
         from fuselog.recorders.compiling.kernels.native import function_of
 
-        return function_of(function)
+        return function_of(function, for_sizes=for_sizes)
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:

@@ -4,7 +4,7 @@ Each odometry message states the velocity until the next message; the true veloc
 plus white noise. Robots are the targets 1, 2, ...; the numbers of the landmarks follow.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -74,6 +74,20 @@ class Drives(NamedTuple):
         steps = np.clip(steps, 0, self.odometry.shape[2] - 1)
         elapsed_s = times_s - self.times_s[steps]
         return drive(self.poses[:, :, steps], self.true_velocity[:, :, steps], elapsed_s)
+
+
+class Targets(NamedTuple):
+    """Targets that a robot may see.
+
+    Attributes:
+        numbers: (targets,), first those of the robots.
+        robots: the other robots.
+        points: (runs, points, 2) the landmarks.
+    """
+
+    numbers: Integers
+    robots: list[Drives]
+    points: Floats
 
 
 class Sightings(NamedTuple):
@@ -264,25 +278,28 @@ def _fix_streams(topic: str, receiver: Fixes, robot: Drives, rngs_of: Rngs) -> l
 
 def _targets(
     parameters: LandmarksParameters, number: int, drives: list[Drives], landmarks: Floats
-) -> Mapping[int, Drives | Floats]:
-    """Return what robot `number` may see, by target number: moving robots, and points (runs, 2)."""
-    seen: dict[int, Drives | Floats] = {}
+) -> Targets:
+    """Return the targets that robot `number` may see."""
+    others: list[int] = []
     if parameters.robots_see_each_other:
-        seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
-    return seen | dict(enumerate(landmarks.swapaxes(0, 1), start=parameters.robots + 1))
+        others = [other for other in range(1, len(drives) + 1) if other != number]
+    points = np.arange(parameters.landmarks) + parameters.robots + 1
+    numbers = np.concatenate([np.array(others, np.int64), points])
+    return Targets(numbers, [drives[other - 1] for other in others], landmarks)
 
 
 def _look(
     sensor: Sensor,
     robot: Drives,
-    targets: Mapping[int, Drives | Floats],
+    targets: Targets,
     rngs: Sequence[np.random.Generator],
 ) -> Sightings:
     """View all targets in range and field of view at the sensor's rate, except dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
-    places = np.empty((2, len(rngs), len(times_s), len(targets)))
-    for place, each in zip(np.moveaxis(places, 3, 0), targets.values(), strict=True):
-        place[:] = each.poses_at(times_s)[:2] if isinstance(each, Drives) else each.T[:, :, None]
+    places = np.empty((2, len(rngs), len(times_s), len(targets.numbers)))
+    for number, other in enumerate(targets.robots):
+        places[..., number] = other.poses_at(times_s)[:2]
+    places[..., len(targets.robots) :] = np.moveaxis(targets.points, 2, 0)[:, :, None]
     pose = np.stack(robot.poses_at(times_s))[:, :, :, None]
     distance, bearing = range_bearing(pose, places)
     _wrap(bearing.reshape(-1))
@@ -293,13 +310,24 @@ def _look(
         outages, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
         outages_s.append(outages)
         own &= ~dead[:, None]
-        is_lost = rng.uniform(size=own.shape[::-1]) < sensor.dropout_probability
-        own &= ~is_lost.T
+        if sensor.dropout_probability > 0.0 or not _skip(rng, own.size):
+            is_lost = rng.uniform(size=own.shape[::-1]) < sensor.dropout_probability
+            own &= ~is_lost.T
     run, view, target = np.nonzero(visible)
     view += run * len(times_s)
     cuts = np.searchsorted(run, range(len(rngs) + 1)).tolist()
-    numbers = np.array(list(targets), dtype=np.int64)[target]
-    return Sightings(times_s, view, cuts, numbers, distance[visible], bearing[visible], outages_s)
+    return Sightings(
+        times_s, view, cuts, targets.numbers[target], distance[visible], bearing[visible], outages_s
+    )
+
+
+def _skip(rng: np.random.Generator, count: int) -> bool:
+    """Skip numbers of a uniform distribution; return False if the generator has to draw them."""
+    bits = rng.bit_generator
+    if isinstance(bits, np.random.PCG64):
+        bits.advance(count)
+        return True
+    return False
 
 
 def _dead(
@@ -334,10 +362,7 @@ def _noisy(
     noise, place, chance = np.empty((3, len(exact)))
     for rng, (first, end) in zip(rngs, pairwise(cuts), strict=True):
         rng.standard_normal(out=noise[first:end])
-        bits = rng.bit_generator
-        if sensor.outlier_probability == 0.0 and isinstance(bits, np.random.PCG64):
-            bits.advance(2 * (end - first))
-        else:
+        if sensor.outlier_probability > 0.0 or not _skip(rng, 2 * (end - first)):
             rng.random(out=place[first:end])
             rng.random(out=chance[first:end])
     measured: Floats = exact + noise * sigma

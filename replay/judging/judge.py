@@ -45,7 +45,7 @@ from fuselog.replay.judging.metrics.measuring import (
     find_metrics,
     metric_key,
 )
-from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
+from fuselog.replay.judging.metrics.quantities import InnovationSums, Quantities
 from fuselog.replay.judging.metrics.sums import BinnedSums
 from fuselog.replay.judging.verdicts import Squares
 
@@ -186,16 +186,12 @@ class Judge:
         self._moments.add(errors)
         if self._on_errors is not None:
             self._on_errors(errors)
-        columns = columns_of(errors)
         if topic not in self._quantities:
-            width = columns.shape[1]
+            width = 6 + len(errors.components)
             bins = {"width": TIME_BIN_NS, "limit": TIME_BINS, "cells": TIME_CELLS}
             by_time = BinnedSums(width, **bins, first=self._first_run)
             self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
-        kept = self._quantities[topic]
-        kept.by_step.add(errors.step, columns)
-        kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
-        kept.constant.add(errors)
+        self._quantities[topic].add(errors)
 
     def close(self) -> None:
         """Release the runs after judging; only sums are left, which can be pickled."""

@@ -177,6 +177,19 @@ def test_dropouts_are_as_frequent_as_stated():
     assert_share(len(streams["/robot1/range_bearing"]), visible(streams, 5.0, 8.0, 360.0), 0.7)
 
 
+def test_a_chance_of_zero_changes_no_random_number() -> None:
+    """Numbers that decide nothing are skipped; a chance that is almost zero draws them."""
+    never, almost = (
+        record(
+            duration_s=9.0,
+            range_bearing={"rate_hz": 5.0, "dropout_probability": chance, "outlier_probability": chance},
+        )["/robot1/range_bearing"]
+        for chance in (0.0, 1e-300)
+    )
+    for name, column in almost.columns.items():
+        assert_array_equal(never[name], column, err_msg=name)
+
+
 def test_outages_come_at_their_rate_are_recorded_and_silence_the_sensor():
     sensor = {"rate_hz": 5.0, "outages_per_minute": 3.0, "outage_s": 2.0}
     streams = record(duration_s=1200.0, range_bearing=sensor)

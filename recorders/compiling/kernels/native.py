@@ -126,11 +126,13 @@ class Kernel:
         return Struct(f"={''.join(map(letters, described))}"), self._loaded[key]
 
 
-def function_of(function: KernelFunction) -> KernelFunction:
-    """Compile a function for calls from Python, without assumptions about the sizes of its arrays.
+def function_of(function: KernelFunction, *, for_sizes: bool = False) -> KernelFunction:
+    """Compile a function for calls from Python; see `compiled`.
 
-    The function creates no arrays, and returns nothing or a number of the annotated kind.
+    The function creates no arrays, and returns nothing or a number of the annotated kind. Unless
+    `for_sizes` is true, its code makes no assumptions about the sizes of its arrays.
     """
+    varies = 1 if for_sizes else _ALL
     stated = function.__annotations__.get("return", "")
     returned = stated if isinstance(stated, str) else getattr(stated, "__name__", str(stated))
     if returned not in ("float", "int", "bool", "None"):
@@ -151,9 +153,9 @@ def function_of(function: KernelFunction) -> KernelFunction:
 
     def called(*arguments: Value) -> Value:
         if returned == "None":
-            return kernel.of((arguments,), varies=_ALL)(0, 1)
+            return kernel.of((arguments,), varies=varies)(0, 1)
         found = np.empty(1, returned)
-        kernel.of((arguments, found), varies=_ALL)(0, 1)
+        kernel.of((arguments, found), varies=varies)(0, 1)
         return found[0].item()
 
     return called

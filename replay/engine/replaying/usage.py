@@ -7,6 +7,7 @@ innovations, and the messages that it reports as skipped.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -142,13 +143,13 @@ class Usage:
             if self.begins_ns is not None:
                 begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
                 facts[EARLY] += int((stream.times(order) < begins_ns).sum())
-            facts["repeat the previous message"] += int(_repeated(stream).sum())
+            repeated = ragged.findings.once("repeated", partial(_repeated, stream))
+            facts["repeat the previous message"] += repeated
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
-                known = np.concatenate([each["landmark_id"] for each in maps])
-                facts["measure targets that are not in the map"] += int(
-                    (~np.isin(stream["target_id"], known)).sum()
-                )
+                known = np.unique(np.concatenate([each["landmark_id"] for each in maps]))
+                unknown = ("unknown", known.tobytes()), partial(_unknown, stream, known)
+                facts["measure targets that are not in the map"] += ragged.findings.once(*unknown)
 
     def note_outputs(self, outputs: Sequence[Ragged]) -> None:
         """Count a block of the estimator's `outputs`."""
@@ -217,16 +218,18 @@ def _topic_in(why: str, topics: Iterable[str]) -> bool:
     return any(why.startswith(f"topic {topic}:") for topic in topics)
 
 
-def _repeated(stream: Stream) -> AnyArray:
-    """Find the messages that equal the one before them in all fields; NaN equals NaN."""
-    found = np.zeros(len(stream), bool)
-    if len(stream) > 1:
-        same = np.diff(stream.publish_time_ns) == 0
-        for column in stream.columns.values() if same.any() else ():
-            flat = column.reshape(len(column), -1)
-            equal = flat[1:] == flat[:-1]
-            if column.dtype.kind == "f":
-                equal |= np.isnan(flat[1:]) & np.isnan(flat[:-1])
-            same &= equal.all(axis=1)
-        found[1:] = same
-    return found
+def _repeated(stream: Stream) -> int:
+    """Count the messages that equal the one before them in all fields; NaN equals NaN."""
+    same = np.diff(stream.publish_time_ns) == 0
+    for column in stream.columns.values() if same.any() else ():
+        flat = column.reshape(len(column), -1)
+        equal = flat[1:] == flat[:-1]
+        if column.dtype.kind == "f":
+            equal |= np.isnan(flat[1:]) & np.isnan(flat[:-1])
+        same &= equal.all(axis=1)
+    return int(np.count_nonzero(same))
+
+
+def _unknown(stream: Stream, known: AnyArray) -> int:
+    """Count the messages that measure a target without one of the numbers `known` (m,)."""
+    return int(np.count_nonzero(~np.isin(stream["target_id"], known)))

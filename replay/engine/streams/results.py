@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fuselog.recorders.compiling.compile import compiled
 from fuselog.recorders.log import Stream, make_stream, schemas
 from fuselog.recorders.log.streams import stream_of
 from fuselog.recorders.models.planar import wrap_angle
@@ -55,13 +56,29 @@ def wrapped(mean: Floats, components: Components) -> Floats:
         mean: (n, d).
         components: the d names and their kinds.
     """
-    given = mean
-    for index in (index for index, kind in enumerate(components.values()) if kind == "angle"):
-        beyond = ~(np.abs(mean[:, index]) < np.pi)
-        if beyond.any():  # angles in range are not changed, to the last bit
-            mean = mean.copy() if mean is given else mean
-            mean[beyond, index] = wrap_angle(mean[beyond, index])
+    angles = [index for index, kind in enumerate(components.values()) if kind == "angle"]
+    beyond = [index for index in angles if not (np.abs(mean[:, index]) < np.pi).all()]
+    if beyond:
+        mean = mean.copy()
+        _wrap_columns(mean, np.array(beyond))
     return mean
+
+
+def wrap_columns(values: Floats, columns: Integers) -> None:
+    """Wrap angles in place, except angles in range, which are not changed, to the last bit.
+
+    Args:
+        values: (n, d).
+        columns: (m,), the columns of angles.
+    """
+    for row in range(len(values)):
+        for place in range(len(columns)):
+            angle = values[row, columns[place]]
+            if not abs(angle) < np.pi:
+                values[row, columns[place]] = wrap_angle(angle)
+
+
+_wrap_columns = compiled(wrap_columns)
 
 
 def gaussian_stream(

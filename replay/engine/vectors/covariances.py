@@ -66,12 +66,13 @@ def fill_squares(
         whitened: (d,), work space.
         found: (2, n), filled; the second row only if there are leading components.
     """
+    size = covariances.shape[1]
     for each in range(len(errors)):
         factorise(covariances[each], factor)
-        for row in range(len(factor)):
+        for row in range(size):
             error = 0.0 if np.isinf(covariances[each, row, row]) else errors[each, row]
             whitened[row] = (error - dot(factor[row], whitened, row)) / factor[row, row]
-        found[0, each] = dot(whitened, whitened, len(whitened))
+        found[0, each] = dot(whitened, whitened, size)
         if leading:
             found[1, each] = dot(whitened, whitened, leading)
 
@@ -129,7 +130,7 @@ def fill_factors(covariances: Array, factors: Array) -> None:
 
 def factorise(covariance: Array, factor: Array) -> None:
     """Compute the lower triangle of a Cholesky factor (d, d); see `_factors`."""
-    for row in range(len(factor)):
+    for row in range(factor.shape[1]):
         for column in range(row + 1):
             entry = covariance[row, column]
             if np.isinf(covariance[row, row]) or np.isinf(covariance[column, column]):
@@ -160,4 +161,5 @@ def dot(left: Array, right: Array, size: int) -> float:
     return total
 
 
-_fill_squares, _fill_factors = compiled(fill_squares), compiled(fill_factors)
+_fill_squares = compiled(fill_squares, for_sizes=True)
+_fill_factors = compiled(fill_factors, for_sizes=True)

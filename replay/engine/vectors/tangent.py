@@ -122,7 +122,7 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
         else:
             scalars.append((columns.start, row, kind == "angle"))
         row += TANGENT_WIDTHS[kind]
-    _subtract(estimate, truth, np.array(scalars, np.int64).reshape(-1, 3), error)
+    _subtract(estimate, truth, np.array(scalars, np.int64).reshape(-1, 3).T.copy(), error)
     return error
 
 
@@ -147,7 +147,7 @@ def between(
             value[:, columns] = _slerp(state[left, columns], state[right, columns], weight)
         else:
             scalars.append((columns.start, kind == "angle"))
-    _interpolate(state, left, right, weight, np.array(scalars, np.int64).reshape(-1, 2), value)
+    _interpolate(state, left, right, weight, np.array(scalars, np.int64).reshape(-1, 2).T.copy(), value)
     return value
 
 
@@ -156,14 +156,14 @@ def subtract(estimate: Floats, truth: Floats, scalars: NDArray[np.int64], error:
 
     Args:
         estimate, truth: (n, components).
-        scalars: (m, 3), for each component, its column, the column of its error, and whether it is an
+        scalars: (3, m), for each component, its column, the column of its error, and whether it is an
             angle.
         error: (n, tangent components), filled in these columns.
     """
     for row in range(len(error)):
-        for each in range(len(scalars)):
-            change = estimate[row, scalars[each, 0]] - truth[row, scalars[each, 0]]
-            error[row, scalars[each, 1]] = wrap_angle(change) if scalars[each, 2] else change
+        for each in range(scalars.shape[1]):
+            change = estimate[row, scalars[0, each]] - truth[row, scalars[0, each]]
+            error[row, scalars[1, each]] = wrap_angle(change) if scalars[2, each] else change
 
 
 def interpolate(
@@ -180,18 +180,18 @@ def interpolate(
         state: (m, components).
         left, right: (n,).
         weight: (n,).
-        scalars: (m, 2), for each component, its column, and whether it is an angle.
+        scalars: (2, m), for each component, its column, and whether it is an angle.
         value: (n, components), filled in these columns.
     """
     for row in range(len(value)):
-        for each in range(len(scalars)):
-            here = state[left[row], scalars[each, 0]]
-            change = state[right[row], scalars[each, 0]] - here
-            change = wrap_angle(change) if scalars[each, 1] else change
-            value[row, scalars[each, 0]] = here + weight[row] * change
+        for each in range(scalars.shape[1]):
+            here = state[left[row], scalars[0, each]]
+            change = state[right[row], scalars[0, each]] - here
+            change = wrap_angle(change) if scalars[1, each] else change
+            value[row, scalars[0, each]] = here + weight[row] * change
 
 
-_subtract, _interpolate = compiled(subtract), compiled(interpolate)
+_subtract, _interpolate = compiled(subtract, for_sizes=True), compiled(interpolate, for_sizes=True)
 
 
 def truth_at(

@@ -201,4 +201,4 @@ def add_error(
     return x * u + y * v + z * w
 
 
-_add_sums = compiled(add_sums)
+_add_sums = compiled(add_sums, for_sizes=True)

@@ -62,10 +62,9 @@ def add_rows(values: Floats, totals: Floats) -> None:
         values: (n, d).
         totals: (d,), filled.
     """
-    for column in range(len(totals)):
-        totals[column] = 0.0
+    totals[:] = 0.0
     for row in range(len(values)):
-        for column in range(len(totals)):
+        for column in range(values.shape[1]):
             totals[column] += values[row, column]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fuselog.recorders.compiling.compile import compiled
 from fuselog.replay.judging.errors.constant import ConstantSums
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, Innovations
-from fuselog.replay.judging.metrics.sums import BinnedSums, Integers
+from fuselog.replay.judging.metrics.sums import BinnedSums, Bins, Integers, bin_of
 
 
 @dataclass
@@ -26,6 +26,22 @@ class Quantities:
     by_time: BinnedSums
     constant: ConstantSums = field(default_factory=ConstantSums)
 
+    def add(self, errors: Errors) -> None:
+        """Add a block."""
+        self.constant.add(errors)
+        if not len(errors.nees):
+            return
+        time_ns = np.rint(errors.elapsed_s * 1e9).astype(np.int64)
+        rows = errors.elapsed_s, errors.squared, errors.covariance, errors.nees
+        position, rotation, main = (
+            np.array(each, np.int64) for each in (errors.position, errors.rotation, errors.main.columns)
+        )
+        with (
+            self.by_step.filling(errors.step) as steps,
+            self.by_time.filling(time_ns, errors.run) as times,
+        ):
+            _add_errors(*rows, position, rotation, main, steps, times)
+
     def merge(self, other: "Quantities") -> None:
         """Add the sums of other runs."""
         self.by_step.merge(other.by_step)
@@ -33,18 +49,7 @@ class Quantities:
         self.constant.merge(other.constant)
 
 
-def columns_of(errors: Errors) -> Floats:
-    """Compute the rows (n, 6 + d) to sum; see `Quantities`."""
-    columns = np.empty((len(errors.nees), 6 + len(errors.components)))
-    position, rotation, main = (
-        np.array(each, np.int64) for each in (errors.position, errors.rotation, errors.main.columns)
-    )
-    squared = errors.elapsed_s, errors.squared, errors.covariance, errors.nees
-    _fill_columns(*squared, position, rotation, main, columns)
-    return columns
-
-
-def fill_columns(
+def add_errors(
     elapsed_s: Floats,
     squared: Floats,
     covariance: Floats,
@@ -52,9 +57,10 @@ def fill_columns(
     position: Integers,
     rotation: Integers,
     main: Integers,
-    columns: Floats,
+    steps: Bins,
+    times: Bins,
 ) -> None:
-    """Fill the rows (n, 6 + d) to sum; see `Quantities`.
+    """Sum the numbers of estimates by step and by time; see `Quantities`.
 
     Args:
         elapsed_s: (n,) elapsed time.
@@ -62,47 +68,55 @@ def fill_columns(
         covariance: (n, d, d).
         nees: (n,).
         position, rotation, main: components of the position, the rotation and the main quantity.
-        columns: (n, 6 + d), filled.
+        steps, times: the bins, of 6 + d columns.
     """
     size = squared.shape[1]
     for row in range(len(nees)):
-        columns[row, 0], columns[row, 5 + size] = elapsed_s[row], nees[row]
-        for column in range(1, 3):
-            columns[row, column] = 0.0
+        of_position, of_rotation, trace, of_square = 0.0, 0.0, 0.0, 0.0
         for place in range(len(position)):
-            columns[row, 1] += squared[row, position[place]]
+            of_position += squared[row, position[place]]
         for place in range(len(rotation)):
-            columns[row, 2] += squared[row, rotation[place]]
-        for column in range(size):
-            columns[row, 3 + column] = squared[row, column]
-        trace, of_square = 0.0, 0.0
+            of_rotation += squared[row, rotation[place]]
         for column in range(len(main)):
             trace += covariance[row, main[column], main[column]]
             for other in range(len(main)):
                 entry = covariance[row, main[other], main[column]]
                 of_square += entry * entry
-        columns[row, 3 + size], columns[row, 4 + size] = trace, of_square
+        for bins in (steps, times):
+            sums = bin_of(bins, row)
+            sums[0] += 1.0
+            sums[1] += elapsed_s[row]
+            sums[2] += of_position
+            sums[3] += of_rotation
+            for column in range(size):
+                sums[4 + column] += squared[row, column]
+            sums[4 + size] += trace
+            sums[5 + size] += of_square
+            sums[6 + size] += nees[row]
 
 
-def fill_innovations(
-    accepted: NDArray[np.bool_], degrees: Integers, squared: Floats, stated: Floats, columns: Floats
+def add_innovations(
+    accepted: NDArray[np.bool_], degrees: Integers, squared: Floats, stated: Floats, runs: Bins
 ) -> None:
-    """Fill the rows to sum for innovations; see `OfRuns`.
+    """Sum the numbers of innovations by run; see `OfRuns`.
 
     Args:
         accepted, degrees, squared: (n,), as in `Innovations`.
         stated: (n,), log-likelihoods; NaN if they are not stated.
-        columns: (n, 5), filled.
+        runs: the bins, of 5 columns.
     """
-    for row in range(len(columns)):
-        is_accepted = accepted[row]
-        columns[row, 0], columns[row, 1] = float(is_accepted), float(degrees[row])
-        columns[row, 2] = float(degrees[row]) if is_accepted else 0.0
-        columns[row, 3] = squared[row]
-        columns[row, 4] = stated[row] if is_accepted else 0.0
+    for row in range(len(accepted)):
+        own, is_accepted = bin_of(runs, row), accepted[row]
+        own[0] += 1.0
+        own[1] += float(is_accepted)
+        own[2] += float(degrees[row])
+        own[3] += float(degrees[row]) if is_accepted else 0.0
+        own[4] += squared[row]
+        own[5] += stated[row] if is_accepted else 0.0
 
 
-_fill_columns, _fill_innovations = compiled(fill_columns), compiled(fill_innovations)
+_add_errors = compiled(add_errors, for_sizes=True)
+_add_innovations = compiled(add_innovations, for_sizes=True)
 
 
 class OfRuns(NamedTuple):
@@ -133,10 +147,12 @@ class InnovationSums:
     def add(self, innovations: Innovations) -> None:
         """Add a block."""
         stated, accepted = innovations.log_likelihood, innovations.accepted
-        columns = np.empty((len(accepted), len(OfRuns._fields) - 1))
-        stated = np.full(len(columns), np.nan) if stated is None else stated
-        _fill_innovations(accepted, innovations.degrees, innovations.squared, stated, columns)
-        self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
+        count = len(accepted)
+        if not count:
+            return
+        stated = np.full(count, np.nan) if stated is None else stated
+        with self._sums.filling(np.zeros(count, np.int64), innovations.run) as runs:
+            _add_innovations(accepted, innovations.degrees, innovations.squared, stated, runs)
 
     def merge(self, other: "InnovationSums") -> None:
         """Add the sums of other runs."""

@@ -1,5 +1,9 @@
 """Sums in bins, for errors whose number is not known in advance."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,16 +42,25 @@ class BinnedSums:
 
     def add(self, position: Integers, values: Floats, group: Integers | None = None) -> None:
         """Add rows (n, columns) at positions (n,) to groups (n,), or to the first group by default."""
-        if len(position) == 0:
-            return
-        group = np.zeros(len(position), np.int64) if group is None else group - self._first
+        if len(position):
+            with self.filling(position, group) as bins:
+                _fill_sums(values, bins)
+
+    @contextmanager
+    def filling(self, position: Integers, group: Integers | None = None) -> Iterator["Bins"]:
+        """Yield empty bins for rows at positions (n,) in groups (n,), and add what they are filled with.
+
+        There must be a row.
+        """
+        group = np.full(len(position), self._first) if group is None else group
         self._widen(int(position.max()))
         low, high = (max(int(end), 0) // self.width for end in (position.min(), position.max()))
         first, last = int(group.min()), int(group.max())
-        self._reserve(last + 1, high + 1)
-        sums = np.zeros((last + 1 - first, high + 1 - low, self._sums.shape[2]))
-        _fill_sums(position, group - first, self.width, low, values, sums)
-        self._sums[first : last + 1, low : high + 1] += sums
+        begin, end, count = first - self._first, last + 1 - self._first, high + 1 - low
+        self._reserve(end, high + 1)
+        sums = np.zeros((end - begin, count, self._sums.shape[2]))
+        yield Bins(position, group, self.width, low, first, count, sums.reshape(-1, sums.shape[2]))
+        self._sums[begin:end, low : high + 1] += sums
 
     def merge(self, other: "BinnedSums") -> None:
         """Add sums with the same columns and without groups before the first group of this object."""
@@ -103,24 +116,39 @@ def _halved(sums: Floats) -> Floats:
     return even[:, 0::2] + even[:, 1::2]
 
 
-def fill_sums(
-    position: Integers, group: Integers, width: int, low: int, values: Floats, sums: Floats
-) -> None:
-    """Sum rows of numbers by group and bin.
+class Bins(NamedTuple):
+    """Bins that a kernel fills.
 
-    Args:
-        position: (n,) positions.
-        group: (n,) groups.
+    Attributes:
+        position, group: (n,) of the rows.
         width: width of a bin.
-        low: the first bin of `sums`.
-        values: (n, columns), the rows.
-        sums: (groups, bins, 1 + columns), row counts and column sums; updated in place.
+        low, first: the first bin and the first group.
+        in_group: number of bins of a group.
+        sums: (groups × bins, 1 + columns), row counts and column sums.
     """
+
+    position: Integers
+    group: Integers
+    width: int
+    low: int
+    first: int
+    in_group: int
+    sums: Floats
+
+
+def bin_of(bins: Bins, row: int) -> Floats:
+    """Return the count and sums (1 + columns,) of the bin to which a row belongs."""
+    place = max(bins.position[row], 0) // bins.width - bins.low
+    return bins.sums[(bins.group[row] - bins.first) * bins.in_group + place]
+
+
+def fill_sums(values: Floats, bins: Bins) -> None:
+    """Sum rows of numbers (n, columns) in their bins."""
     for row in range(len(values)):
-        cell = sums[group[row], max(position[row], 0) // width - low]
-        cell[0] += 1.0
+        own = bin_of(bins, row)
+        own[0] += 1.0
         for column in range(values.shape[1]):
-            cell[1 + column] += values[row, column]
+            own[1 + column] += values[row, column]
 
 
 _fill_sums = compiled(fill_sums)

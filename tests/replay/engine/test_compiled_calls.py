@@ -44,6 +44,21 @@ def test_a_call_returns_the_number_that_the_annotation_says():
     assert_array_equal(values, [2.0, 4.0, 8.0])
 
 
+def add_columns(matrix: np.ndarray, sums: np.ndarray) -> None:
+    """Sum each column."""
+    for row in range(len(matrix)):
+        for column in range(matrix.shape[1]):
+            sums[column] += matrix[row, column]
+
+
+def test_code_for_sizes_is_compiled_for_the_sizes_of_every_call():
+    add, whole = compiled(add_columns, for_sizes=True), np.arange(24.0).reshape(6, 4)
+    for matrix in (whole, whole[:2], whole[:, :3].copy(), whole[:, ::2]):
+        sums = np.zeros(matrix.shape[1])
+        add(matrix, sums)
+        assert_array_equal(sums, matrix.sum(axis=0))
+
+
 def without_its_kind(values: np.ndarray):
     return values[0]
 
