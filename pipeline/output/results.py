@@ -319,6 +319,7 @@ def write_outcome(
     import pyarrow
     import pyarrow.csv
     import pyarrow.parquet
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     for name, table in outcome.tables.items():
         (folder / "tables").mkdir(exist_ok=True)
@@ -336,7 +337,8 @@ def write_outcome(
             figure = draw(figure)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
             show_names_as_they_are(figure)
-            figure.savefig(path, metadata={"Date": None})
+            canvas: Any = FigureCanvasSVG(figure)
+            canvas.print_svg(path, metadata={"Date": None})  # savefig draws a figure with a layout twice
     if outcome.timings:
         (folder / TIMINGS).write_text(json.dumps(outcome.timings, indent=2) + "\n", encoding="utf-8")
     written = sorted(path for path in folder.rglob("*") if path.is_file())
