@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -305,6 +307,13 @@ def hash_of(path: Path) -> str:
     """Compute the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def import_writers() -> None:
+    """Import the libraries with which `write_outcome` writes, which takes a second."""
+    for name in ("pandas", "pyarrow.csv", "pyarrow.parquet", "matplotlib.backends.backend_svg"):
+        import_module(name)
 
 
 def write_outcome(
