@@ -21,6 +21,9 @@ _SAFE_PATH, _OURS = "PYTHONSAFEPATH", "fuselog"
 # Libraries read these files in the current folder. numba loads code from a cache that its file names,
 # and matplotlib's file can make it run LaTeX.
 _OF_NUMBA, _OF_MATPLOTLIB = ".numba_config.yaml", "matplotlibrc"
+# Variables that libraries of linear algebra read when they are loaded, and what the user set them to.
+_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "OMP_NUM_THREADS")
+_threads_of_user: dict[str, str | None] = {}
 
 
 def start_module(
@@ -59,7 +62,20 @@ def safe_spawning() -> Iterator[None]:
 
 def users_environment() -> dict[str, str]:
     """Return the variables as the user set them, for programs that the user runs through fuselog."""
-    return {name: value for name, value in os.environ.items() if (name, value) != (_SAFE_PATH, _OURS)}
+    stated: dict[str, str | None] = {**os.environ, **_threads_of_user}
+    if stated.get(_SAFE_PATH) == _OURS:
+        del stated[_SAFE_PATH]
+    return {name: value for name, value in stated.items() if value is not None}
+
+
+def limit_libraries() -> None:
+    """Limit linear algebra to one core, in libraries that are loaded now or later."""
+    from threadpoolctl import threadpool_limits  # slow to import
+
+    for name in _THREADS:
+        _threads_of_user.setdefault(name, os.environ.get(name))
+        os.environ[name] = "1"
+    threadpool_limits(1)
 
 
 def keep_off_settings_here() -> None:

@@ -9,7 +9,7 @@ Listing names does not import anything.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from textwrap import shorten
 from typing import Any
 
@@ -19,9 +19,17 @@ SINGULAR = {"studies": "study"}
 
 
 @cache
+def registered() -> EntryPoints:
+    """Return all registered entry points, from one pass over the installed distributions."""
+    found = entry_points()
+    groups = [group for group in found.groups if group.startswith("fuselog.")]
+    return EntryPoints(each for group in groups for each in found.select(group=group))
+
+
+@cache
 def available(kind: str) -> dict[str, EntryPoint]:
     """Return the registered entry points of a kind, such as "recorders", sorted by name."""
-    found = entry_points(group=f"fuselog.{kind}")
+    found = registered().select(group=f"fuselog.{kind}")
     return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
 
 

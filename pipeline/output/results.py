@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -307,6 +309,13 @@ def hash_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@cache
+def import_writers() -> None:
+    """Import the libraries with which `write_outcome` writes, which takes a second."""
+    for name in ("pandas", "pyarrow.csv", "pyarrow.parquet", "matplotlib.backends.backend_svg"):
+        import_module(name)
+
+
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
@@ -319,6 +328,7 @@ def write_outcome(
     import pyarrow
     import pyarrow.csv
     import pyarrow.parquet
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     for name, table in outcome.tables.items():
         (folder / "tables").mkdir(exist_ok=True)
@@ -336,7 +346,8 @@ def write_outcome(
             figure = draw(figure)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
             show_names_as_they_are(figure)
-            figure.savefig(path, metadata={"Date": None})
+            canvas: Any = FigureCanvasSVG(figure)
+            canvas.print_svg(path, metadata={"Date": None})  # savefig draws a figure with a layout twice
     if outcome.timings:
         (folder / TIMINGS).write_text(json.dumps(outcome.timings, indent=2) + "\n", encoding="utf-8")
     written = sorted(path for path in folder.rglob("*") if path.is_file())

@@ -12,7 +12,7 @@ import logging
 import pickle
 import shutil
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,6 +21,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol
 
+from fuselog.pipeline.output.results import import_writers
 from fuselog.pipeline.runs.checkpoints import Checkpoints
 from fuselog.pipeline.runs.ensemble import Pass, parts_of
 from fuselog.pipeline.runs.executors import (
@@ -188,7 +189,8 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
     assert setting.checkpoints is not None
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
-    results = work_off(cells, setting.open_pool or inline_pool, setting.checkpoints, pace)
+    open_pool = setting.open_pool or inline_pool
+    results = work_off(cells, open_pool, setting.checkpoints, pace, import_writers)
     finished = iter(setting.progress(results, pace, len(cells)))
     for part in parts:
         whole = next(finished)
@@ -221,11 +223,16 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
 
 
 def work_off(
-    cells: Sequence[Work], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
+    cells: Sequence[Work],
+    open_pool: PoolFactory,
+    checkpoints: Checkpoints,
+    pace: Pace,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> Iterator[Any]:
     """Yield the results of cells in order; cells that are already done are not computed again.
 
-    Only the cells in progress are in memory. Raises BadInput if the workers of a cell died repeatedly.
+    `meanwhile` is called before each wait for a worker. Only the cells in progress are in memory.
+    Raises BadInput if the workers of a cell died repeatedly.
     """
     checkpoints.begin()
     keys = [cell.key for cell in cells]
@@ -249,7 +256,7 @@ def work_off(
             lost: BaseException | None = None
             while following < len(cells) and lost is None:
                 try:
-                    while waiting and len(pending) < pool.workers:
+                    while waiting and len(pending) < pool.workers + pool.queued:
                         place = checkpoints.place_of(keys[waiting[0]]).absolute()
                         future = pool.executor.submit(cells[waiting[0]].packed, place)
                         pending[future] = waiting.popleft()
@@ -272,6 +279,7 @@ def work_off(
                         )
                     waiting.appendleft(following)
                     continue
+                meanwhile()
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     try:
                         error = future.exception()
@@ -284,7 +292,7 @@ def work_off(
                     pace.worked_off += cells[number].runs
                     checkpoints.write(keys[number], future.result())
             if lost is not None:  # afterwards, some executors lose all other cells as well
-                died.update(pending.values())
+                died.update(islice(pending.values(), pool.workers))  # the others were not begun
                 waiting.extendleft(sorted(pending.values(), reverse=True))
                 number, times = died.most_common(1)[0]
                 if times >= ATTEMPTS:

@@ -17,18 +17,17 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache, partial
 from importlib import resources
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
 
-from threadpoolctl import threadpool_limits
-
 from fuselog.recorders.compiling.compile import core_count, use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
-from fuselog.recorders.processes import keep_off_settings_here, safe_spawning
+from fuselog.recorders.processes import keep_off_settings_here, limit_libraries, safe_spawning
+from fuselog.recorders.registry import registered
 from fuselog.recorders.remote.paths import RemotePath, state_of
 
 # Smallest number of runs for which starting processes saves time.
@@ -47,12 +46,14 @@ class WorkerPool(NamedTuple):
         require: function that raises BadInput unless all workers see the same files at given absolute
             paths as this process does.
         lost: exceptions of a future whose worker has died.
+        queued: number of further tasks that are submitted, so that no worker waits for this process.
     """
 
     executor: Executor
     workers: int
     require: Callable[[Sequence[Path]], None] = lambda _: None  # always true on this machine
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
+    queued: int = 0
 
 
 # Opens a pool of workers, and closes it.
@@ -140,7 +141,7 @@ def processes(count: int) -> PoolFactory:
         with safe_spawning():
             pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
             try:
-                yield WorkerPool(pool, count)
+                yield WorkerPool(pool, count, queued=1)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 for worker in set(active_children()) - others:
@@ -170,9 +171,7 @@ def _begin_worker() -> None:
 def _use_one_core() -> None:
     """Limit the kernels and linear algebra of this process to one core, and ignore numeric warnings."""
     use_cores(1)
-    import scipy.linalg  # noqa: F401  (its BLAS is another than NumPy's: only what is loaded is limited)
-
-    threadpool_limits(1)
+    limit_libraries()
     ignore_warnings_of_numbers()
 
 
@@ -233,7 +232,7 @@ def dask(scheduler: str) -> PoolFactory:
             workers = sum(client.nthreads().values())
             stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
             require = partial(_require_paths, scheduler, client)
-            yield WorkerPool(DaskExecutor(client), workers, require, (KilledWorker,))
+            yield WorkerPool(DaskExecutor(client), workers, require, (KilledWorker,), queued=1)
 
     return begin
 
@@ -306,9 +305,7 @@ def version_of_code() -> str:
     for package in PACKAGES:
         with resources.as_file(resources.files(package)) as folder:
             _add_sources(digest, folder)
-    groups = [group for group in entry_points().groups if group.startswith("fuselog.")]
-    entries = [entry for group in groups for entry in entry_points(group=group)]
-    modules = {entry.module.partition(".")[0] for entry in entries} - {"fuselog"}
+    modules = {entry.module.partition(".")[0] for entry in registered()} - {"fuselog"}
     for spec in filter(None, map(find_spec, sorted(modules))):
         for place in spec.submodule_search_locations or ():
             _add_sources(digest, Path(place))

@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING, Any
@@ -51,12 +51,12 @@ def main(scenario: str, parameters: Mapping[str, Any], runs: int, estimator: str
 def register(checkout: Path) -> None:
     """Have names stand for what the checkout's own pyproject.toml says."""
     stated = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))
-    groups = stated["project"]["entry-points"]
-
-    def entry_points(group: str) -> list[EntryPoint]:
-        return [EntryPoint(name, value, group) for name, value in groups.get(group, {}).items()]
-
-    vars(registry)["entry_points"] = entry_points
+    found = EntryPoints(
+        EntryPoint(name, value, group)
+        for group, entries in stated["project"]["entry-points"].items()
+        for name, value in entries.items()
+    )
+    vars(registry)["entry_points"] = found.select
 
 
 def either(name: str, *modules: str) -> Any:

@@ -7,10 +7,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Future
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import chdir, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,6 +22,7 @@ import fuselog as fl
 from fuselog.pipeline.command_line import main
 from fuselog.pipeline.output.results import TIMINGS
 from fuselog.pipeline.runs import campaigns, executors
+from fuselog.pipeline.runs.campaigns import Pace, work_off
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.executors import (
     InlineExecutor,
@@ -254,6 +257,68 @@ class Dying(InlineExecutor):
         return super().submit(work, *args, **kwargs)
 
 
+class Waiting(Executor):
+    """Keeps work waiting until it is told to do the first of it, or to die with it."""
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[Future[bytes], Callable[[], bytes]]] = []
+
+    def submit(self, work, /, *args, **kwargs):
+        """Have the work wait."""
+        self.waiting.append((Future(), partial(work, *args, **kwargs)))
+        return self.waiting[-1][0]
+
+    def go_on(self, *, dies: bool) -> None:
+        """Do the first work that waits, or die with it."""
+        future, work = self.waiting.pop(0)
+        if dies:
+            future.set_exception(BrokenExecutor("it was killed"))
+        else:
+            future.set_result(work())
+
+
+class Numbered(NamedTuple):
+    """A cell whose result is its number."""
+
+    first: int
+    runs: int = 1
+    files: tuple[Path, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """The next cell."""
+        return self.first + 1
+
+    @property
+    def key(self) -> str:
+        """The number, as a name of a kept cell."""
+        return f"{self.first:064x}"
+
+    def packed(self, folder: Path) -> bytes:  # noqa: ARG002
+        """The number, as workers send it."""
+        return pickle.dumps(self.first)
+
+
+def test_a_cell_waits_for_each_worker_and_is_not_blamed_for_its_death(tmp_path):
+    executors_begun: list[Waiting] = []
+    deaths, waiting = [True, True, False, True, False, False], []
+
+    @contextmanager
+    def one_worker():
+        executors_begun.append(Waiting())
+        yield WorkerPool(executors_begun[-1], 1, queued=1)
+
+    def go_on() -> None:
+        waiting.append(len(executors_begun[-1].waiting))
+        executors_begun[-1].go_on(dies=deaths.pop(0))
+
+    with checkpoints_of(tmp_path / "result") as checkpoints:
+        cells = [Numbered(number) for number in range(3)]
+        assert [*work_off(cells, one_worker, checkpoints, Pace(3), go_on)] == [0, 1, 2]
+    assert waiting == [2, 2, 2, 2, 2, 1]
+    assert not deaths
+
+
 # What a worker says of its cores: threads of libraries, and cores of kernels.
 CORES_THERE = (
     "(__import__('scipy.linalg'), "
@@ -271,8 +336,9 @@ def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("all_cores")
 def test_a_worker_uses_one_core() -> None:
-    """Also in SciPy, whose library is another than NumPy's and is loaded later."""
+    """Also in SciPy, whose library is another than NumPy's, and is loaded only when it is used."""
     with processes(1)() as pool:
+        assert not pool.executor.submit(eval, "'scipy' in __import__('sys').modules").result()
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from threadpoolctl import threadpool_limits
 
 import fuselog as fl
 from fuselog import BadInput
 from fuselog.recorders.log import RunMetadata, make_stream, schemas, write_log
 from fuselog.recorders.log.opening import Topic
-from fuselog.recorders.processes import safe_spawning
+from fuselog.recorders.processes import limit_libraries, safe_spawning
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.replaying.estimator import configure
 from fuselog.replay.engine.streams.sources import memory_source
@@ -362,10 +363,18 @@ def test_a_log_of_a_program_needs_estimates_and_nothing_else(tmp_path: Path) -> 
             assert [each.schema.name for each in found.values()] == ["GaussianEstimate"]
 
 
-def test_a_program_has_the_environment_of_the_user() -> None:
-    """Though workers, which start it, keep the current folder off the path of Python."""
-    says = "import os; raise SystemExit('PYTHONSAFEPATH' in os.environ)"
-    with safe_spawning():
+def test_a_program_has_the_environment_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though workers keep the current folder off the path of Python, and use one core."""
+    monkeypatch.setattr("fuselog.recorders.processes._threads_of_user", {})
+    for name in ("OPENBLAS", "BLIS", "OMP", "MKL"):
+        monkeypatch.setenv(f"{name}_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS")
+    says = (
+        "import os; cores = [os.environ.get(f'{each}_NUM_THREADS') for each in ('OMP', 'MKL')]; "
+        "raise SystemExit('PYTHONSAFEPATH' in os.environ or cores != ['3', None])"
+    )
+    with safe_spawning(), threadpool_limits(None):  # what is limited here is free again afterwards
+        limit_libraries()
         started = Program([sys.executable, "-c", says])
         assert started.process.wait() == 0
     started.end()
