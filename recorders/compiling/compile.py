@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache, lru_cache, wraps
+from functools import cache, cached_property, lru_cache, wraps
 from itertools import pairwise
 from types import FunctionType
 from typing import ParamSpec, Protocol, TypeVar, cast
@@ -96,7 +96,6 @@ def compile_over_runs(run_once: RunOnce, *, title: str = "") -> "OverRuns":
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
 
-    @cache
     def loop() -> Loop:
         from fuselog.recorders.compiling.kernels.native import Kernel
 
@@ -111,11 +110,18 @@ class OverRuns:
 
     Attributes:
         run_once: function that processes one run.
-        compiled_loop: function that makes the compiled loop; None if the loop is always plain Python.
+        make_loop: function that makes the compiled loop; None if the loop is always plain Python.
     """
 
     run_once: RunOnce
-    compiled_loop: Callable[[], Loop] | None = None
+    make_loop: Callable[[], Loop] | None = None
+
+    @cached_property
+    def compiled_loop(self) -> Loop:
+        """The compiled loop, made at first use, which may import modules."""
+        assert self.make_loop is not None
+        with done_once():
+            return self.make_loop()
 
     def __call__(
         self,
@@ -125,10 +131,8 @@ class OverRuns:
         per_run: Sequence[KernelArgument] | None = None,
     ) -> None:
         """Process all runs; NaN and infinity cause no warnings or errors, even in plain Python."""
-        if self.compiled_loop is not None and not is_uncompiled():
-            with done_once():
-                loop = self.compiled_loop()  # imports modules at first use
-            _share(loop, runs, *arguments, scratch=scratch, per_run=per_run)
+        if self.make_loop is not None and not is_uncompiled():
+            _share(self.compiled_loop, runs, *arguments, scratch=scratch, per_run=per_run)
             return
         memory = [scratch()] if scratch else []
         with np.errstate(all="ignore"):

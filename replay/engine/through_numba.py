@@ -10,7 +10,6 @@ import dis
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
@@ -41,7 +40,7 @@ def numba_over_runs(run_once: RunOnce, title: str = "") -> OverRuns:
     called, if numba is not installed or cannot compile the function.
     """
     title = title or f"{run_once.__module__}.{run_once.__name__}"
-    return OverRuns(run_once, cache(lambda: _Loop(cast(FunctionType, run_once), title)))
+    return OverRuns(run_once, lambda: _Loop(cast(FunctionType, run_once), title))
 
 
 class _Loop:

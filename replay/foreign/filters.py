@@ -23,7 +23,7 @@ from fuselog.replay.engine.streams.channels import given_or_stated, resolved
 from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.engine.streams.measurements import check_width
 from fuselog.replay.engine.streams.priors import gaussians
-from fuselog.replay.engine.streams.results import failures_by_run, state_stream
+from fuselog.replay.engine.streams.results import failures_by_run, named, state_stream
 from fuselog.replay.foreign.description import (
     Description,
     ForeignParameters,
@@ -531,7 +531,8 @@ def streams_of(
     state = replace(state, log_time_ns=issued_ns)
     made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
     if description.innovation:
-        made.append(recorded_innovations(topic, description.innovation, truth, innovations, recorded))
+        metadata = {**named(description.innovation), "truth": truth}
+        made.append(recorded_innovations(f"{topic}/innovation", metadata, innovations, recorded))
         check_stream(made[-1].stream)
     return made
 

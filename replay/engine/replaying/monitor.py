@@ -22,7 +22,13 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, make_stream, schemas
 from fuselog.recorders.log.planes import Origin, in_plane
 from fuselog.replay.engine.replaying.coverage import Coverage
-from fuselog.replay.engine.replaying.soundness import UNSOUND, unsound_over_runs, work_space
+from fuselog.replay.engine.replaying.soundness import (
+    FOREVER,
+    SOUND,
+    UNSOUND,
+    unsound_over_runs,
+    work_space,
+)
 from fuselog.replay.engine.replaying.usage import Usage
 from fuselog.replay.engine.streams.blocks import Ragged, join, ragged_rows, run_of_rows
 from fuselog.replay.engine.streams.failures import Failure, failure_stream, reason_of
@@ -38,7 +44,6 @@ ESTIMATES = frozenset(
     schema.full_name
     for schema in (schemas.GAUSSIAN_ESTIMATE, schemas.ESTIMATE_SIZE, schemas.TRACK_ESTIMATE)
 )
-FOREVER = np.iinfo(np.int64).max
 
 
 class RunMonitor:
@@ -263,7 +268,7 @@ class RunMonitor:
             return None
         coverage = self._coverages.get(stream.topic.rpartition("/")[0])
         before_ns = coverage.last_ns if coverage else np.full(self.runs, -1)
-        rows, found = np.full(self.runs, FOREVER), np.full(self.runs, -1)
+        rows, found = np.empty(self.runs, np.int64), np.empty(self.runs, np.int64)
         mean, covariance = (np.ascontiguousarray(stream[name]) for name in ("mean", "covariance"))
         size = isqrt(covariance.shape[1])
         unsound_over_runs(
@@ -277,7 +282,7 @@ class RunMonitor:
             found,
             scratch=_memory_of(size),
         )
-        bad = np.flatnonzero(found >= 0)
+        (bad,) = np.nonzero(found != SOUND)
         for run in bad:
             row = rows[run]
             first = row == estimates.offsets[run]
@@ -305,7 +310,8 @@ class RunMonitor:
         Runs that have already failed are excluded.
         """
         coverages = [self._coverages[case] for case in self._states]
-        if not coverages:
+        reaches_end = ((coverage.last_ns == self._last_ns).all() for coverage in coverages)
+        if not coverages or (not self._is_batch and any(reaches_end)):
             return
         mute = ~reduce(np.logical_or, (coverage.has_estimates for coverage in coverages))
         found = mute

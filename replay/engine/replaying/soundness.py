@@ -18,6 +18,8 @@ UNSOUND = (
     "the covariance is not symmetric",
 )
 NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK, NOT_SYMMETRIC = range(len(UNSOUND))
+SOUND = -1
+FOREVER = (1 << 63) - 1  # the row, or the stamp in ns, at which a run without faults ends
 # Fraction of a variance: a covariance that is singular up to rounding (for example, of one particle) is
 # valid.
 INDEFINITE = 1e-9
@@ -61,16 +63,17 @@ def find_unsound(
         before_ns: (runs,) the last stamp before this block.
         mean: (n, d).
         covariance: (n, t * t) row-major.
-        rows: (runs,) row of the first invalid estimate, filled if there is one.
-        found: (runs,) index in `UNSOUND`, filled if there is an invalid estimate.
+        rows: (runs,) row of the first invalid estimate; filled, with FOREVER if there is none.
+        found: (runs,) index in `UNSOUND`; filled, with SOUND if there is no invalid estimate.
         work: work space.
     """
+    rows[run], found[run] = FOREVER, SOUND
     begin, end, last_ns = offsets[run], offsets[run + 1], before_ns[run]
     while begin < end:
         stop = min(begin + LANES, end)
         is_clear = stop - begin == LANES and are_clearly_sound(begin, mean, covariance, work)
         for row in range(begin, stop):
-            wrong = GOES_BACK if time_ns[row] < last_ns else -1
+            wrong = GOES_BACK if time_ns[row] < last_ns else SOUND
             if wrong < 0 and not is_clear:
                 wrong = fault_of(mean[row], covariance[row], work.factor)
             if wrong >= 0:
@@ -119,13 +122,13 @@ def are_clearly_sound(first: int, mean: Floats, covariance: Floats, work: Work) 
 
 
 def fault_of(mean: Floats, covariance: Floats, factor: Floats) -> int:
-    """Return the index in `UNSOUND` of an estimate's fault, ignoring its stamp; -1 if it is sound.
+    """Return the index in `UNSOUND` of an estimate's fault, ignoring its stamp, or SOUND.
 
     Args:
         mean, covariance: (d,), (t * t,) row-major.
         factor: (t, t), work space.
     """
-    size, wrong, is_wrong, total = len(factor), -1, False, 0.0
+    size, wrong, is_wrong, total = len(factor), SOUND, False, 0.0
     for i in range(len(mean)):
         total += mean[i]
     for i in range(len(covariance)):

@@ -109,11 +109,12 @@ def _steps(bound_model: BoundModel, method: Method) -> Steps:
 @lru_cache(maxsize=64)
 def _compiled(bound_model: BoundModel, method: Method) -> tuple[OverRuns, Steps]:
     """Make the loop over the runs, which is compiled at its first call, and the steps that it calls."""
-    steps = _steps(bound_model, method)
-    names = number_fields(bound_model.model.parameters)
-    loop = recursion(bound_model, steps, reading_settings(names))
-    title = title_of(bound_model.model, method.summary)
-    return compile_over_runs(loop, title=title), steps
+    with done_once():
+        steps = _steps(bound_model, method)
+        names = number_fields(bound_model.model.parameters)
+        loop = recursion(bound_model, steps, reading_settings(names))
+        title = title_of(bound_model.model, method.summary)
+        return compile_over_runs(loop, title=title), steps
 
 
 def samplers_of(
@@ -221,7 +222,7 @@ class Filter:
     ) -> tuple[FilterState, FilterEvents]:
         """Return the events that need not wait, and a state that contains the waiting events."""
         next_output, waiting, unsettled = state.next_output, None, None
-        if self.delays_ns.any():
+        if self.has_delays:
             if state.unsettled is not None:
                 events = join_events(state.unsettled, events)
             delays = self.delays_ns
@@ -277,6 +278,11 @@ class Filter:
         """Delays of messages; see `delays_of`."""
         return delays_of(self.bound_model, self.settings)
 
+    @cached_property
+    def has_delays(self) -> bool:
+        """Whether messages of a topic are moved to their times of measurement."""
+        return bool(self.delays_ns.any())
+
     @property
     def initial(self) -> tuple[float, ...]:
         """Control before its first message."""
@@ -312,7 +318,7 @@ class Filter:
             return "it does not support estimates between messages (every_s, --every)"
         if control is not None and control.interpolated:
             return f"{control.topic} is interpolated, so messages have to wait for its next message"
-        if self.delays_ns.any():
+        if self.has_delays:
             return "messages are moved to their times of measurement and have to wait for each other"
         if self.is_random:
             return "its samples are random, and would differ if a message were processed again"
@@ -329,8 +335,7 @@ class Filter:
     ) -> tuple[FilterState, tuple[EstimatesToFill, Integers], list[Ragged]]:
         """Filter events; return the state after them, estimates, their offsets, and other outputs."""
         sensors = self.bound_model.sensors
-        with done_once():
-            loop, _ = _compiled(self.bound_model, self.method)
+        loop, _ = _compiled(self.bound_model, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(events.wants_estimate, events.offsets)
@@ -430,10 +435,15 @@ class Filter:
         """Names and kinds of the components of all innovations."""
         return innovation_components(self.bound_model.sensors)
 
+    @cached_property
+    def innovation_metadata(self) -> Mapping[str, str]:
+        """Metadata of the channel of the innovations."""
+        return {**named(self.measured), "truth": self.truth}
+
     def innovations(self, innovations: InnovationRows, offsets: Integers) -> Ragged:
         """Make the stream of innovations of a filter with sensors; see `states`."""
-        topic = f"/estimates/{self.name}"
-        return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)
+        topic = f"/estimates/{self.name}/innovation"
+        return recorded_innovations(topic, self.innovation_metadata, innovations, offsets)
 
 
 @lru_cache(maxsize=64)

@@ -18,7 +18,7 @@ from fuselog.recorders.log import schemas
 from fuselog.recorders.log.streams import computed_stream
 from fuselog.replay.engine.arrays import AnyArgument, Columns, Floats, Integers, RowSlice
 from fuselog.replay.engine.streams.blocks import Ragged, filled_rows
-from fuselog.replay.engine.streams.results import ALL_WELL, named, rows_of
+from fuselog.replay.engine.streams.results import ALL_WELL, rows_of
 from fuselog.replay.inference.kalman.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
@@ -129,14 +129,13 @@ class RunResults(NamedTuple):
 
 
 def recorded_innovations(
-    topic: str, components: Mapping[str, str], truth: str, innovations: InnovationRows, offsets: Integers
+    topic: str, metadata: Mapping[str, str], innovations: InnovationRows, offsets: Integers
 ) -> Ragged:
     """Make the stream of innovations from the results of a recursion.
 
     Args:
-        topic: topic of the estimator.
-        components: names and kinds of the measured components.
-        truth: topic with which the estimates are compared.
+        topic: topic of the stream.
+        metadata: metadata of its channel: the measured components, and the topic with the truth.
         innovations: (n, ...) innovations of all runs, concatenated; see `filled`.
         offsets: (runs + 1,) first row of each run.
     """
@@ -150,7 +149,6 @@ def recorded_innovations(
         "normalised_innovation_squared": numbers[:, 0],
         "log_likelihood": numbers[:, 1],
     }
-    topic, metadata = f"{topic}/innovation", {**named(components), "truth": truth}
     stream = computed_stream(topic, schemas.INNOVATION, time_ns, columns, metadata)
     return Ragged(stream, offsets)
 

@@ -51,7 +51,7 @@ BY_NUMBA = f"""{MODULE}
     numba.config.reload_config()  # it was imported before the folder of its cache was set
     loop = numba_over_runs(kernel(model))
     loop(3, columns)
-    (made,) = loop.compiled_loop()._kernels.values()
+    (made,) = loop.compiled_loop._kernels.values()
     print(*columns.found, "cached" if made.stats.cache_hits else "compiled")
 """
 OURS = f"""{MODULE}

@@ -23,7 +23,13 @@ from fuselog.replay.engine.api.inputs import Floats, Given, Integers, Messages
 from fuselog.replay.engine.api.outputs import Estimates, Results
 from fuselog.replay.engine.replaying.estimator import Batch, Estimator, Recursive
 from fuselog.replay.engine.replaying.replaying import Report, collect, replay
-from fuselog.replay.engine.replaying.soundness import LANES, unsound_over_runs, work_space
+from fuselog.replay.engine.replaying.soundness import (
+    FOREVER,
+    LANES,
+    SOUND,
+    unsound_over_runs,
+    work_space,
+)
 from fuselog.replay.engine.streams.blocks import Ragged, gather
 from fuselog.replay.engine.streams.failures import Failure, failure_stream, sentences_of
 from fuselog.replay.engine.streams.results import failures_of
@@ -351,7 +357,7 @@ def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool, oth
     size, count, place = len(covariance), others + 1, others // 2
     covariances = np.tile(np.eye(size).ravel(), (count, 1))
     covariances[place] = np.ravel(covariance)
-    rows, found = np.full(1, -9), np.full(1, -1)
+    rows, found = np.full(1, -9), np.full(1, -9)
     unsound_over_runs(
         1,
         np.array([0, count]),
@@ -363,8 +369,8 @@ def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool, oth
         found,
         scratch=partial(work_space, size),
     )
-    assert (found[0] < 0) == is_sound
-    assert rows[0] == (-9 if is_sound else place)
+    assert (found[0] == SOUND) == is_sound
+    assert rows[0] == (FOREVER if is_sound else place)
 
 
 def test_a_failure_is_told_in_its_block_alone() -> None:
