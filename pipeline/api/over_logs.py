@@ -37,7 +37,7 @@ from fuselog.pipeline.runs.batches import Row, Task, batches_of, over_logs
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.ensemble import Pass, Progress, Settings, no_progress
 from fuselog.pipeline.runs.executors import PoolFactory, pool_for
-from fuselog.pipeline.selecting.selection import Selection
+from fuselog.pipeline.selecting.selection import Selection, SelectionOptions
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
 from fuselog.recorders.log import open_log
 from fuselog.recorders.remote.paths import seen_from
@@ -196,13 +196,11 @@ class Campaign(NamedTuple):
             yield worst_first(_table_of(self.selection, found)), hand_over
 
 
-def campaign_of(selection: Mapping[str, Any], out: Path) -> Campaign:
-    """Select logs and workers by the options of a command: paths, where, group, workers, scheduler."""
-    found = select(selection["paths"], selection["where"], selection["group"])
-    stated = {name: selection[name] for name in ("where", "group") if selection[name] is not None}
-    stated["selection"] = [str(path) for path in selection["paths"]]
-    pool = pool_for(selection["workers"], selection["scheduler"], len(found.logs))
-    return Campaign(found, out, pool, stated, progress)
+def campaign_of(options: SelectionOptions, out: Path) -> Campaign:
+    """Select logs and workers by the options of a command."""
+    found = select(options.paths, options.where, options.group)
+    pool = pool_for(options.workers, options.scheduler, len(found.logs))
+    return Campaign(found, out, pool, options.stated, progress)
 
 
 def _table_of(selection: Selection, found: Sequence[Sequence[Row]]) -> pd.DataFrame:

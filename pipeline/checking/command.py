@@ -1,8 +1,7 @@
 """The command `fuselog check`, which replays runs and reports the first difference from a golden."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 from fuselog.pipeline.api.over_logs import FAULTS, campaign_of, show_over_logs
@@ -14,6 +13,7 @@ from fuselog.pipeline.output.outputs import Kind, check_files
 from fuselog.pipeline.output.terminal import print_json, say
 from fuselog.pipeline.output.words import count
 from fuselog.pipeline.runs.settings import pairs_of, settings_of_estimators
+from fuselog.pipeline.selecting.selection import SelectionOptions
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.errors import BadInput
 
@@ -38,7 +38,7 @@ def check_path(
     settings_file: Path | None,
     settings: Sequence[str],
     in_place: InPlace | None = None,
-    selection: Mapping[str, Any] | None = None,
+    selection: SelectionOptions | None = None,
 ) -> bool:
     """Compare the runs at `path` with a golden, or write the golden; return whether all fields agree.
 
@@ -56,7 +56,7 @@ def check_path(
             estimators=chosen,
             columns=columns,
             tolerances=pairs_of("--tolerance", tolerances, _tolerance, _TOLERANCE),
-            where=selection["where"] if selection else None,
+            where=selection.where if selection else None,
         )
         streams = sum(len(run["streams"]) for run in made["runs"].values())
         size_kb = golden.stat().st_size / 1e3

@@ -3,13 +3,16 @@
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from fuselog.recorders.remote.paths import located
 from fuselog.replay.foreign.naming import allow_programs_of_files
+
+if TYPE_CHECKING:
+    from fuselog.pipeline.selecting.selection import SelectionOptions
 
 
 class Output(click.Path):
@@ -186,17 +189,19 @@ def selection_options(function: Callable[..., None]) -> Callable[..., None]:
 
 def selecting(
     paths: Sequence[Path], options: dict[str, Any], *, always: bool = False
-) -> dict[str, Any] | None:
+) -> "SelectionOptions | None":
     """Move the options of a selection out of the options of a command.
 
     Returns None if there is no selection: the paths are logs and folders, no option is given, and
     `always` is not set.
     """
     from fuselog.pipeline.selecting.catalog import is_catalog
+    from fuselog.pipeline.selecting.selection import SelectionOptions
 
-    found = {name: options.pop(name, None) for name in ("where", "group", "workers", "scheduler")}
-    is_given = any(value is not None for value in found.values()) or any(map(is_catalog, paths))
-    return {"paths": paths, **found} if always or is_given else None
+    names = SelectionOptions._fields[1:]
+    found = SelectionOptions(paths, *(options.pop(name, None) for name in names))
+    is_given = any(value is not None for value in found[1:]) or any(map(is_catalog, paths))
+    return found if always or is_given else None
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -1,6 +1,6 @@
 """Functions of commands that process each log of a selection by itself."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +8,13 @@ from fuselog.pipeline.api.linting import Linting, alterations_for_lint
 from fuselog.pipeline.api.over_logs import LOG, Replaying, campaign_of, show_over_logs
 from fuselog.pipeline.runs.executors import states_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
+from fuselog.pipeline.selecting.selection import SelectionOptions
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.foreign.naming import program_files
 
 
 def replay_selection(
-    selection: Mapping[str, Any],
+    selection: SelectionOptions,
     names: Sequence[str],
     *,
     out: Path | None,
@@ -50,7 +51,7 @@ def replay_selection(
 
 
 def lint_selection(
-    selection: Mapping[str, Any],
+    selection: SelectionOptions,
     *,
     out: Path | None,
     recover: bool,

@@ -1,7 +1,7 @@
 """The command `fuselog compare`, which prints verdicts with intervals and writes the chosen outputs."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.terminal import print_json, print_table, progress, say, warn
 from fuselog.pipeline.runs.executors import states_of
 from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.selecting.selection import SelectionOptions
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.foreign.naming import program_files
 
@@ -83,7 +84,7 @@ def compare_candidates(
 
 
 def compare_selection(
-    selection: Mapping[str, Any],
+    selection: SelectionOptions,
     labels: Sequence[str],
     *,
     margin: float,

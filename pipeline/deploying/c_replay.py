@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from fuselog.pipeline.deploying.c_source.braces import braced
-from fuselog.pipeline.deploying.c_source.names import CFilter, filled, identifier
+from fuselog.pipeline.deploying.c_source.names import CFilter, identifier, rendered
 from fuselog.recorders.parameters import Role, field_of, meanings
 from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.replaying.estimator import Reading
@@ -138,184 +138,21 @@ def _literal(text: str) -> str:
 def replay_text(made: CFilter, reading: Reading) -> str:
     """Write the text of NAME_replay.c."""
     maps = _maps(made)
-    parameters = _parameters(made)
-    sets = "".join(
-        f"    own->parameters.{place} = (REAL)parameters[{index}];\n"
-        for index, (_, places, _) in enumerate(parameters)
-        for place in places
+    first = len(maps) + bool(made.controls)
+    kinds = made.filtering.bound_model.model.kinds
+    text = rendered(
+        made,
+        "replay.c",
+        maps=maps,
+        places=[
+            (index, place) for index, (_, places, _) in enumerate(_parameters(made)) for place in places
+        ],
+        updates=[
+            (number, sensor.topic, _taking(name, sensor, maps))
+            for number, (name, sensor) in enumerate(made.sensors, first)
+        ],
+        angles=[index for index, kind in enumerate(kinds) if kind == "angle"],
     )
-    cases, topic = [], 0
-    for number, each in enumerate(maps):
-        cases.append(
-            f"    if (topic == {topic}) {{ /* {each.topic}, before the start */\n"
-            f"        if (own->points{number} == MOST_POINTS)\n            return NO_ROOM;\n"
-            f"        memcpy(own->point{number}[own->points{number}++], fields,\n"
-            f"               {1 + each.size} * sizeof *fields);\n"
-            "        return FUSELOG_FILTER_WELL;\n    }\n"
-        )
-        topic += 1
-    cases.append(
-        "    if (fuselog_filter_predict(filter, time_ns) != FUSELOG_FILTER_WELL)\n        return LOST;\n"
-    )
-    if made.controls:
-        cases.append(
-            f"    if (topic == {topic}) {{ /* the control */\n"
-            "        for (int k = 0; k < NAME_CONTROLS; k++)\n"
-            "            if (!isnan(fields[k]))\n"
-            "                own->filter.control[k] = (REAL)fields[k];\n"
-            "        return FUSELOG_FILTER_WELL;\n    }\n"
-        )
-        topic += 1
-    for name, sensor in made.sensors:
-        cases.append(
-            f"    if (topic == {topic}) {{ /* {sensor.topic} */\n{_taking(name, sensor, maps)}    }}\n"
-        )
-        topic += 1
-    points = "".join(
-        f"    double point{number}[MOST_POINTS][{1 + each.size}];\n    int points{number};\n"
-        for number, each in enumerate(maps)
-    )
-    angles = "".join(
-        f"    mean[{index}] = wrapped(mean[{index}]);\n"
-        for index, kind in enumerate(made.filtering.bound_model.model.kinds)
-        if kind == "angle"
-    )
-    wrap = (
-        """/* The equal angle in [-pi, pi). */
-static double wrapped(double angle)
-{
-    const double pi = 3.141592653589793;
-    double turned;
-    if (fabs(angle) < pi)
-        return angle;
-    turned = fmod(angle + pi, 2.0 * pi);
-    return (turned < 0.0 ? turned + 2.0 * pi : turned) - pi;
-}
-
-"""
-        if angles
-        else ""
-    )
-    text = f"""/* fuselog replays the filter with this: see docs/your-filter.md, fuselog_filter.h. */
-#include "fuselog_filter.h"
-
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "NAME.h"
-
-{"enum { MOST_POINTS = 4096 };" if maps else ""}
-enum {{ NEEDS_PRIOR = 1, LOST, NO_ROOM, BAD_PRIOR }};
-
-typedef struct {{
-    NAME filter;
-    NAME_parameters parameters;
-    NAME_innovation innovation;
-    int32_t outcome; /* of the last message */
-{points}}} Own;
-
-/* Converts numbers of the interface to those of the filter. */
-static void take(REAL *to, const double *from, int count)
-{{
-    for (int i = 0; i < count; i++)
-        to[i] = (REAL)from[i];
-}}
-
-/* Converts them back. */
-static void give(double *to, const REAL *from, int count)
-{{
-    for (int i = 0; i < count; i++)
-        to[i] = (double)from[i];
-}}
-
-int32_t fuselog_filter_version(void) {{ return FUSELOG_FILTER_VERSION; }}
-
-const char *fuselog_filter_describe(void)
-{{
-    return
-DESCRIPTION;
-}}
-
-void *fuselog_filter_create(const double *parameters, uint64_t seed)
-{{
-    Own *own = calloc(1, sizeof *own);
-    (void)seed;
-    (void)parameters;
-    if (own == NULL)
-        return NULL;
-    own->parameters = NAME_as_tuned;
-{sets}    return own;
-}}
-
-void fuselog_filter_destroy(void *filter) {{ free(filter); }}
-
-void *fuselog_filter_copy(const void *filter)
-{{
-    Own *copy = malloc(sizeof *copy);
-    return copy != NULL ? memcpy(copy, filter, sizeof *copy) : NULL;
-}}
-
-int32_t fuselog_filter_start(void *filter, int64_t time_ns, const double *mean, const double *covariance)
-{{
-    Own *own = filter;
-    REAL state[NAME_STATES], spread[NAME_TANGENT * NAME_TANGENT];
-    if (mean == NULL)
-        return NEEDS_PRIOR;
-    take(state, mean, NAME_STATES);
-    take(spread, covariance, NAME_TANGENT * NAME_TANGENT);
-    return NAME_init(&own->filter, time_ns, state, spread) == NAME_WELL ? FUSELOG_FILTER_WELL
-                                                                          : BAD_PRIOR;
-}}
-
-int32_t fuselog_filter_predict(void *filter, int64_t time_ns)
-{{
-    Own *own = filter;
-    const NAME_outcome outcome = NAME_predict(&own->filter, time_ns, &own->parameters);
-    return outcome == NAME_WELL || outcome == NAME_BACKWARD ? FUSELOG_FILTER_WELL : LOST;
-}}
-
-static int32_t told(Own *own, NAME_outcome outcome)
-{{
-    if (outcome == NAME_NOT_POSITIVE_DEFINITE || outcome == NAME_NOT_FINITE)
-        return LOST;
-    if (outcome == NAME_WELL)
-        own->outcome = own->innovation.is_accepted ? FUSELOG_FILTER_WELL : FUSELOG_FILTER_REJECTED;
-    return FUSELOG_FILTER_WELL;
-}}
-
-int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns, const double *fields)
-{{
-    Own *own = filter;
-    own->outcome = FUSELOG_FILTER_NOTHING;
-{"".join(cases)}    return FUSELOG_FILTER_WELL;
-}}
-
-{wrap}int32_t fuselog_filter_state(const void *filter, double *mean, double *covariance)
-{{
-    const Own *own = filter;
-COVARIANCE    give(mean, own->filter.mean, NAME_STATES);
-{angles}    return FUSELOG_FILTER_WELL;
-}}
-
-int32_t fuselog_filter_innovation(const void *filter, double *innovation, double *covariance)
-{{
-    const Own *own = filter;
-    if (own->outcome == FUSELOG_FILTER_NOTHING)
-        return FUSELOG_FILTER_NOTHING;
-    give(innovation, own->innovation.difference, NAME_INNOVATION);
-    give(covariance, &own->innovation.covariance[0][0], NAME_INNOVATION * NAME_INNOVATION);
-    return own->outcome;
-}}
-"""
-    spread = "    give(covariance, &WHOSE[0][0], NAME_TANGENT * NAME_TANGENT);\n"
-    covariance = (
-        "    REAL spread[NAME_TANGENT][NAME_TANGENT];\n    NAME_covariance(&own->filter, spread);\n"
-        + spread.replace("WHOSE", "spread")
-        if made.is_root
-        else spread.replace("WHOSE", "own->filter.covariance")
-    )
-    text = filled(made, text.replace("COVARIANCE", covariance))
     return braced(text).replace("DESCRIPTION", _literal(_description(made, reading)))
 
 

@@ -12,8 +12,7 @@ from fuselog.pipeline.checking.stored import Golden
 from fuselog.pipeline.deploying.c_replay import replay_text, why_no_replay
 from fuselog.pipeline.deploying.c_source.filter import source
 from fuselog.pipeline.deploying.c_source.header import header
-from fuselog.pipeline.deploying.c_source.names import CFilter, identifier
-from fuselog.pipeline.deploying.c_target import LINKED, STARTING
+from fuselog.pipeline.deploying.c_source.names import CFilter, identifier, text_of
 from fuselog.pipeline.deploying.c_test import test_text, vectors_of, vectors_text
 from fuselog.pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from fuselog.pipeline.deploying.folder import cmake_text, readme_text
@@ -89,8 +88,8 @@ def deploy(
         f"{made.name}.c": source(made),
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
-        "cortex_m4f.c": STARTING,
-        "cortex_m4f.ld": LINKED,
+        "cortex_m4f.c": text_of("cortex_m4f.c"),
+        "cortex_m4f.ld": text_of("cortex_m4f.ld"),
         "CMakeLists.txt": cmake_text(made),
     }
     certificate = certificate_of(made, files)

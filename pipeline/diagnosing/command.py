@@ -1,6 +1,6 @@
 """The command `fuselog diagnose`, which prints likely faults and what to try against them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from fuselog.pipeline.output.results import plain
 from fuselog.pipeline.output.terminal import print_json, print_metrics, print_table, say, status
 from fuselog.pipeline.runs.estimates import recorded_estimators
 from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
+from fuselog.pipeline.selecting.selection import SelectionOptions
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
 from fuselog.recorders.parameters import parse_settings
@@ -112,7 +113,7 @@ def diagnose_log(
 
 
 def diagnose_selection(
-    selection: Mapping[str, Any],
+    selection: SelectionOptions,
     *,
     label: str | None,
     out: Path | None,

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fuselog.pipeline.selecting.catalog import read_current, with_columns
 from fuselog.pipeline.selecting.where import rows_where
@@ -14,6 +14,31 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_NAMED = 3  # largest number of logs that notes name
+
+
+class SelectionOptions(NamedTuple):
+    """The options with which a command selects logs and the workers that process each log by itself.
+
+    Attributes:
+        paths: logs, folders of logs, and catalogs.
+        where: a condition on the columns of the catalogs.
+        group: the column that names the group of each log.
+        workers: the number of processes.
+        scheduler: the address of a Dask scheduler.
+    """
+
+    paths: Sequence[Path]
+    where: str | None = None
+    group: str | None = None
+    workers: int | None = None
+    scheduler: str | None = None
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Return the settings that a result states of the selection."""
+        conditions = {"where": self.where, "group": self.group}
+        given = {name: value for name, value in conditions.items() if value is not None}
+        return {**given, "selection": [str(path) for path in self.paths]}
 
 
 @dataclass(frozen=True)

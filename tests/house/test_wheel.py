@@ -43,6 +43,7 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
             *(sys.executable, "-m", "pip", "--python", python, "install"),
             *("-q", "--no-deps", "--no-index", "--no-compile", wheel),
         )
+        assert_holds_all_files(packages / "fuselog")
         link_to_what_is_required(packages)
         assert run(scripts / "fuselog", "--version").split()[-1] in wheel.name
         demo = (
@@ -55,6 +56,14 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
         told = json.loads((elsewhere / "demo" / "result.json").read_text())
         assert told["metrics"]["ekf.position_rmse_m.robot1"] < 1.0
         assert (elsewhere / "report.html").stat().st_size > 100_000
+
+
+def assert_holds_all_files(installed: Path) -> None:
+    """Every file beside the modules, such as a template, is where its package is installed."""
+    for room in ("pipeline", "recorders", "replay"):
+        for path in (ROOT / room).rglob("*.*"):
+            if path.suffix != ".pyc":
+                assert (installed / path.relative_to(ROOT)).is_file(), path
 
 
 def link_to_what_is_required(packages: Path) -> None:

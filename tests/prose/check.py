@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 from tests.house.sources import PATHS, ROOT
 
-PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
+C_CODE = "pipeline/deploying/c_source/*.[ch]"  # its comments and messages
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md", C_CODE)
 CODE = re.compile(
     r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|>>> [^\n]*|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+",
     re.DOTALL,

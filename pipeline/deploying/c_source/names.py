@@ -3,7 +3,10 @@
 import re
 from dataclasses import replace
 from hashlib import sha256
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from fuselog.replay.inference.kalman.update import innovation_components
 from fuselog.replay.inference.linear_algebra.factors import FACTORS
@@ -61,6 +64,11 @@ class CFilter(NamedTuple):
     def is_root(self) -> bool:
         """Test whether the filter stores a factor of the covariance, not the covariance itself."""
         return self.filtering.form is FACTORS
+
+    @property
+    def carried(self) -> str:
+        """Return the name in C of the matrix that the filter stores."""
+        return "factor" if self.is_root else "covariance"
 
     @property
     def is_interpolated(self) -> bool:
@@ -161,8 +169,33 @@ def _read(step: Step) -> set[str]:
     }
 
 
-def filled(made: CFilter, template: str) -> str:
-    """Fill a template with the names and sizes of a filter."""
-    text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
+def text_of(name: str) -> str:
+    """Read a file of this folder."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+_TEMPLATES = Environment(
+    loader=FunctionLoader(text_of),
+    block_start_string="/*%",
+    block_end_string="%*/",
+    variable_start_string="${",
+    variable_end_string="}",
+    comment_start_string="/*#",
+    comment_end_string="#*/",
+    keep_trailing_newline=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    undefined=StrictUndefined,
+)
+
+
+def rendered(made: CFilter, template: str, **values: Any) -> str:
+    """Render a template of this folder, in which `made` is the filter.
+
+    NAME is a placeholder for the filter's name; REAL and the suffix _S are placeholders for the
+    precision. `/*% ... %*/` is a statement of Jinja2, `/*# ... #*/` a comment, `${...}` an expression.
+    """
+    text = _TEMPLATES.get_template(template).render(made=made, **values)
+    text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", text)
     text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
     return made.precision.text(text)

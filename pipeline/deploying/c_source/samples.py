@@ -1,17 +1,11 @@
-"""C functions evaluated at weighted samples, as in `fuselog.replay.inference.kalman.regression`.
+"""C functions evaluated at weighted samples, as in `fuselog.replay.inference.kalman.regression`."""
 
-Placeholders are those of `algebra`. SAMPLES is the largest number of samples, and DRAWN the largest
-number of entries in a sample. VALUES is the largest number of tangent components of a function's value,
-and PLACES the largest number of its components.
-"""
-
-import re
 from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 
-from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.pipeline.deploying.c_source.names import CFilter
 from fuselog.pipeline.deploying.c_source.statements import Inputs, body, entries
 from fuselog.replay.inference.kalman.regression import MEANS
 from fuselog.replay.inference.kalman.wide_angles import QUARTER_RAD, UNIFORM_RAD, WIDE_RAD
@@ -22,188 +16,12 @@ from fuselog.replay.tracing.graph import Node, steady
 
 SETTLED_IN_SINGLE = 1e-7  # see `manifold.SETTLED`
 
-TYPE = """\
-/* The results of a function at samples: tangent vectors of the samples from the mean, followed by noise,
- * and of its values from their centre, minus a shift. */
-typedef struct {
-    REAL factor[DRAWN][DRAWN]; /* of the covariance of state and noise */
-    REAL offsets[SAMPLES][DRAWN], values[SAMPLES][VALUES];
-    REAL centre[PLACES], shift[VALUES];
-} drawn_samples;
 
-/* A sample's offset: the factor times a point. */
-static void draw(drawn_samples *samples, int index, int size, const REAL *point)
-{
-    for (int row = 0; row < size; row++) {
-        REAL entry = samples->factor[row][0] * point[0];
-        for (int k = 1; k <= row; k++)
-            entry += samples->factor[row][k] * point[k];
-        samples->offsets[index][row] = entry;
-    }
-}
-
-/* The mean of the values becomes the shift. */
-static void find_shift(drawn_samples *samples, int count, const REAL *weights, int size)
-{
-    for (int i = 0; i < size; i++) {
-        REAL entry = 0.0_S;
-        for (int k = 0; k < count; k++)
-            entry += weights[k] * samples->values[k][i];
-        samples->shift[i] = entry;
-    }
-}
-"""
-
-NARROWING = """\
-/* The sum of the variances of `width` tangent components. */
-static REAL squared_length(const drawn_samples *samples, int first, int width)
-{
-    REAL squared = 0.0_S;
-    for (int row = first; row < first + width; row++)
-        for (int k = 0; k <= row; k++)
-            squared += samples->factor[row][k] * samples->factor[row][k];
-    return squared;
-}
-
-/* The share of the factor at which samples are taken, so that no angle wraps: 1 unless an angle is
- * hardly known. A motion (`bounded`) samples no angle wider than uniform. */
-static REAL narrow(drawn_samples *samples, int count, int size, const REAL *points, REAL unsuspected,
-                   int bounded)
-{
-    static const int first[TURNS] = {FIRST}, width[TURNS] = {WIDTH};
-    static const REAL times[TURNS] = {TIMES};
-    REAL widest = 0.0_S, reach = 0.0_S;
-    int suspected = 0;
-    for (int turn = 0; turn < TURNS; turn++)
-        if (times[turn] * times[turn] * squared_length(samples, first[turn], width[turn]) >
-            unsuspected * unsuspected)
-            suspected = 1;
-    if (!suspected)
-        return 1.0_S;
-    for (int turn = 0; turn < TURNS; turn++) {
-        REAL most = 0.0_S;
-        for (int row = first[turn]; row < first[turn] + width[turn]; row++) {
-            REAL wide = times[turn] * sqrt_S(squared_length(samples, row, 1));
-            if (bounded && wide > UNIFORM_RAD) {
-                for (int k = 0; k <= row; k++)
-                    samples->factor[row][k] *= UNIFORM_RAD / wide;
-                wide = UNIFORM_RAD;
-            }
-            widest = wide > widest ? wide : widest;
-        }
-        for (int index = 0; index < count; index++) {
-            REAL squared = 0.0_S;
-            for (int row = first[turn]; row < first[turn] + width[turn]; row++) {
-                REAL away = 0.0_S;
-                for (int k = 0; k <= row; k++)
-                    away += samples->factor[row][k] * points[index * size + k];
-                squared += away * away;
-            }
-            most = squared > most ? squared : most;
-        }
-        most = times[turn] * sqrt_S(most);
-        reach = most > reach ? most : reach;
-    }
-    if (reach <= QUARTER_RAD || (widest <= WIDE_RAD && reach <= HALF_RAD))
-        return 1.0_S;
-    const REAL share = QUARTER_RAD / reach;
-    for (int row = 0; row < size; row++)
-        for (int k = 0; k <= row; k++)
-            samples->factor[row][k] *= share;
-    return share;
-}
-
-/* Rescales offsets and values of narrowed samples to their full width. */
-static void widen(drawn_samples *samples, int count, int drawn, int size, REAL share)
-{
-    for (int index = 0; index < count; index++) {
-        for (int row = 0; row < drawn; row++)
-            samples->offsets[index][row] /= share;
-        for (int i = 0; i < size; i++)
-            samples->values[index][i] /= share;
-    }
-    for (int i = 0; i < size; i++)
-        samples->shift[i] /= share;
-    for (int row = 0; row < drawn; row++)
-        for (int k = 0; k <= row; k++)
-            samples->factor[row][k] /= share;
-}
-"""
-
-MOMENTS = """\
-/* The state's factor, with room for noise behind it; 0 if its covariance is indefinite. */
-static int start_samples(const NAME *filter, drawn_samples *samples)
-{
-    for (int row = 0; row < DRAWN; row++)
-        for (int column = 0; column < DRAWN; column++)
-            samples->factor[row][column] =
-                row < T && column <= row ? filter->covariance[row][column] : 0.0_S;
-    return cholesky(&samples->factor[0][0], DRAWN, T);
-}
-
-/* The covariance of the values and, if `cross` is not NULL, that of the state with them. */
-static void find_moments(const drawn_samples *samples, int count, const REAL *weights, int size,
-                         REAL *spread, int stride, REAL (*cross)[M])
-{
-    for (int i = 0; i < size; i++)
-        for (int j = 0; j <= i; j++) {
-            REAL entry = 0.0_S;
-            for (int k = 0; k < count; k++)
-                entry += weights[k] * (samples->values[k][i] - samples->shift[i]) *
-                         (samples->values[k][j] - samples->shift[j]);
-            spread[i * stride + j] = spread[j * stride + i] = entry;
-        }
-    for (int row = 0; cross != NULL && row < T; row++)
-        for (int i = 0; i < size; i++) {
-            REAL entry = 0.0_S;
-            for (int k = 0; k < count; k++)
-                entry += samples->offsets[k][row] *
-                         (weights[k] * (samples->values[k][i] - samples->shift[i]));
-            cross[row][i] = entry;
-        }
-}
-"""
-
-ON_AXES = """\
-/* The same for samples on axes: the covariance of the state with the values is the factor of the state's
- * covariance times that of the points with the values. The values `kept` are unchanged states. */
-static void find_moments_on_axes(const drawn_samples *samples, int count, const REAL *weights,
-                                 const REAL *points, int drawn, const int *axes, int size, REAL *spread,
-                                 int stride, REAL (*cross)[M], const int *kept, int number)
-{
-    REAL joint[DRAWN][VALUES], mixed[T][VALUES];
-    find_moments(samples, count, weights, size, spread, stride, NULL);
-    for (int k = 0; k < drawn; k++)
-        for (int i = 0; i < size; i++)
-            joint[k][i] = 0.0_S;
-    for (int k = 0; k < count; k++) {
-        const int axis = axes[k];
-        const REAL weighted = weights[k] * points[k * drawn + axis];
-        for (int i = 0; i < size; i++)
-            joint[axis][i] += weighted * (samples->values[k][i] - samples->shift[i]);
-    }
-    for (int row = 0; row < T; row++)
-        for (int i = 0; i < size; i++) {
-            REAL entry = 0.0_S;
-            for (int k = 0; k <= row; k++)
-                entry += samples->factor[row][k] * joint[k][i];
-            mixed[row][i] = entry;
-        }
-    for (int row = 0; cross != NULL && row < T; row++)
-        for (int i = 0; i < size; i++)
-            cross[row][i] = mixed[row][i];
-    for (int k = 0; k < number; k++)
-        for (int i = 0; i < size; i++)
-            spread[kept[k] * stride + i] = spread[i * stride + kept[k]] = mixed[kept[k]][i];
-}
-"""
-
-
-def samples_text(made: CFilter) -> list[str]:
+def samples(made: CFilter) -> dict[str, Any]:
     """Write the tables of samples, and the functions that evaluate motion and sensors at the samples."""
     functions = [each for each in made.steps.sampled if each is not None]
     if not functions:
-        return []
+        return {"tables": ""}
     sizes = {
         "SAMPLES": max(len(each.points) for each in functions),
         "DRAWN": max(each.points.shape[1] for each in functions),
@@ -214,39 +32,36 @@ def samples_text(made: CFilter) -> list[str]:
     tables = {each.points.shape[1]: _table(made, each) for each in functions}
     on_axes = [] if made.is_root else [each for each in functions if len(each.axes)]
     axes = {each.points.shape[1]: _axes_table(each) for each in on_axes}
-    return [
-        f"enum {{ {listed} }};\n",
-        *tables.values(),
-        *axes.values(),
-        filled(made, TYPE),
-        *_narrowing(made, functions[0]),
-        *(
+    return {
+        "tables": "\n".join([f"enum {{ {listed} }};\n", *tables.values(), *axes.values()]),
+        "axes": axes,
+        "functions": [
             text
             for number, each in enumerate(made.steps.sampled)
             if each is not None
             for text in (*_settling(made, number), _sampling(made, number)[0])
-        ),
-    ]
-
-
-def _narrowing(made: CFilter, sampled: SampledFunction) -> list[str]:
-    """Write the functions that keep angles of samples within half a turn; [] if there are no angles."""
-    if not sampled.turns:
-        return []
-    first, width, times = zip(*sampled.turns, strict=True)
-    number = made.precision.number
-    words = {
-        "TURNS": str(len(first)),
-        "FIRST": ", ".join(map(str, first)),
-        "WIDTH": ", ".join(map(str, width)),
-        "TIMES": ", ".join(map(number, times)),
-        "UNIFORM_RAD": number(UNIFORM_RAD),
-        "QUARTER_RAD": number(QUARTER_RAD),
-        "WIDE_RAD": number(WIDE_RAD),
-        "HALF_RAD": number(np.pi),
+        ],
+        **_turns(made, functions[0]),
     }
-    text = re.sub(r"\b(" + "|".join(words) + r")\b", lambda found: words[found[0]], NARROWING)
-    return [filled(made, text)]
+
+
+def _turns(made: CFilter, sampled: SampledFunction) -> dict[str, Any]:
+    """List the angles of samples, which are kept within half a turn, with the limits."""
+    first, width, times = zip(*sampled.turns, strict=True) if sampled.turns else ((), (), ())
+    limits = {
+        "uniform_rad": UNIFORM_RAD,
+        "quarter_rad": QUARTER_RAD,
+        "wide_rad": WIDE_RAD,
+        "half_rad": np.pi,
+    }
+    number = made.precision.number
+    return {
+        "turns": len(first),
+        "first": ", ".join(map(str, first)),
+        "width": ", ".join(map(str, width)),
+        "times": ", ".join(map(number, times)),
+        **{name: number(limit) for name, limit in limits.items()},
+    }
 
 
 def _table(made: CFilter, sampled: SampledFunction) -> str:
@@ -259,7 +74,7 @@ def _table(made: CFilter, sampled: SampledFunction) -> str:
         ", ".join(number(float(each)) for each in sampled.weights[first : first + 4])
         for first in range(0, count, 4)
     )
-    text = f"""/* Samples of N(0, I) in {size} dimensions, and their weights. */
+    return f"""/* Samples of N(0, I) in {size} dimensions, and their weights. */
 static const REAL points_{size}[{count}][{size}] = {{
 {rows}
 }};
@@ -267,7 +82,6 @@ static const REAL weights_{size}[{count}] = {{
     {weights}
 }};
 """
-    return made.precision.text(text)
 
 
 def _axes_table(sampled: SampledFunction) -> str:
@@ -358,7 +172,7 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
     call = ", ".join([*(each for _, each in needed), "&samples"])
     what = "the motion gives" if number == 0 else f"{name} measures"
     head = f"/* What {what} at samples, and the mean of it. */\nstatic void sample_{name}({typed})\n{{\n"
-    return filled(made, head + text + "}\n"), f"sample_{name}({call});"
+    return head + text + "}\n", f"sample_{name}({call});"
 
 
 def _in_loop(
@@ -419,4 +233,4 @@ def _settling(made: CFilter, number: int) -> list[str]:
         "/* The centre becomes the mean of the values: their deviations from it sum to zero. */\n"
         f"static void settle_{name}(drawn_samples *samples)\n{{\n"
     )
-    return [filled(made, head + body(lines) + "}\n")]
+    return [head + body(lines) + "}\n"]

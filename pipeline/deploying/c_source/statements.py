@@ -4,9 +4,6 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from fuselog.pipeline.deploying.c_source.names import CFilter, identifier
-from fuselog.pipeline.deploying.c_source.products import (
-    columns_text,
-)
 from fuselog.replay.inference.linear_algebra.manifold import is_flat, manifold_blocks
 from fuselog.replay.inference.step_graphs import Step
 from fuselog.replay.tracing.graph import INPUT, Node, needed
@@ -119,6 +116,12 @@ def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
             if row > column[0]:
                 calls.append(f"{into}[{column[0]}][{row}] = {into}[{row}][{column[0]}];")
     return Loops(declared, named, calls)
+
+
+def columns_text(name: str, columns: list[list[int]], size: str) -> str:
+    """Write the table that lists columns row by row; see covariance.c."""
+    rows = ", ".join("{" + ", ".join(map(str, [*row, -1])) + "}" for row in columns)
+    return f"static const signed char {name}[{size}][T + 1] = {{{rows}}};"
 
 
 def entries(step: Step, array: str) -> dict[str, Node]:

@@ -2,10 +2,7 @@
 
 import re
 
-from fuselog.pipeline.deploying.c_source import factors
-from fuselog.pipeline.deploying.c_source.algebra import ALGEBRA, COMMON, ITERATE, UPDATE
-from fuselog.pipeline.deploying.c_source.header import update_signature
-from fuselog.pipeline.deploying.c_source.names import CFilter, filled
+from fuselog.pipeline.deploying.c_source.names import CFilter
 from fuselog.pipeline.deploying.c_source.samples import moments_call, sampling_call, weighed
 from fuselog.pipeline.deploying.c_source.statements import (
     Inputs,
@@ -18,30 +15,28 @@ from fuselog.pipeline.deploying.c_source.statements import (
     retriangulates,
     turned_axes,
 )
-from fuselog.replay.inference.kalman.iterated_update import SETTLED
 from fuselog.replay.tracing.c_text import c_lines
 
 
-def correcting_text(made: CFilter) -> list[str]:
+def corrections(made: CFilter) -> list[str]:
     """Write the function that corrects the state and, for a curved state, one for its curvature."""
     if not made.sensors:
         return []
     step, direction = made.steps.correct, made.steps.direction
-    carried = "factor" if made.is_root else "covariance"
     texts = []
     if direction is not None:
         names, declared = Inputs(made, "").names(direction)
-        text = "/* Finds how the state changes in the direction in which it is curved. */\n"
-        text += "static void bend(NAME *filter, REAL slope[T])\n{\n"
-        text += body([*declared, "REAL a[T];"])
-        text += body(c_lines(entries(direction, "a"), names, made.precision))
-        texts.append(
-            filled(made, text + f"    find_slope((const REAL(*)[T])filter->{carried}, a, slope);\n}}\n")
+        head = (
+            "/* Finds how the state changes in the direction in which it is curved. */\n"
+            "static void bend(NAME *filter, REAL slope[T])\n{\n"
         )
+        lines = c_lines(entries(direction, "a"), names, made.precision)
+        find = f"find_slope((const REAL(*)[T])filter->{made.carried}, a, slope);"
+        texts.append(head + body([*declared, "REAL a[T];", *lines, find]) + "}\n")
     names, declared = Inputs(made, "").names(step, "step", "slope")
     named, assigned = moved_state(made, step)
     if step.has("F"):
-        t, call = made.tangent, f"propagate(filter->{carried}, (const REAL(*)[T])F, columns_of_F);"
+        t, call = made.tangent, f"propagate(filter->{made.carried}, (const REAL(*)[T])F, columns_of_F);"
         if made.is_root:
             call = f"carry(filter, (const REAL(*)[T])F, columns_of_F, {t}, &found);"
             declared = ["factorisation found;", *declared]
@@ -50,34 +45,22 @@ def correcting_text(made: CFilter) -> list[str]:
         declared = [*loops.declared, *declared]
         named |= loops.named
         assigned = [*loops.calls, *assigned]
-    assigned += [f"turn(filter->{carried}, step, {at});" for at in turned_axes(made)]
+    assigned += [f"turn(filter->{made.carried}, step, {at});" for at in turned_axes(made)]
     assigned += ["retriangulate(filter);"] if made.is_root and retriangulates(made) else []
     head = (
         "/* Moves the state by a step of its tangent space, and the covariance with it. */\n"
         "static void correct(NAME *filter, const REAL step[T], const REAL slope[T])\n{\n"
     )
     lines = c_lines(named, names, made.precision)
-    text = filled(made, head + body(declared) + body(lines) + body(assigned)) + "}\n"
-    return [*texts, _bending(made, text)]
+    return [*texts, head + body([*declared, *lines, *assigned]) + "}\n"]
 
 
-def _bending(made: CFilter, text: str) -> str:
+def bent(made: CFilter, text: str) -> str:
     """Write the calls for curvature, or remove them if the state is not curved."""
     if made.steps.direction is not None:
-        return text.replace("FIND_SLOPE;", filled(made, "REAL slope[T];\n    bend(filter, slope);"))
+        return text.replace("FIND_SLOPE;", f"{made.precision.real} slope[T];\n    bend(filter, slope);")
     text = re.sub(r"\n *FIND_SLOPE;", "", text)
     return re.sub(r",\s*(const \w+ )?slope(\[\w+\])?(?=[,)])", "", text)
-
-
-def algebra_text(made: CFilter) -> list[str]:
-    """Write the part of an update that all sensors share."""
-    if not made.sensors:
-        return []
-    if made.is_root:
-        return [filled(made, COMMON), _bending(made, filled(made, factors.UPDATE))]
-    settled = made.precision.number(1e-6 if made.precision.ending else SETTLED)
-    own = ITERATE.replace("LEAST_CHANGE", settled) if made.steps.is_iterated else UPDATE
-    return [filled(made, COMMON), filled(made, ALGEBRA), _bending(made, filled(made, own))]
 
 
 def update_text(made: CFilter, number: int) -> str:
@@ -98,7 +81,10 @@ def update_text(made: CFilter, number: int) -> str:
         f"if (!{usable})",
         "    return NAME_BAD_INPUT;",
     ]
-    head = f"{update_signature(name)}\n{{\n"
+    head = (
+        f"NAME_outcome NAME_update_{name}(NAME *filter, const REAL *data,\n"
+        "    const NAME_parameters *parameters, NAME_innovation *innovation)\n{\n"
+    )
     gate = f"&parameters->{name}.gate, innovation"
     if made.steps.is_iterated:
         calls = [
@@ -115,8 +101,8 @@ def update_text(made: CFilter, number: int) -> str:
             "}",
             "return finished(filter, outcome, innovation);",
         ]
-        own = _bending(made, filled(made, head + body([*begin, *calls]) + "}\n"))
-        return _linearise(made, name, body([*loops.declared, *lines])) + own
+        own = head + body([*begin, *calls]) + "}\n"
+        return _linearise(name, body([*loops.declared, *lines])) + own
     if made.is_root:
         sampled = made.steps.sampled[number + 1]
         columns = made.tangent if sampled is None else len(sampled.points)
@@ -134,7 +120,7 @@ def update_text(made: CFilter, number: int) -> str:
             f"                           {gate});",
         ]
     end.append("return finished(filter, outcome, innovation);")
-    return filled(made, head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n")
+    return head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n"
 
 
 def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
@@ -171,7 +157,7 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
     return loops._replace(declared=[*loops.declared, *declared]), lines
 
 
-def _linearise(made: CFilter, name: str, text: str) -> str:
+def _linearise(name: str, text: str) -> str:
     """Write the innovation of a sensor that is linearised in every iteration."""
     head = f"""/* The innovation about the mean, of the sensor linearised at the mean moved by a step. */
 static void linearise_{name}(NAME *filter, const REAL step[T], const REAL slope[T], const REAL *data,
@@ -179,4 +165,4 @@ static void linearise_{name}(NAME *filter, const REAL step[T], const REAL slope[
 {{
 """
     unused = "" if "parameters->" in text else "    (void)parameters;\n"
-    return _bending(made, filled(made, head + unused + text) + "}\n\n")
+    return head + unused + text + "}\n\n"

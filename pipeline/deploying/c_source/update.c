@@ -1,32 +1,5 @@
-"""The Kalman update in C, with the same operations as `fuselog.replay.inference.kalman.update`.
-
-`UPDATE` is the update of all filters except iterated filters, which use `ITERATE`. Both call `ALGEBRA`.
-Square-root forms have their own update and use only `COMMON`.
-
-NAME, T and M are placeholders for the filter's name, the size of its tangent space, and the largest
-number of components of a sensor. REAL and the suffix _S are placeholders for the precision.
-"""
-
-CHOLESKY = """/* A = L L' in place, for the first `size` rows and columns; 0 if A is indefinite. */
-static int cholesky(REAL *A, int stride, int size)
-{
-    for (int column = 0; column < size; column++)
-        for (int row = column; row < size; row++) {
-            REAL entry = A[row * stride + column];
-            for (int k = 0; k < column; k++)
-                entry -= A[row * stride + k] * A[column * stride + k];
-            if (row > column)
-                A[row * stride + column] = entry / A[column * stride + column];
-            else if (entry > 0.0_S)
-                A[row * stride + row] = sqrt_S(entry);
-            else
-                return 0;
-        }
-    return 1;
-}
-"""
-
-COMMON = """\
+/*# The Kalman update, with the same operations as `fuselog.replay.inference.kalman.update`. `iterate` is the
+ * update of iterated filters. Square-root forms share only the functions before `update`. #*/
 /* The factor on the covariance of an innovation that the options of robust updates give. */
 static REAL inflation(REAL nis, int size, const NAME_gate *gate)
 {
@@ -109,9 +82,66 @@ static void keep(NAME_innovation *innovation, int components, const int *places,
                     innovation->covariance[places[j]][places[i]] = S[i][j];
     }
 }
-"""
 
-ALGEBRA = """/* Moves the measured components to the front; returns their number. */
+/*% if made.is_root %*/
+/* Updates by rows that hold the values and behind them the state, in `columns` columns. The factor of
+ * these and of the noise holds that of S, K L and that of P: see Kaminski, Bryson and Schmidt, IEEE TAC
+ * 16(6), 1971. A component that is NaN counts as one of a noise of its own, which is as predicted. */
+static int update(NAME *filter, int sensor, int components, int columns, const int *places, REAL v[M],
+                  REAL noise[M][M], factorisation *found, const NAME_gate *gate,
+                  NAME_innovation *innovation)
+{
+    REAL S[M][M], step[T], nis = 0.0_S, wider;
+    int size = 0;
+    for (int i = 0; i < components; i++) {
+        if (!isnan(v[i])) {
+            size++;
+            continue;
+        }
+        for (int k = 0; k < columns; k++)
+            found->rows[i][k] = 0.0_S;
+        for (int k = 0; k < components; k++)
+            noise[i][k] = noise[k][i] = 0.0_S;
+        noise[i][i] = 1.0_S;
+    }
+    if (!factorise(found, components + T, columns, components, &noise[0][0], M))
+        return NAME_NOT_POSITIVE_DEFINITE;
+    square(&found->factor[0][0], ROWS, components, &S[0][0], M);
+    keep(innovation, components, places, v, (const REAL(*)[M])S);
+    for (int i = 0; i < components; i++) {
+        if (!(found->factor[i][i] > 0.0_S))
+            return NAME_NOT_POSITIVE_DEFINITE;
+        if (isnan(v[i]))
+            v[i] = 0.0_S;
+    }
+    for (int i = 0; i < components; i++) {
+        for (int k = 0; k < i; k++)
+            v[i] -= found->factor[i][k] * v[k];
+        v[i] /= found->factor[i][i];
+        nis += v[i] * v[i];
+    }
+    innovation->nis = nis;
+    innovation->is_accepted = is_used(filter, sensor, size, nis, gate);
+    if (!innovation->is_accepted)
+        return NAME_WELL;
+    wider = inflation(nis, size, gate);
+    for (int row = 0; row < T; row++) {
+        step[row] = 0.0_S;
+        for (int i = 0; i < components; i++)
+            step[row] += found->factor[components + row][i] * v[i] / wider;
+        for (int k = 0; k < components + T; k++)
+            found->rows[row][k] = found->factor[components + row][k];
+    }
+    for (int k = 0; k < components + T; k++)
+        found->weights[k] = k < components ? 1.0_S - 1.0_S / wider : 1.0_S;
+    orthogonalise(found, T, components + T);
+    take_factor(filter, found);
+    FIND_SLOPE;
+    correct(filter, step, slope);
+    return NAME_WELL;
+}
+/*% else %*/
+/* Moves the measured components to the front; returns their number. */
 static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
 {
     int size = 0;
@@ -186,31 +216,8 @@ static void downdate(REAL P[T][T], int size, const REAL W[T][M])
             P[row][column] = P[column][row] = entry;
         }
 }
-"""
 
-UPDATE = """\
-/* x (+) K v and P - K S K'. The gain K is not formed: with S = L L' and W = C L^-T, K v is W L^-1 v,
- * and K S K' is W W'. Components that are NaN in v are left out; v, S and C are used up. */
-static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M][M], REAL C[T][M],
-                  const NAME_gate *gate, NAME_innovation *innovation)
-{
-    const int size = drop_missing(components, v, S, C);
-    REAL step[T];
-    if (!whiten(size, v, S, &innovation->nis))
-        return NAME_NOT_POSITIVE_DEFINITE;
-    innovation->is_accepted = is_used(filter, sensor, size, innovation->nis, gate);
-    if (!innovation->is_accepted)
-        return NAME_WELL;
-    inflate(size, v, S, inflation(innovation->nis, size, gate));
-    find_step(size, v, S, C, step);
-    downdate(filter->covariance, size, (const REAL(*)[M])C);
-    FIND_SLOPE;
-    correct(filter, step, slope);
-    return NAME_WELL;
-}
-"""
-
-ITERATE = """\
+/*% if made.steps.is_iterated %*/
 /* One iterate of Gauss-Newton on the posterior: finds the step of an innovation that was linearised at
  * the step before; UNSETTLED while they differ. The gate and the weight of a measurement are decided at
  * the first, whose step before is zero. Bell and Cathey, IEEE TAC 38(2), 1993. */
@@ -236,10 +243,31 @@ static int iterate(NAME *filter, int sensor, int components, int iteration, REAL
     for (int row = 0; row < T; row++)
         if (fabs_S(step[row] - before[row]) > change)
             change = fabs_S(step[row] - before[row]);
-    if (change >= LEAST_CHANGE && iteration + 1 < ITERATIONS)
+    if (change >= ${least_change} && iteration + 1 < ITERATIONS)
         return UNSETTLED;
     downdate(filter->covariance, size, (const REAL(*)[M])C);
     correct(filter, step, slope);
     return NAME_WELL;
 }
-"""
+/*% else %*/
+/* x (+) K v and P - K S K'. The gain K is not formed: with S = L L' and W = C L^-T, K v is W L^-1 v,
+ * and K S K' is W W'. Components that are NaN in v are left out; v, S and C are used up. */
+static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M][M], REAL C[T][M],
+                  const NAME_gate *gate, NAME_innovation *innovation)
+{
+    const int size = drop_missing(components, v, S, C);
+    REAL step[T];
+    if (!whiten(size, v, S, &innovation->nis))
+        return NAME_NOT_POSITIVE_DEFINITE;
+    innovation->is_accepted = is_used(filter, sensor, size, innovation->nis, gate);
+    if (!innovation->is_accepted)
+        return NAME_WELL;
+    inflate(size, v, S, inflation(innovation->nis, size, gate));
+    find_step(size, v, S, C, step);
+    downdate(filter->covariance, size, (const REAL(*)[M])C);
+    FIND_SLOPE;
+    correct(filter, step, slope);
+    return NAME_WELL;
+}
+/*% endif %*/
+/*% endif %*/
