@@ -327,7 +327,8 @@ def bind_model(
                 f"{lacking}, which this method needs"
             )
         own = BoundModel(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
-        numbers = settings_of(label, own, found, parameters)
+        assumed = assumed_of(label, own, found, parameters)
+        numbers = settings_of(label, own, found, parameters, assumed)
         if (model, own.sensors) not in bound_models:
             try:
                 bound_models[model, own.sensors] = bound_model_of(*augmented_model(own, added))
@@ -342,7 +343,6 @@ def bind_model(
         control = [found.control.name] if found.control else []
         read = (*found.fallbacks, *found.sensors)
         streams = (*control, *(topic.name for _, topic in read))
-        assumed = assumed_of(label, own, found, parameters)
         initialization = Initializer(name, found, own, numbers, assumed).initialization
         static = filtering.static(topics)
         priors = {found.prior.name: model.state}

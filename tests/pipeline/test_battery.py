@@ -85,13 +85,13 @@ def test_the_fault_is_named_first(cell: battery.Cell) -> None:
     assert low < innovations["nis"].sum() < high, found["setting"]
 
 
-NOISIEST = [each for each in consistent.FalseCausesOptions().ratios() if each.to_compass in (1.0, 10.0)]
+NOISIEST = [each for each in consistent.FalseCausesOptions().ratios() if each.to_compass == 10.0]
 
 
 @pytest.mark.paper
 @pytest.mark.parametrize("ratios", NOISIEST, ids=str)
 def test_the_noise_of_the_wheels_is_no_cause(ratios: consistent.Ratios) -> None:
-    """It is as large as what the compass errs by, or ten times: shifted stamps would average it."""
+    """It is ten times as large as what the compass errs by: shifted stamps would average it."""
     assert not consistent.tried(ratios, 1003)["cause"]
 
 
@@ -102,13 +102,6 @@ def test_a_delay_beside_noisy_wheels_is_found() -> None:
     cause = seek(log, "ekf", OPEN, 1).causes[0]
     assert (cause.hypothesis.kind, cause.hypothesis.topic) == ("delay", FIX)
     assert cause.value == pytest.approx(0.3, abs=0.02)
-
-
-@pytest.mark.parametrize("faults", battery.PAIRS[:2], ids=" + ".join)
-@pytest.mark.paper
-def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
-    """With one undone the other is still so large that a noise thousands of times larger fits."""
-    assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
 
 
 def test_pairs_and_triples_are_of_faults_that_a_log_tells_apart() -> None:
@@ -186,17 +179,15 @@ def test_faults_at_once_are_counted() -> None:
 
 
 @pytest.mark.paper
-@pytest.mark.parametrize("has_gyro", [False, True])
-def test_several_ordinary_faults_are_fitted_together(*, has_gyro: bool) -> None:
+def test_several_ordinary_faults_are_fitted_together() -> None:
     """All are named, none of them as a noise; all values are in their intervals.
 
     The fixes are so good that 80 s tell as much as 10 minutes.
     """
-    log = several(1, 80.0, has_gyro=has_gyro, has_prior=True, fix_sigma_m=0.12)
-    turn = (GYRO, "turn_rate_z_radps") if has_gyro else (ODOMETRY, "turn_radps")
+    log = several(1, 80.0, has_gyro=True, has_prior=True, fix_sigma_m=0.12)
     planted = {
         ("factor or sign", ODOMETRY, "forward_mps"): 1.03,
-        ("bias or turned frame", *turn): 0.01,
+        ("bias or turned frame", GYRO, "turn_rate_z_radps"): 0.01,
         ("delay", FIX, ""): 0.25,
         ("parameter", "lever_x_m", "lever_x_m"): 0.40,
         ("parameter", "lever_x_m", "lever_y_m"): -0.15,

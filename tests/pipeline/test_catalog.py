@@ -1,12 +1,10 @@
 """Catalogs of logs, conditions on them, and commands over the logs that they select."""
 
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pandas as pd
@@ -19,6 +17,7 @@ from fuselog.pipeline.api.over_logs import measured
 from fuselog.pipeline.logs import cataloguing
 from fuselog.pipeline.output.results import Outcome
 from fuselog.pipeline.runs.batches import Batch
+from fuselog.pipeline.runs.checkpoints import Checkpoints
 from fuselog.pipeline.selecting.catalog import read_catalog, rows_in, schema
 from fuselog.pipeline.selecting.where import rows_where
 from fuselog.recorders.errors import BadInput
@@ -460,23 +459,25 @@ def test_a_full_disk_ends_a_selection_and_keeps_its_batches(
 
 
 @pytest.mark.paper
-def test_a_killed_worker_changes_no_byte(drives: Path, fuselog: Callable[..., Said]) -> None:
-    for number in range(40):
+def test_a_killed_worker_changes_no_byte(
+    drives: Path, monkeypatch: pytest.MonkeyPatch, fuselog: Callable[..., Said]
+) -> None:
+    for number in range(6):
         shutil.copy(drives / "robot0" / "drive4.mcap", drives / f"copy{number}.mcap")
     line = ("replay", "drives", "-e", "ekf", "--group", "folder", "--out", "out")
     whole = contents_of((*line, "--workers", "1"), fuselog)
     killed: list[BaseProcess] = []
+    write = Checkpoints.write
 
-    def kill() -> None:
-        while not list(Path("out.unfinished").glob("*.bin")):
-            time.sleep(0.002)
-        killed.extend(active_children()[:1])
-        killed[0].kill()
+    def written(checkpoints: Checkpoints, key: str, left: bytes) -> None:
+        write(checkpoints, key, left)
+        if not killed:
+            killed.extend(active_children()[:1])
+            killed[0].kill()
 
-    thread = Thread(target=kill)
-    thread.start()
+    monkeypatch.setattr(Checkpoints, "write", written)
     found = contents_of((*line, "--workers", "2"), fuselog)
-    thread.join()
+    killed[0].join()
     assert killed[0].exitcode == -9
     assert found == whole
 

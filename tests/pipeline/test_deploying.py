@@ -54,7 +54,6 @@ def recorded(tmp_path: Path, scenario: str, **parameters: Any) -> Path:
     [
         ("landmarks", ROBOT, "ekf", False),
         ("landmarks", ROBOT, "iekf", False),
-        ("landmarks", ROBOT, "ukf", False),
         ("landmarks", ROBOT, "sqrt:ukf", True),
         ("landmarks", {**ROBOT, "prior_sigma_rad": 3.0}, "ukf", False),
         ("landmarks", {**ROBOT, "prior_sigma_rad": 3.0}, "sqrt:ukf", False),

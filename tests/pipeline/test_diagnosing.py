@@ -172,8 +172,13 @@ def first(source: fl.MemorySource, **settings: float) -> Any:
         return fl.diagnose(source, "ekf", set={**OPEN, **settings}).sentences[0]
 
 
-def test_nothing_is_found_where_nothing_is_wrong(run: fl.MemorySource) -> None:
-    found = fl.diagnose(run, "ekf")
+@pytest.fixture(scope="module")
+def found(run: fl.MemorySource) -> fl.Diagnosis:
+    """What is said of it."""
+    return fl.diagnose(run, "ekf")
+
+
+def test_nothing_is_found_where_nothing_is_wrong(found: fl.Diagnosis) -> None:
     assert found.sentences == []
     told = f"nothing found: none of the {found.hypotheses} faults tried reaches"
     assert found.told[0].startswith(told)
@@ -568,11 +573,13 @@ def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySour
     fl.write(log, run)
 
 
-def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource) -> None:
+def test_without_truth_errors_are_left_out_and_that_is_said(
+    run: fl.MemorySource, found: fl.Diagnosis
+) -> None:
     streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/truth")}
-    found = fl.diagnose(replace(run, streams=streams), "ekf")
-    assert any(note.startswith("no truth: errors and NEES are missing") for note in found.notes)
-    assert any(note.startswith("there is only one run") for note in fl.diagnose(run, "ekf").notes)
+    without = fl.diagnose(replace(run, streams=streams), "ekf")
+    assert any(note.startswith("no truth: errors and NEES are missing") for note in without.notes)
+    assert any(note.startswith("there is only one run") for note in found.notes)
 
 
 @pytest.mark.parametrize(("bias_rad", "sides"), [(0.0, 0), (0.006, 1)])

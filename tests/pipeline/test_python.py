@@ -321,14 +321,14 @@ def test_a_component_that_was_not_measured_is_nan(recordings: list[fl.MemorySour
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     "method",
-    ["smoother:ekf:lag=500ms", "smoother:iterated", "particles:50", "bound:smoother", "imm:ekf"],
+    ["smoother:ekf:lag=500ms", "smoother:iterated", "particles:10", "bound:smoother", "imm:ekf"],
 )
 def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.MemorySource]) -> None:
     """What is not registered, tied to a method by its name, is replayed as the command replays it."""
     from fuselog.replay.families.vehicles.vehicle_kalman import VEHICLE
 
     has_modes = method.startswith("imm")
-    logs = [fl.record("manoeuvres", **SHORT)] if has_modes else recordings
+    logs = [fl.record("manoeuvres", **SHORT)] if has_modes else recordings[:1]
     mine = fl.modelled(replace(VEHICLE if has_modes else robot(), summary="mine"), method)
     assert str(mine).startswith("mine, ")
     assert str(mine).endswith(f"({method})")

@@ -7,6 +7,7 @@ import shutil
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.optimise import DROP_95, Cost, curvature
 from fuselog.pipeline.output.results import read_result
-from fuselog.pipeline.runs.executors import InlineExecutor
+from fuselog.pipeline.runs.executors import InlineExecutor, PoolFactory, WorkerPool
 from fuselog.pipeline.tuning.confidence import SearchOutcome, confidence
 from fuselog.pipeline.tuning.objective import Best, Objective
 from fuselog.pipeline.tuning.search import Coordinates, least, scanned
@@ -533,10 +534,20 @@ def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
         fl.tune(seen, "ekf", "sigma_range_m", executor=Dying(), **given)
 
 
-@pytest.mark.paper
-def test_processes_tune_as_the_command_says(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+def test_processes_tune_as_the_command_says(
+    world: Path, tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two are asked for; what would come and go is pickled here."""
+    asked: list[int] = []
+
+    def opened(count: int) -> PoolFactory:
+        asked.append(count)
+        return lambda: nullcontext(WorkerPool(Away(), count))
+
+    monkeypatch.setattr("fuselog.pipeline.runs.executors.processes", opened)
     tune = ("tune", world / "log.mcap", "-e", "ekf", "--free", "sigma_range_m", "--json", "--out")
     shared = fuselog(*tune, tmp_path / "shared", "--workers", "2").json
+    assert asked == [2]
     assert shared["parameters"] == fuselog(*tune, tmp_path / "alone").json["parameters"]
 
 

@@ -34,7 +34,7 @@ def path(tmp_path_factory):
 
 @pytest.mark.paper
 @pytest.mark.parametrize("schema", SCHEMAS.values(), ids=list(SCHEMAS))
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(data=st.data(), compression=st.sampled_from(COMPRESSIONS))
 def test_every_schema_reads_back_bit_for_bit(path, schema, data, compression):
     """Infinities, zeros, NaN where allowed, empty streams and vectors, wide vectors: all are kept."""

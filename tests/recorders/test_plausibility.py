@@ -128,7 +128,7 @@ def test_no_delay_is_named_that_is_a_period_off(
 ) -> None:
     """Nor one that is off by more than is stated; at random, most drives tell theirs."""
     named = 0
-    for seed in range(4):
+    for seed in range(4 if np.isinf(period_s) else 2):
         found = compared(winding(seed, period_s, late_s, speed_period_s))
         assert {each.kind for each in found} <= {"delay"}
         for each in found:

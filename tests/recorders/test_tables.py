@@ -627,21 +627,21 @@ def test_blocks_make_no_difference(
 
 
 @pytest.mark.paper
-def test_a_million_rows_in_five_seconds(tmp_path: Path) -> None:
+def test_two_hundred_thousand_rows_in_a_second(tmp_path: Path) -> None:
     """Of CPU time, all threads together, the log included."""
-    count = 1_000_000
+    count = 200_000
     numbers = np.random.default_rng(0).normal(size=(count, 6)).round(6)
     columns = {
         "time": 1756402240 + np.arange(count) / 200,
         **dict(zip(("ax", "ay", "az", "gx", "gy", "gz"), numbers.T, strict=True)),
     }
-    pyarrow.csv.write_csv(pa.table(columns), tmp_path / "million.csv")
+    pyarrow.csv.write_csv(pa.table(columns), tmp_path / "many.csv")
     (tmp_path / "mapping.toml").write_text(INERTIAL)
     begin = time.process_time()
     values = {"mapping": str(tmp_path / "mapping.toml")}
-    _, messages = import_log("table", tmp_path / "million.csv", values, tmp_path / "log.mcap")
+    _, messages = import_log("table", tmp_path / "many.csv", values, tmp_path / "log.mcap")
     assert messages == count
-    assert time.process_time() - begin < 5
+    assert time.process_time() - begin < 1
 
 
 BAD = [

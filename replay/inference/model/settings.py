@@ -62,7 +62,11 @@ class TracedParameters:
 
 
 def settings_of(
-    label: str, bound_model: BoundModel, found: Found, parameters: ModelParameters
+    label: str,
+    bound_model: BoundModel,
+    found: Found,
+    parameters: ModelParameters,
+    assumed: Mapping[str, float],
 ) -> Floats:
     """Collect the numbers (1 + sensors, fields) of motion and sensors from parameters and channels.
 
@@ -74,6 +78,7 @@ def settings_of(
         bound_model: the bound model, with the sensors of the log.
         found: its topics.
         parameters: parameters given by the user.
+        assumed: parameters that are assumed, see `assumed_of`.
 
     Raises BadInput if no channel states a needed number, if a channel states an invalid value of a
     parameter, or if the model does not match its declarations.
@@ -82,7 +87,6 @@ def settings_of(
     names = number_fields(model.parameters)
     given = {name: getattr(parameters, name) for name in names}
     everything = _stating(found)
-    assumed = assumed_of(label, bound_model, found, parameters)
     given |= {name: number for name, number in assumed.items() if given[name] is None}
     given |= _of_origin(bound_model, found, parameters)
     needed = _needed(f"estimator {label}", bound_model, tuple(given.items()))

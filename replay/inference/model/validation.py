@@ -171,14 +171,15 @@ def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
 def _check(
     where: str, function: ModelFunction, arguments: tuple[AnyArgument, ...], sizes: tuple[int, ...]
 ) -> None:
-    what = f"{where}: {place_of(function)}"
     with np.errstate(all="ignore"):
         try:
             found = function(*arguments)
         except Exception as error:
+            what = f"{where}: {place_of(function)}"
             raise BadInput(f"{what} raised {type(error).__name__}: {error}") from error
-    wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
+    if isinstance(found, tuple) and len(found) in sizes:
+        return
+    what, wanted = f"{where}: {place_of(function)}", " or ".join(map(str, dict.fromkeys(sizes)))
     if not isinstance(found, tuple):
         raise BadInput(f"{what} returns a {type(found).__name__}; return a tuple of {wanted} components")
-    if len(found) not in sizes:
-        raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")
+    raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")
