@@ -87,13 +87,13 @@ def test_estimates_last_as_long_as_any_of_them_is_referred_to(collect: Callable[
     assert not place.exists()
 
 
-def test_importing_is_quick_and_brings_nothing_heavy() -> None:
+def test_importing_brings_nothing_heavy() -> None:
+    """So that it is quick; `make bench` measures commands."""
     done = python(
-        "import time; begin = time.process_time(); import fuselog; took = time.process_time() - begin\n"
-        "print(took, *{'numba', 'numpy', 'pandas', 'rerun', 'matplotlib'} & sys.modules.keys())"
+        "import fuselog\n"
+        "print(*{'numba', 'numpy', 'pandas', 'rerun', 'matplotlib', 'pydantic'} & sys.modules.keys())"
     )
-    took_s, *heavy = done.stdout.split()
-    assert (float(took_s) < 0.1, heavy) == (True, [])
+    assert done.stdout.split() == []
 
 
 def test_every_name_of_the_stub_is_there() -> None:

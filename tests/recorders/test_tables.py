@@ -3,15 +3,12 @@
 import gzip
 import json
 import struct
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.csv
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -624,24 +621,6 @@ def test_blocks_make_no_difference(
     for topic, stream in whole.items():
         assert_array_equal(parts[topic].publish_time_ns, stream.publish_time_ns)
     assert_array_equal(parts["/truth"]["state"], whole["/truth"]["state"])
-
-
-@pytest.mark.paper
-def test_two_hundred_thousand_rows_in_a_second(tmp_path: Path) -> None:
-    """Of CPU time, all threads together, the log included."""
-    count = 200_000
-    numbers = np.random.default_rng(0).normal(size=(count, 6)).round(6)
-    columns = {
-        "time": 1756402240 + np.arange(count) / 200,
-        **dict(zip(("ax", "ay", "az", "gx", "gy", "gz"), numbers.T, strict=True)),
-    }
-    pyarrow.csv.write_csv(pa.table(columns), tmp_path / "many.csv")
-    (tmp_path / "mapping.toml").write_text(INERTIAL)
-    begin = time.process_time()
-    values = {"mapping": str(tmp_path / "mapping.toml")}
-    _, messages = import_log("table", tmp_path / "many.csv", values, tmp_path / "log.mcap")
-    assert messages == count
-    assert time.process_time() - begin < 1
 
 
 BAD = [
