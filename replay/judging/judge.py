@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from fuselog.recorders.log import schemas
 from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.registry import available, foreign_code, load
-from fuselog.replay.engine.streams.blocks import Ragged
-from fuselog.replay.engine.streams.sources import Source
+from fuselog.replay.engine.streams.blocks import Findings, Ragged
+from fuselog.replay.engine.streams.sources import MemorySource, Source
 from fuselog.replay.judging.consistency.bounds import Bounds
 from fuselog.replay.judging.consistency.conditioning import Conditioning, conditioning_of
 from fuselog.replay.judging.diagnostics import LEAVES, Diagnostics
@@ -100,6 +100,8 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
+        are_in_memory = all(isinstance(source, MemorySource) for source in sources)
+        self._true_states = Findings(1) if are_in_memory else None
         runs = JudgedRuns(sources, self._truths, gap_limit_s, first_run)
         self._kinds: dict[str, KindJudge] = {
             name: load("judges", name, type)(runs) for name in available("judges")
@@ -174,6 +176,7 @@ class Judge:
             steps=begun,
             first_run=self._first_run,
             first_fixes=self._first_fixes,
+            shared=self._true_states,
         )
         self._steps[topic] = begun + np.diff(rows.offsets)
         if errors is None:
@@ -197,6 +200,7 @@ class Judge:
         """Release the runs after judging; only sums are left, which can be pickled."""
         self._doubts = self.doubts
         self._sources, self._truths, self._kinds, self._on_errors = (), [], {}, None
+        self._true_states = None
         self._steps.clear()
         for of_topic in self._uninformed.values():
             of_topic.first.clear()

@@ -9,6 +9,7 @@ Estimation with Applications to Tracking and Navigation, 5.4.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from fuselog.recorders.log.planes import Origin
 from fuselog.recorders.models.orientation import heading
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import over_columns
-from fuselog.replay.engine.streams.blocks import Ragged, run_of_rows
+from fuselog.replay.engine.streams.blocks import Findings, Ragged, run_of_rows
 from fuselog.replay.engine.streams.planes import into_plane_of
 from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.engine.vectors.components import (
@@ -240,6 +241,7 @@ def errors_of(
     steps: NDArray[np.int64] | None = None,
     first_run: int = 0,
     first_fixes: FirstFixes | None = None,
+    shared: Findings | None = None,
 ) -> Errors | None:
     """Compute the errors of the Gaussian estimates of an ensemble, in components that all truths have.
 
@@ -255,6 +257,8 @@ def errors_of(
         steps: (runs,) number of earlier estimates of each run.
         first_run: number of the first run.
         first_fixes: origins of the tangent planes of estimates whose channels state no origin.
+        shared: cache of true states for estimators with the same stamps, only for truths in memory:
+            others are read along with every estimator.
 
     Raises BadInput if the stream does not state its components, or if a truth states another kind for
     one of the components.
@@ -271,22 +275,26 @@ def errors_of(
         return None
     if unlike(stream, sources, first_fixes):
         return None
-    planes = planes_of(stream, len(sources), first_fixes)
+    is_aligned = ALIGNED in stream.metadata
+    planes = [None if is_aligned else each for each in planes_of(stream, len(sources), first_fixes)]
     names, kinds = list(judged), list(judged.values())
     time_ns, offsets = stream.publish_time_ns, estimates.offsets
-    there = [
-        _truth_around(
-            truth,
-            truth_topic,
-            judged,
-            time_ns[offsets[run] : offsets[run + 1]],
-            gap_limit_s,
-            stream.topic,
-            None if ALIGNED in stream.metadata else planes[run],
-        )
-        for run, truth in enumerate(truths)
-    ]
-    truth = states_of_runs(there, time_ns, offsets, kinds, gap_limit_s)
+
+    def true_states() -> Floats:
+        cuts = zip(truths, planes, pairwise(offsets.tolist()), strict=True)
+        there = [
+            _truth_around(
+                truth, truth_topic, judged, time_ns[first:end], gap_limit_s, stream.topic, plane
+            )
+            for truth, plane, (first, end) in cuts
+        ]
+        return states_of_runs(there, time_ns, offsets, kinds, gap_limit_s)
+
+    if shared is None:
+        truth = true_states()
+    else:
+        stamps = time_ns.tobytes(), offsets.tobytes()
+        truth = shared.once((truth_topic, *judged.items(), *planes, *stamps), true_states)
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, judged, where)
     mean = stream["mean"].reshape(len(stream), len(components))

@@ -24,7 +24,7 @@ from fuselog.recorders.log import (
 )
 from fuselog.recorders.log.streams import empty_stream
 from fuselog.recorders.recording import Recording
-from fuselog.replay.engine.streams.blocks import Ragged, gather
+from fuselog.replay.engine.streams.blocks import Findings, Ragged, gather
 from fuselog.replay.engine.streams.priors import priors_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.engine.vectors.covariances import normalized_error_squared
@@ -148,6 +148,25 @@ def test_runs_together_have_the_truths_of_each_alone(data: st.DataObject):
 
 
 # Errors and NEES.
+
+
+def test_estimators_of_the_same_stamps_share_the_true_states() -> None:
+    """Other stamps, and the same stamps in other runs, have their own true states."""
+    paths = [truth([0, 2], [[0, 0, 0], [end, 4, 1]]) for end in (2, 8)]
+    truths, shared = [Truths(source(path)) for path in paths], Findings(1)
+
+    def found(*times_s: list[float]) -> object:
+        rows = gather([estimates(each, np.ones((len(each), 3)), np.eye(3)) for each in times_s])
+        alone, errors = (errors_of(rows, truths, 9.0, shared=each) for each in (None, shared))
+        assert alone is not None
+        assert errors is not None
+        assert_array_equal(errors.error, alone.error)
+        return next(iter(shared.values()))
+
+    first = found([0.5], [1.0, 1.5])
+    assert found([0.5], [1.0, 1.5]) is first
+    assert found([0.5, 1.0], [1.5]) is not first
+    assert found([0.5], [1.0, 1.6]) is not first
 
 
 def test_errors_of_a_known_case():
