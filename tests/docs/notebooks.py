@@ -11,13 +11,14 @@ FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 
-def executed(*paths: Path) -> list[Any]:
+def executed(*paths: Path, before: str = "") -> list[Any]:
     """Notebooks, run from top to bottom, each in an empty folder; raises where a cell does.
 
-    One kernel runs all, which forgets every name between two. Without the notices of what is
-    compiled, which depend on what is in the cache.
+    One kernel runs all, and code `before` them; it forgets every name between two. Without the
+    notices of what is compiled, which depend on what is in the cache.
     """
     all_in_one = nbformat.v4.new_notebook()
+    all_in_one.cells.append(nbformat.v4.new_code_cell(before))
     notebooks = [nbformat.read(path, as_version=4) for path in paths]
     with tempfile.TemporaryDirectory() as folder:
         for path, notebook in zip(paths, notebooks, strict=True):

@@ -141,7 +141,9 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name not in 
     ),
     "biometrics-sequential": Recipe("biometrics-sequential", estimators={"ratio": {"pairs": "trimmed"}}),
     "biometrics-sequential-simulated": Recipe(
-        "biometrics-sequential-simulated", parameters={"users": 120}
+        "biometrics-sequential-simulated",
+        parameters={"users": 120},
+        estimators={"ratio": {"folds": 2, "iterations": 5}},
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
     "broad-peers": Recipe("broad-peers", part="07_undisturbed_fast_rotation_B.hdf5", span_s=30.0),

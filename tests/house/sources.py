@@ -1,10 +1,12 @@
 """Gives the files of the product, each read and parsed once for all tests of the house."""
 
 import ast
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+Definition = ast.Module | ast.ClassDef | ast.FunctionDef
 PATHS = [
     path.relative_to(ROOT)
     for room in ("fuselog", "pipeline", "recorders", "replay")
@@ -23,5 +25,15 @@ def tree_of(path: Path) -> ast.Module:
 
 
 @cache
-def nodes_of(path: Path) -> list[ast.AST]:
-    return list(ast.walk(tree_of(path)))
+def definitions_of(path: Path) -> list[Definition]:
+    """The module, its classes and functions, and theirs."""
+    return list(definitions_in(tree_of(path)))
+
+
+def definitions_in(node: ast.AST) -> Iterator[Definition]:
+    """A node and what is defined in it. Most nodes are in expressions, which define nothing."""
+    if isinstance(node, Definition):
+        yield node
+    for each in ast.iter_child_nodes(node):
+        if not isinstance(each, ast.expr):
+            yield from definitions_in(each)

@@ -10,30 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.house.sources import PATHS, ROOT, tree_of
+from tests.house.sources import PATHS, ROOT, Definition, definitions_of, tree_of
 
 STUB = ast.parse((ROOT / "fuselog" / "__init__.pyi").read_text(encoding="utf-8"))
 ENTRY = re.compile(r"^    (\*{0,2}\w+(?:, \w+)*): \S", re.MULTILINE)
 ARRAY = re.compile(r"\b(Floats|Integers|Booleans|NDArray|ArrayLike|Times)\b")
-Documented = ast.Module | ast.ClassDef | ast.FunctionDef
 
 
-def documented(node: ast.AST) -> Iterator[Documented]:
-    """A node and what is defined in it. Most nodes are in expressions, which define nothing."""
-    if isinstance(node, Documented):
-        yield node
-    for each in ast.iter_child_nodes(node):
-        if not isinstance(each, ast.expr):
-            yield from documented(each)
-
-
-def section_of(node: Documented, head: str) -> str:
+def section_of(node: Definition, head: str) -> str:
     """What stands under a heading of a docstring, such as `Args`; empty where there is none."""
     _, _, after = f"\n{ast.get_docstring(node) or ''}".partition(f"\n{head}:\n")
     return re.split(r"\n(?=\S)", after)[0]
 
 
-def entries_of(node: Documented, head: str) -> set[str]:
+def entries_of(node: Definition, head: str) -> set[str]:
     return {name for names in ENTRY.findall(section_of(node, head)) for name in names.split(", ")}
 
 
@@ -63,7 +53,7 @@ def fields_of(node: ast.ClassDef) -> set[str]:
     }
 
 
-def faults_of_opening(node: Documented) -> Iterator[str]:
+def faults_of_opening(node: Definition) -> Iterator[str]:
     """What keeps the first line of a docstring from being a sentence."""
     first, *more = (ast.get_docstring(node) or "").split("\n")
     if not first:
@@ -136,7 +126,7 @@ def test_modules_and_classes_open_with_a_sentence() -> None:
     faults = [
         f"{path}: {getattr(node, 'name', 'the module')} {fault}"
         for path in PATHS
-        for node in documented(tree_of(path))
+        for node in definitions_of(path)
         if isinstance(node, ast.Module | ast.ClassDef)
         for fault in faults_of_opening(node)
     ]
@@ -158,7 +148,7 @@ def test_functions_of_arrays_say_what_they_take() -> None:
 def test_where_arguments_are_described_they_all_are() -> None:
     """And those alone; ruff's D417, which knows one name a line, is off."""
     for path in PATHS:
-        for node in documented(tree_of(path)):
+        for node in definitions_of(path):
             if isinstance(node, ast.FunctionDef) and section_of(node, "Args"):
                 described = {name.lstrip("*") for name in entries_of(node, "Args")}
                 assert described == parameters_of(node), f"{path}: {node.name} {described}"

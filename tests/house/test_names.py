@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.house import sources
-from tests.house.sources import ROOT, nodes_of, text_of
+from tests.house.sources import ROOT, definitions_of, text_of, tree_of
 
 PATHS = [path for path in sources.PATHS if path.parts[0] != "fuselog"]  # whose names are of others
 DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z]\w*)+)(?:\(.*?\))?`")
@@ -52,7 +52,7 @@ def holders() -> dict[str, set[str]]:
             *above, module = above
         for outer, inner in pairwise([*above, module]):
             found[outer].add(inner)
-        for node in nodes_of(path):
+        for node in definitions_of(path):
             if isinstance(node, ast.Module):
                 imports_count = path.name == "__init__.py"
                 kept = [
@@ -86,9 +86,8 @@ def prose_of(path: Path) -> Iterator[str]:
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT:
                 yield token.string
-    for node in nodes_of(path):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            yield ast.get_docstring(node) or ""
+    for node in definitions_of(path):
+        yield ast.get_docstring(node) or ""
 
 
 def is_there(dotted: str) -> bool:
@@ -105,11 +104,10 @@ def is_there(dotted: str) -> bool:
 
 
 def variables_of(path: Path) -> set[str]:
-    variables = {node.id for node in nodes_of(path) if isinstance(node, ast.Name)}
-    variables |= {node.arg for node in nodes_of(path) if isinstance(node, ast.arg)}
-    return variables - {
-        node.name for node in nodes_of(path) if isinstance(node, ast.ClassDef | ast.alias)
-    }
+    nodes = list(ast.walk(tree_of(path)))
+    variables = {node.id for node in nodes if isinstance(node, ast.Name)}
+    variables |= {node.arg for node in nodes if isinstance(node, ast.arg)}
+    return variables - {node.name for node in nodes if isinstance(node, ast.ClassDef | ast.alias)}
 
 
 def missing_from(path: Path, text: str) -> list[str]:
@@ -133,7 +131,7 @@ def test_what_is_named_is_there() -> None:
 
 def test_every_attribute_that_is_described_is_one() -> None:
     for path in PATHS:
-        for node in nodes_of(path):
+        for node in definitions_of(path):
             if isinstance(node, ast.ClassDef):
                 _, _, section = (ast.get_docstring(node) or "").partition("\nAttributes:\n")
                 section = section.partition("\n\n")[0]

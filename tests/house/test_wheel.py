@@ -48,6 +48,7 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
         assert run(scripts / "fuselog", "--version").split()[-1] in wheel.name
         demo = (
             "import fuselog as fl; from fuselog.pipeline.command_line import main; print(fl.__file__)\n"
+            "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"  # takes long
             "assert main('run landmarks --runs 2 --out demo --json'.split()) == 0\n"
             "assert main('report demo'.split()) == 0"
         )

@@ -1,10 +1,8 @@
 """Finds habits and terms of `words.toml` in the prose of pages, docstrings, comments and messages."""
 
 import ast
-import io
 import re
 import sys
-import tokenize
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +17,7 @@ CODE = re.compile(
     r"```.*?```|``[^`]+``|`[^`\n]+`|<!--.*?-->|>>> [^\n]*|\]\([^)]*\)|\$[^$\n]+\$|https?://\S+",
     re.DOTALL,
 )
+STRING_OR_COMMENT = re.compile(r"""("{3}|'{3}|["'])(?:\\.|[^\\])*?\1|#[^\n]*""", re.DOTALL)
 LEAST_BLANKS = 2  # of a string that counts as prose
 LETTERS = re.compile("[a-z]{2}")
 
@@ -44,7 +43,7 @@ def habits() -> list[Habit]:
         listed = tomllib.load(file)
     return [
         Habit(
-            re.compile(each["pattern"], re.IGNORECASE | re.MULTILINE),
+            re.compile(each["pattern"], re.ASCII | re.IGNORECASE | re.MULTILINE),
             each["write"],
             re.compile(each["except"], re.IGNORECASE) if "except" in each else None,
         )
@@ -67,9 +66,9 @@ def texts_of_code(source: str) -> Iterator[Text]:
         if (words.count(" ") >= LEAST_BLANKS or words.endswith(".")) and LETTERS.search(words):
             yield Text(node.lineno, words)
         waiting += inner
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield Text(token.start[0], token.string.lstrip("# "))
+    for found in STRING_OR_COMMENT.finditer(source):
+        if found[0].startswith("#"):
+            yield Text(source.count("\n", 0, found.start()) + 1, found[0].lstrip("# "))
 
 
 def texts_of(path: Path) -> Iterable[Text]:

@@ -17,10 +17,11 @@ SHEET = {"turn_rate_radps": "0.05 deg/s/sqrt(Hz)", "specific_force_mps2": "100 u
 
 
 def at_rest() -> Iterator[str]:
-    """An inertial unit whose axes walk, are steady, or forget; messages are lost; a sheet is given."""
-    turn = [Terms(1e-3, 3e-4), Terms(1e-3), Terms(1e-3, 0.0, 2e-3, 2.0)]
-    force = [Terms(1e-2), Terms(1e-2, 1e-2), Terms(2e-2, 1e-3)]
-    yield from _said(_columns(turn), _columns(force), lost=slice(200, 230))
+    """A unit whose axes walk, are steady, or forget; messages are lost; a sheet is given."""
+    turn = _columns([Terms(1e-3, 3e-4), Terms(1e-3), Terms(1e-3, 0.0, 2e-3, 2.0)])
+    force = np.full((SIZE, 3), np.nan)
+    force[:, :1] = _columns([Terms(1e-2)])
+    yield from _said(turn, force, lost=slice(200, 230))
 
 
 def disturbed() -> Iterator[str]:
@@ -30,7 +31,7 @@ def disturbed() -> Iterator[str]:
     turn[:, 1] += 1e-4 * TIMES_S
     turn[:, 2] += 2e-3 * np.sin(0.25 * np.pi * TIMES_S)
     force[:, 0] = np.convolve(np.pad(force[:, 0], 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
-    force[:, 1] += np.where(np.arange(SIZE) % 1000 < 500, 0.02, -0.02)
+    force[:, 1] = np.nan
     force[:, 2] += 1e-4 * TIMES_S + 0.2 * np.exp(-TIMES_S / 4.0) + 0.03 * np.sin(44.0 * TIMES_S)
     yield from _said(turn, force, taus=[0.4, 4.0])
 
