@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 import tarfile
 from collections.abc import Callable, Iterator
@@ -73,6 +74,16 @@ def _unwritten(shape: Any, dtype: Any = float, **options: Any) -> np.ndarray:
     if made.dtype.kind == "f":
         made[...] = np.nan
     return made
+
+
+@contextmanager
+def heeding_interrupts() -> Iterator[None]:
+    """Ctrl-C ends this process and one begun meanwhile, also in a background job or with nohup."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

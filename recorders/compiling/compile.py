@@ -53,7 +53,8 @@ def compiled(
     Args:
         function: plain Python function of arrays and numbers.
         for_sizes: whether the code is specialised for the sizes of all axes but the first; loops over
-            small matrices are then faster, but other sizes are compiled separately.
+            small matrices are then faster, but other sizes are compiled separately. The number of rows
+            of data therefore has to be the size of a first axis.
 
     Returns:
         The compiled function.

@@ -129,7 +129,7 @@ CASES = (
         {},
         "state",
         reactor_in_c,
-        {LOOP: 1.8, PLUMBING: 4.0},
+        {LOOP: 1.8, PLUMBING: 3.0},
         (({"steps": 2000}, 1), ({}, 1000)),
     ),
     Case(

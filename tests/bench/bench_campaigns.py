@@ -10,20 +10,15 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from time import process_time, thread_time
-from typing import Any
-from unittest.mock import patch
 
 from fuselog.pipeline.runs.campaigns import cells_of, judge_all
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.executors import PoolFactory, processes
 from fuselog.pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
-from fuselog.recorders.compiling.compile import OverRuns, core_count
-from fuselog.recorders.environment import CORES
+from tests.bench.parts import LOOPS, parts_of
 from tests.bench.timing import cpu_seconds, seconds
 
-RUNS = 2000
-called = OverRuns.__call__
+RUNS, LONG = 2000, 10_000
 Row = tuple[str, str, str, str]
 
 
@@ -34,18 +29,23 @@ def main() -> list[Row]:
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "compiled")
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         _campaign(folder, processes(2), 256)()  # modules and kernels are compiled, figures were drawn
-        campaigns = {count: seconds(_campaign(folder, processes(count))) for count in (1, 2)}
+        rates = {
+            runs: [runs / seconds(_campaign(folder, processes(count), runs)) for count in (1, 2)]
+            for runs in (RUNS, LONG)
+        }
         experiment = load_experiment("landmarks", {}, {"runs": 128})[1]
         ways = {"campaign": partial(_one_cell, experiment, folder), "alone": _cell(experiment, folder)}
         taken = cpu_seconds(ways, repeats=9)
-        cell_s, loops_s = _of_filters(ways["alone"])
-    rates = {count: RUNS / taken_s for count, taken_s in campaigns.items()}
+        parts = parts_of(ways["alone"])
     return [
-        (
-            f"landmarks, {RUNS} runs: two workers; one, at least 1.7 times",
-            f"{rates[2]:.0f} runs/s",
-            f"{rates[1]:.0f} runs/s",
-            f"{rates[2] / rates[1]:.2f} times",
+        *(
+            (
+                f"landmarks, {runs} runs: two workers; one, at least 1.9 times",
+                f"{two:.0f} runs/s",
+                f"{one:.0f} runs/s",
+                f"{two / one:.2f} times",
+            )
+            for runs, (one, two) in rates.items()
         ),
         (
             "one cell of 128 runs that is kept, CPU; its work alone, at most 1.05 times",
@@ -55,35 +55,16 @@ def main() -> list[Row]:
         ),
         (
             "one cell of 128 runs, CPU of one core; the loops of its three filters, at most 2.5 times",
-            f"{cell_s:.2f} s",
-            f"{loops_s:.2f} s",
-            f"{cell_s / loops_s:.2f} times",
+            f"{parts.whole_s:.2f} s",
+            f"{parts.parts_s[LOOPS]:.2f} s",
+            f"{parts.of_loops:.2f} times",
         ),
     ]
 
 
-def _campaign(folder: Path, open_pool: PoolFactory, runs: int = RUNS) -> Callable[[], object]:
+def _campaign(folder: Path, open_pool: PoolFactory, runs: int) -> Callable[[], object]:
     name, experiment = load_experiment("landmarks", {}, {"runs": runs})
     return partial(run_experiment, name, experiment, folder / "result", logs=0, open_pool=open_pool)
-
-
-def _of_filters(work: Callable[[], object], repeats: int = 9) -> tuple[float, float]:
-    """The CPU time of a cell on one core, and of the loops of filters in it: medians of their pairs."""
-    taken, loops_s = [], [0.0]
-
-    def timed(loop: OverRuns, *arguments: Any, **named: Any) -> None:
-        begin = thread_time()
-        called(loop, *arguments, **named)
-        loops_s[-1] += (thread_time() - begin) * (loop.run_once.__name__ == "follow")
-
-    with patch.object(OverRuns, "__call__", timed), patch.dict(os.environ, {CORES: "1"}):
-        core_count.cache_clear()
-        for _ in range(repeats):
-            loops_s[-1], begin = 0.0, process_time()
-            work()
-            taken.append((process_time() - begin, loops_s[-1]))
-    core_count.cache_clear()
-    return sorted(taken, key=lambda each: each[0] / each[1])[repeats // 2]
 
 
 def _one_cell(experiment: Experiment, folder: Path) -> None:

@@ -1,6 +1,6 @@
 """How far campaigns scale: measured on one and two workers here, simulated from there to a thousand.
 
-`python -m tests.bench.scaling` measures, keeps what it measured, and makes the table and the figure of
+`python -m tests.bench.scaling` measures, keeps what it measured, and makes the tables and the figure of
 docs/many-runs.md; `python -m tests.bench.scaling --keep` makes them from what is kept. The simulation is
 of one driver, which serves finished cells one after another: their results come over its network, are
 kept and merged, and the worker gets its next cell.
@@ -11,6 +11,7 @@ import json
 import re
 import sys
 import tempfile
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -25,6 +26,7 @@ from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE
 from fuselog.pipeline.runs.executors import processes
 from fuselog.pipeline.runs.experiment import Setting, load_experiment, run_experiment
+from tests.bench.parts import parts_of
 from tests.bench.timing import seconds
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -34,7 +36,7 @@ WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 NETWORK_BYTES_PER_S = 125e6  # of the driver: a gigabit a second
 LATENCY_S = 1e-3
 CELLS_EACH = 20  # of every worker in the simulation
-_TABLE = re.compile(r"(<!-- scaling -->\n).*?(<!-- end -->)", re.DOTALL)
+_TABLES = re.compile(r"(<!-- (scaling|shares) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 class Measured(NamedTuple):
@@ -45,12 +47,20 @@ class Measured(NamedTuple):
         driver_s: the driver keeps, reads and merges what a cell left.
         cell_bytes: the size of that.
         runs_per_s: of whole campaigns of 2000 runs, with one worker and with two.
+        shares: of the parts of a cell in its CPU time, as fractions.
     """
 
     cell_s: float
     driver_s: float
     cell_bytes: int
     runs_per_s: tuple[float, float]
+    shares: Mapping[str, float]
+
+    @property
+    def undivided_s(self) -> float:
+        """What a second worker does not shorten, of the time that 2000 runs take."""
+        one, two = (RUNS / rate for rate in self.runs_per_s)
+        return 2.0 * two - one
 
     @property
     def served_s(self) -> float:
@@ -72,7 +82,9 @@ def measure() -> Measured:
     """Measure; rates are of wall time, so that two cores must have nothing else to do for a minute."""
     with tempfile.TemporaryDirectory() as scratch:
         rates = [RUNS / seconds(partial(_campaign, Path(scratch), count)) for count in (1, 2)]
-        return Measured(*_measured_cells(Path(scratch)), (rates[0], rates[1]))
+        taken = parts_of(partial(_cells(Path(scratch))[0].work_off, Path(scratch)))
+        shares = {part: taken_s / taken.whole_s for part, taken_s in taken.parts_s.items()}
+        return Measured(*_measured_cells(Path(scratch)), (rates[0], rates[1]), shares)
 
 
 def _campaign(folder: Path, workers: int) -> None:
@@ -82,12 +94,10 @@ def _campaign(folder: Path, workers: int) -> None:
 
 def _measured_cells(folder: Path) -> tuple[float, float, int]:
     """CPU time of a cell and of the driver with it, and the bytes that come to the driver."""
-    _, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
-    cells = cells_of(experiment, Setting(folder, folder, logs=0, draws=False))[:7]
     cell_s, driver_s, left, whole = [], [], b"", None
     with processes(1)() as pool, checkpoints_of(folder / "cells") as checkpoints:
         checkpoints.begin()
-        for cell in cells:
+        for cell in _cells(folder)[:7]:
             left, taken_s = pool.executor.submit(_timed, cell, checkpoints.place_of(cell.key)).result()
             begin_s = process_time()
             checkpoints.write(cell.key, left)
@@ -99,6 +109,11 @@ def _measured_cells(folder: Path) -> tuple[float, float, int]:
             driver_s.append(process_time() - begin_s)
             cell_s.append(taken_s)
     return median(cell_s), median(driver_s), len(left)
+
+
+def _cells(folder: Path) -> list[Cell]:
+    _, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
+    return cells_of(experiment, Setting(folder, folder, logs=0, draws=False))
 
 
 def _timed(cell: Cell, folder: Path) -> tuple[bytes, float]:
@@ -130,7 +145,8 @@ def table(measured: Measured) -> str:
     one, two = measured.runs_per_s
     said = f"""\
 On two cores, {RUNS} runs of `landmarks`, including the start of processes and the figures, ran at
-{one:.0f} runs/s with one worker and at {two:.0f} runs/s with two.
+{one:.0f} runs/s with one worker and at {two:.0f} runs/s with two. A second worker does not shorten the
+start, the figures and the timeline; they take {measured.undivided_s:.1f} s for any number of runs.
 A worker computes a cell in {measured.cell_s:.2f} s.
 The result of a cell has {measured.cell_bytes / 1e6:.1f} MB; the driver keeps it
 and merges it in {1e3 * measured.driver_s:.0f} ms. In a simulation
@@ -141,6 +157,14 @@ or more workers to {measured.limit_runs_per_s:.0f} runs/s:
 |---|---|---|
 """
     return said + "\n".join(rows) + "\n"
+
+
+def table_of_shares(shares: Mapping[str, float]) -> str:
+    """The parts of a cell, the largest first; the last row is what no part has."""
+    parts = sorted(shares.items(), key=lambda each: -each[1])
+    parts.append(("other: collecting streams, monitoring, reports", 1.0 - sum(shares.values())))
+    rows = [f"| {part} | {share:.0%} |\n" for part, share in parts]
+    return "".join(["| part | share |\n|---|---|\n", *rows])
 
 
 def chart(measured: Measured) -> Chart:
@@ -169,12 +193,13 @@ def kept() -> Measured:
 
 
 def rendered(page: str, measured: Measured) -> str:
-    """The page with its table made anew."""
-    return _TABLE.sub(lambda found: f"{found[1]}{table(measured)}{found[2]}", page)
+    """The page with its tables made anew."""
+    tables = {"scaling": table(measured), "shares": table_of_shares(measured.shares)}
+    return _TABLES.sub(lambda found: f"{found[1]}{tables[found[2]]}{found[3]}", page)
 
 
 def main() -> None:
-    """Measure, unless `--keep` is given, and make the page's table and figure."""
+    """Measure, unless `--keep` is given, and make the page's tables and figure."""
     if "--keep" not in sys.argv[1:]:
         KEPT.write_text(json.dumps(measure()._asdict(), indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8"), kept()), encoding="utf-8")

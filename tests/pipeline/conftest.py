@@ -4,11 +4,10 @@ import io
 import json
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,7 +33,7 @@ from fuselog.recorders.log import (
 )
 from fuselog.recorders.recording import record_run
 from tests.claims.few_runs import opposite
-from tests.conftest import without_drawing
+from tests.conftest import heeding_interrupts, without_drawing
 from tests.goldens import keeping
 
 SHORT = ["--set", "duration_s=2"]
@@ -87,16 +86,6 @@ def run_here(*arguments: str | Path) -> Said:
     with redirect_stdout(out), redirect_stderr(err):
         code = main([str(each) for each in arguments])
     return Said(code, out.getvalue(), err.getvalue())
-
-
-@contextmanager
-def heeding_interrupts() -> Iterator[None]:
-    """Ctrl-C ends this process and one begun meanwhile, also in a background job or with nohup."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

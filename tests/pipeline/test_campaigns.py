@@ -510,7 +510,7 @@ def test_the_page_and_its_figure_say_what_was_measured():
 def test_the_simulated_driver_is_the_limit_where_it_is_busy():
     """A cell of 1 s, and .1 s of the driver: ten workers and one more keep it busy."""
     network = scaling.NETWORK_BYTES_PER_S
-    measured = scaling.Measured(1.0, 0.05, round(0.05 * network), (100.0, 200.0))
+    measured = scaling.Measured(1.0, 0.05, round(0.05 * network), (100.0, 200.0), {})
     assert measured.limit_workers == 11
     assert scaling.simulated(measured, 1) == pytest.approx(128 / 1.1, rel=0.01)
     assert scaling.simulated(measured, 4) == pytest.approx(4 * 128 / 1.1, rel=0.05)

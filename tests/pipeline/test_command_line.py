@@ -26,9 +26,9 @@ from fuselog.pipeline.api.lists import told as told_of
 from fuselog.pipeline.output.results import result_folder
 from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 from fuselog.replay.timeline.drawing.canvas import Scene
+from tests.conftest import heeding_interrupts
 from tests.lists import lists
 from tests.lists import main as keep_lists
-from tests.pipeline.conftest import heeding_interrupts
 from tests.replay.foreign.test_isolation import SANE, run_with
 from tests.replay.foreign.test_programs import FAIL, PROGRAM, python
 

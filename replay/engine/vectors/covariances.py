@@ -49,12 +49,18 @@ def errors_squared(error: Array, covariance: Array, leading: int) -> tuple[Array
         covariances = np.broadcast_to(covariance, (*shape, size, size)).reshape(-1, size, size)
         errors, covariances = (np.ascontiguousarray(each, float) for each in (errors, covariances))
         work = np.empty((size, size)), np.empty(size)
-        _fill_squares(errors, covariances, leading, *work, found.reshape(2, -1))
+        _fill_squares(errors, covariances, leading, *work, *(each.reshape(-1) for each in found))
     return found[0][()], found[1][()]
 
 
 def fill_squares(
-    errors: Array, covariances: Array, leading: int, factor: Array, whitened: Array, found: Array
+    errors: Array,
+    covariances: Array,
+    leading: int,
+    factor: Array,
+    whitened: Array,
+    squares: Array,
+    leading_squares: Array,
 ) -> None:
     """Compute |L^-1 e|^2 of errors (n, d) with the Cholesky factors L of covariances (n, d, d).
 
@@ -64,7 +70,8 @@ def fill_squares(
         leading: number of components of the second result; their factor is a part of L.
         factor: (d, d), work space.
         whitened: (d,), work space.
-        found: (2, n), filled; the second row only if there are leading components.
+        squares: (n,), filled.
+        leading_squares: (n,), filled if there are leading components.
     """
     size = covariances.shape[1]
     for each in range(len(errors)):
@@ -72,9 +79,9 @@ def fill_squares(
         for row in range(size):
             error = 0.0 if np.isinf(covariances[each, row, row]) else errors[each, row]
             whitened[row] = (error - dot(factor[row], whitened, row)) / factor[row, row]
-        found[0, each] = dot(whitened, whitened, size)
+        squares[each] = dot(whitened, whitened, size)
         if leading:
-            found[1, each] = dot(whitened, whitened, leading)
+            leading_squares[each] = dot(whitened, whitened, leading)
 
 
 def log_likelihood(squared: Array, error: Array, covariance: Array) -> Array:

@@ -143,7 +143,12 @@ def bin_of(bins: Bins, row: int) -> Floats:
 
 
 def fill_sums(values: Floats, bins: Bins) -> None:
-    """Sum rows of numbers (n, columns) in their bins."""
+    """Sum rows of numbers in their bins.
+
+    Args:
+        values: (n, columns), the rows.
+        bins: the bins, which are filled.
+    """
     for row in range(len(values)):
         own = bin_of(bins, row)
         own[0] += 1.0

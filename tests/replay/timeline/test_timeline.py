@@ -44,6 +44,7 @@ from fuselog.replay.timeline.landmarks import GATED
 from fuselog.replay.timeline.show import Drawing, read_moments, show, worst_at
 from fuselog.replay.timeline.sinks import open_recording
 from fuselog.replay.timeline.viewer import Listener, listen, screenshot, view
+from tests.conftest import heeding_interrupts
 
 SENSOR = {"rate_hz": 5.0, "outlier_probability": 0.05, "outages_per_minute": 9.0, "outage_s": 2.0}
 RUN = 1
@@ -769,7 +770,9 @@ def test_a_page_is_served_to_this_machine_alone_and_ends_with_the_command(
 ) -> None:
     program = str(Path(sys.executable).with_name("fuselog"))
     command = [program, "view", str(rrd), "--web"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as running:
+    with heeding_interrupts():
+        running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    with running:
         assert running.stdout is not None
         try:
             [url] = re.findall(r"http:[^;\s]+", running.stdout.readline())
