@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -309,7 +308,6 @@ def hash_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-@cache
 def import_writers() -> None:
     """Import the libraries with which `write_outcome` writes, which takes a second."""
     for name in ("pandas", "pyarrow.csv", "pyarrow.parquet", "matplotlib.backends.backend_svg"):

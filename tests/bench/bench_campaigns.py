@@ -15,7 +15,7 @@ from fuselog.pipeline.runs.campaigns import cells_of, judge_all
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.executors import PoolFactory, processes
 from fuselog.pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
-from tests.bench.parts import LOOPS, parts_of
+from tests.bench.parts import LOOPS, time_parts
 from tests.bench.timing import cpu_seconds, seconds
 
 RUNS, LONG = 2000, 10_000
@@ -36,7 +36,7 @@ def main() -> list[Row]:
         experiment = load_experiment("landmarks", {}, {"runs": 128})[1]
         ways = {"campaign": partial(_one_cell, experiment, folder), "alone": _cell(experiment, folder)}
         taken = cpu_seconds(ways, repeats=9)
-        parts = parts_of(ways["alone"])
+        parts = time_parts(ways["alone"])
     return [
         *(
             (

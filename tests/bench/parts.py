@@ -5,13 +5,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
-from importlib import import_module
+from pkgutil import resolve_name
 from time import process_time, thread_time
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
-from fuselog.recorders.compiling.compile import OverRuns, core_count
-from fuselog.recorders.environment import CORES
+from fuselog.recorders.compiling.compile import OverRuns, core_count, use_cores
 
 LOOPS = "loops of the filters"
 # The functions that do the parts; none is called in another.
@@ -35,13 +34,13 @@ class Taken(NamedTuple):
         return self.whole_s / self.parts_s[LOOPS]
 
 
-def parts_of(work: Callable[[], object], repeats: int = 9) -> Taken:
+def time_parts(work: Callable[[], object], repeats: int = 9) -> Taken:
     """Measure a cell `repeats` times; the median by `of_loops`."""
-    taken = []
-    with patch.dict(os.environ, {CORES: "1"}):
-        core_count.cache_clear()
+    before = core_count()
+    with patch.dict(os.environ):
+        use_cores(1)
         taken = [_timed(work) for _ in range(repeats)]
-    core_count.cache_clear()
+        use_cores(before)
     return sorted(taken, key=lambda each: each.of_loops)[repeats // 2]
 
 
@@ -63,14 +62,8 @@ def _timed(work: Callable[[], object]) -> Taken:
     call = OverRuns.__call__
     with ExitStack() as stack:
         for part, name in FUNCTIONS.items():
-            stack.enter_context(patch(name, partial(timed, part, _found(name))))
+            stack.enter_context(patch(name, partial(timed, part, resolve_name(name))))
         stack.enter_context(patch.object(OverRuns, "__call__", called))
         begin_s = process_time()
         work()
         return Taken(process_time() - begin_s, parts_s)
-
-
-def _found(name: str) -> Callable[..., object]:
-    module, _, function = name.rpartition(".")
-    found: Callable[..., object] = getattr(import_module(module), function)
-    return found

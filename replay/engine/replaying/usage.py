@@ -148,8 +148,8 @@ class Usage:
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
                 known = np.unique(np.concatenate([each["landmark_id"] for each in maps]))
-                unknown = ("unknown", known.tobytes()), partial(_unknown, stream, known)
-                facts["measure targets that are not in the map"] += ragged.findings.once(*unknown)
+                key, find = ("unknown", known.tobytes()), partial(_unknown, stream, known)
+                facts["measure targets that are not in the map"] += ragged.findings.once(key, find)
 
     def note_outputs(self, outputs: Sequence[Ragged]) -> None:
         """Count a block of the estimator's `outputs`."""
