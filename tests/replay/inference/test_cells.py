@@ -33,8 +33,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "moving-sights": ("moving-los", {"duration_s": 3.0}),
     "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
     "ranging-position": ("ranging", {**FEW_RANGES, "tags_m": [(0.0, 0.0, 0.0)]}),
-    "robot": ("landmarks", {"duration_s": 6.0, "range_bearing": {"rate_hz": 4.0}}),
-    "vehicle": ("vehicles", {"duration_s": 20.0, "stochastic": True}),
+    "robot": ("landmarks", {"duration_s": 4.0, "range_bearing": {"rate_hz": 4.0}}),
+    "vehicle": ("vehicles", {"duration_s": 14.0, "stochastic": True}),
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
