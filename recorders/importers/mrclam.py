@@ -129,7 +129,10 @@ def _robot_streams(
 def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArray[np.float64]:
     """Read the numbers of one file, (rows, columns); some columns contain whole numbers of 32 bits."""
     try:
-        table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
+        try:
+            table = _columns_of(path, float)
+        except ValueError:  # raised again, unless only some words are no numbers
+            table = _columns_of(path, str)
     except FileNotFoundError:
         raise BadInput(f"{path}: no such file; an MRCLAM folder needs it") from None
     except pd.errors.EmptyDataError:
@@ -141,19 +144,22 @@ def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArr
             f"{path}: has {table.shape[1]} columns, expected {columns}; give the file as published"
         )
     numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
-    _refuse(~np.isfinite(numbers), path, table, "expected a number")
+    _refuse(~np.isfinite(numbers), path, "expected a number")
     is_identifier = (numbers >= 0) & (numbers < 2**32) & (numbers == np.floor(numbers))
     is_identifier[:, [column not in identifiers for column in range(columns)]] = True
-    _refuse(~is_identifier, path, table, "expected a whole number, zero or more")
+    _refuse(~is_identifier, path, "expected a whole number, zero or more")
     return numbers
 
 
-def _refuse(bad: NDArray[np.bool_], path: Path, table: pd.DataFrame, what: str) -> None:
+def _columns_of(path: Path, kind: type) -> pd.DataFrame:
+    return pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=kind)
+
+
+def _refuse(bad: NDArray[np.bool_], path: Path, what: str) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise BadInput(
-            f"{path}: data row {row + 1}, column {column + 1} is {table.iloc[row, column]}, {what}"
-        )
+        text = _columns_of(path, str).iloc[row, column]
+        raise BadInput(f"{path}: data row {row + 1}, column {column + 1} is {text}, {what}")
 
 
 def _timed(
@@ -166,7 +172,7 @@ def _timed(
     """
     table = _table(path, columns, identifiers)
     bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)
-    _refuse(bad, path, pd.DataFrame(table), "expected a time in seconds since 1970")
+    _refuse(bad, path, "expected a time in seconds since 1970")
     times_ns = to_ns(np.rint(table[:, 0] * 1e6), 1000, where=str(path))
     order = np.argsort(times_ns, kind="stable")
     return times_ns[order], table[order, 1:]

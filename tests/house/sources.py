@@ -1,6 +1,7 @@
 """Gives the files of the product, each read and parsed once for all tests of the house."""
 
 import ast
+import gc
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -21,7 +22,10 @@ def text_of(path: Path) -> str:
 
 @cache
 def tree_of(path: Path) -> ast.Module:
-    return ast.parse(text_of(path))
+    """The parsed file; visited by garbage collection again and again, trees would take far longer."""
+    tree = ast.parse(text_of(path))
+    gc.freeze()
+    return tree
 
 
 @cache

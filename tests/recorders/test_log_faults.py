@@ -8,7 +8,8 @@ from tests.faults import crafted, cuts, damaged_logs, flips
 
 
 @pytest.mark.paper
-@pytest.mark.parametrize(("campaign", "most"), [(flips, 30), (cuts, 30), (crafted, 8)], ids=str)
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize(("campaign", "most"), [(flips, 30), (cuts, 30), (crafted, 6)], ids=str)
 def test_faults_hold(campaign, most):
     """Exactly the right numbers, a stated part of them, or one sentence."""
     tally = campaign.run(60.0, np.random.default_rng(0), most)
@@ -33,6 +34,6 @@ def test_what_does_not_hold_is_noted(monkeypatch):
 
     monkeypatch.setattr(damaged_logs, "sample", honest_sample)
     monkeypatch.setattr(damaged_logs, "read_streams", forgetful)
-    tally = flips.run(60.0, np.random.default_rng(0), 30)
+    tally = flips.run(60.0, np.random.default_rng(0), 6)
     assert tally.held < tally.tried
     assert "and nothing says so" in " ".join(tally.notes)

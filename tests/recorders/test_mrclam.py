@@ -122,7 +122,7 @@ def test_folders_that_are_no_set_are_told(small: Path, tmp_path: Path):
     ("name", "row", "words"),
     [
         ("Robot1_Odometry.dat", "-5.0 0.1 0.1", "row 3, column 1 is -5.0, expected a time in seconds"),
-        ("Robot1_Odometry.dat", "1e300 0.1 0.1", "row 3, column 1 is 1e.300, expected a time"),
+        ("Robot1_Odometry.dat", "1e300 0.1 0.1", "row 3, column 1 is 1e300, expected a time"),
         ("Landmark_Groundtruth.dat", "8.5 1 2 0 0", "row 3, column 1 is 8.5, expected a whole number"),
         ("Barcodes.dat", "-3 17", "row 4, column 1 is -3"),
         ("Robot1_Measurement.dat", "1248444175.4 1.5 1 1", "row 5, column 2 is 1.5"),

@@ -108,6 +108,8 @@ class Maker:
         if path in given and not isinstance(given[path], int):
             return np.array(given[path], float)
         dtype = {"float32": "f4", "float64": "f8"}.get(inner[1][0], inner[1][0])
+        if dtype.startswith("f"):
+            return self.generator.normal(size=count).astype("f4").astype(dtype)
         return np.array([self._number(inner[1][0]) for _ in range(count)], dtype)
 
     def _number(self, name: str) -> Any:

@@ -19,16 +19,16 @@ def test_no_table_is_read_wrongly_without_a_word(
 ) -> None:
     rng = np.random.default_rng(3)
     verdicts, wrong = Counter[str](), []
-    for _ in range(60):
+    for _ in range(40):
         drawn = draw(tmp_path, rng)
         verdict, why = judge(drawn)
         drawn.path.unlink()
         verdicts[verdict] += 1
         wrong += [f"{drawn.choices}: {why}"] if verdict == "wrong" else []
     with capsys.disabled():
-        print(f"\ntables read right without a question: {verdicts['right']} of 60")
+        print(f"\ntables read right without a question: {verdicts['right']} of 40")
     assert not wrong
-    assert verdicts["right"] >= 54
+    assert verdicts["right"] >= 36
 
 
 STAMPS_S = 1_700_000_000 + 0.5 * np.arange(400)

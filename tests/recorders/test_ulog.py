@@ -186,12 +186,12 @@ def rows_in(path: Path, content: bytes) -> bytes:
 
 
 @pytest.mark.paper
-def test_a_log_that_is_cut_at_any_thousandth_gives_what_is_whole(tmp_path: Path):
+def test_a_log_that_is_cut_anywhere_gives_what_is_whole(tmp_path: Path):
     whole = by_hand()
     every = rows_in(tmp_path / "cut.ulg", whole)
     assert len(every) == 300 * 32
     begin = whole.index(b"D\x07\x00") - 2
-    for cut in np.linspace(0, len(whole), 1001).astype(int):
+    for cut in np.linspace(0, len(whole), 332).astype(int):
         found = rows_in(tmp_path / "cut.ulg", whole[:cut])
         assert every.startswith(found)
         assert len(found) // 32 >= (cut - begin - 6 * 11) // 37

@@ -275,13 +275,13 @@ def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: Mem
 
 @cache
 def drives(runs: int, values: str) -> list[MemorySource]:
-    """Drives of 40 s, once for all methods; what they have of their own as JSON."""
-    given = {"duration_s": 40.0, **json.loads(values)}
+    """Drives of 28 s, once for all methods; what they have of their own as JSON."""
+    given = {"duration_s": 28.0, **json.loads(values)}
     return [memory_source(*record_run("navigation", given, 1, run)) for run in range(runs)]
 
 
 def aligned_nees(method: str, runs: int = 40, **values: Any) -> tuple[Any, int]:
-    """NEES (stamps, runs) of drives of 40 s, from 8 s on, when they move, and how many runs."""
+    """NEES (stamps, runs) of drives of 28 s, from 8 s on, when they move, and how many runs."""
     sources = drives(runs, json.dumps(values))
     states = outputs(INERTIAL, method, sources)["state"]
     nees = []

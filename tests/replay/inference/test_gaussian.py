@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -237,6 +237,7 @@ def one_set(dimension: int, kappa: float) -> SampleSets:
 
 @pytest.mark.paper
 @pytest.mark.parametrize(("method", "kappa"), [("ekf", 0.0), ("iekf", 0.0), ("ukf", 0.0), ("ukf", 1.7)])
+@settings(max_examples=25)
 @given(st.integers(1, 4), st.integers(1, 3), st.integers(1, 5), seeds)
 def test_filters_are_exact_for_linear_models_of_any_size(
     method: str, kappa: float, states: int, controls: int, components: int, seed: int

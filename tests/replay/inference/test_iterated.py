@@ -66,7 +66,6 @@ def test_the_sheets_row() -> None:
 
 
 @pytest.mark.paper
-@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("start", "cost", "iterations"), [("prior", 7086.12968525, 12), ("motion", 10730.8608525, None)]
 )

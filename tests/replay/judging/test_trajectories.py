@@ -199,14 +199,14 @@ def test_relative_errors_by_hand() -> None:
 @pytest.mark.paper
 @pytest.mark.parametrize("offset_s", [0.0, 0.437, -7.0])
 def test_a_time_offset_is_found(offset_s: float) -> None:
-    truth = walk(2000)
+    truth = walk(1000)
     estimate = disturbed(truth, Alignment(Rotation.from_rotvec([0, 1, 0.5]).as_matrix(), np.ones(3)))
-    late = replace(estimate, time_ns=estimate.time_ns - round(offset_s * 1e9)).take(np.arange(100, 1500))
+    late = replace(estimate, time_ns=estimate.time_ns - round(offset_s * 1e9)).take(np.arange(100, 800))
     found = estimated_offset_s(late, truth, "se3")
     assert found == pytest.approx(offset_s, abs=0.01)
     how = Comparison("se3", association="interpolated", time_offset_s="estimate")
     done = compare(late, truth, how)
-    assert (done.time_offset_s, len(done.truth)) == (found, 1400)
+    assert (done.time_offset_s, len(done.truth)) == (found, 700)
     assert statistics(done.absolute_m)["rmse"] < 0.04
 
 

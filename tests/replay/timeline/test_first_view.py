@@ -27,7 +27,7 @@ FIRST = {
     "acoustic-shots": First({}, {"shooter:bearings-only": {}, "shooter:native-measurements": {}}),
     "axis": First({"steps": 5}, {"bingham-axis": {}, "kalman-axis": {}}),
     "batch-reactor": First({"steps": 10}, {"ekf": {}}),
-    "biometric-scores": First({"users": 20}, {"score-rule": {}}),
+    "biometric-scores": First({"users": 20}, {"score-rule": {"subsets": ["face", "all"]}}),
     "car": First({"duration_s": 20.0}, {"ekf": {}, "ukf": {}}),
     "crossing": First({"duration_s": 20.0}, {"tracker:jipda": {}}),
     "extended-target": First({"points": 10}, {"analytic": {}}),

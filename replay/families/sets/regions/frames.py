@@ -67,8 +67,11 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
     place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
     range_m = _maximum_range_m(stream, known) if known.arena_m is None else np.inf
     cuts = np.flatnonzero(np.diff(stream.publish_time_ns)) + 1
+    is_relative = "angle_rad" in stream.columns
     for rows in np.split(np.arange(len(stream)), cuts):
-        if "angle_rad" in stream.columns:
+        if (1 + is_relative) * len(rows) < known.least_landmarks:
+            continue
+        if is_relative:
             numbers = np.stack([stream["first_id"][rows], stream["second_id"][rows]], axis=1)
             angle = stream["angle_rad"][rows]
         else:

@@ -14,8 +14,12 @@ pytestmark = pytest.mark.paper
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("biometrics") / "result"
     settings = {"users": 40, "low_galleries": 2, "options": {"seeds": 2, "replicates": 20}}
+    settings |= {label: {"folds": 2} for label in ("qda", "knn", "hmm")}
     label, experiment = load_experiment("biometrics-simulated", settings, {"runs": 2})
-    return folder, run_experiment(label, experiment, folder, logs=1)
+    with pytest.MonkeyPatch.context() as patch:
+        # each bar of each of many fusions is sent by itself
+        patch.setattr("fuselog.replay.families.biometrics.timeline.UPDATES", 3)
+        return folder, run_experiment(label, experiment, folder, logs=1)
 
 
 def test_tables_stand_beside_the_paper_and_follow_from_the_rates(result):

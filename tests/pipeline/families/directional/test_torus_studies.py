@@ -90,7 +90,8 @@ def test_a_report_compares_by_the_errors_of_single_runs(tmp_path):
     """It draws them, so that it cannot miss them; a tie is no refutation."""
     _, experiment = load_experiment("torus-filter", {}, {})
     cases = {"strong-coupling": experiment.options["cases"]["strong-coupling"]}
-    result = run("torus-filter", tmp_path / "out", {"runs": 8, "options": {"cases": cases}})
+    options = {"cases": cases, "grid_cells": 16}
+    result = run("torus-filter", tmp_path / "out", {"runs": 8, "options": options})
     runs = pd.read_parquet(tmp_path / "out" / "tables" / "runs.parquet")
     found = np.sqrt((runs[runs["estimator"] == "torus"]["angle_rmse_rad"] ** 2).mean())
     assert found == pytest.approx(result.metrics["torus.angle_rmse_rad.strong-coupling"])

@@ -33,6 +33,8 @@ def test_the_room(tmp_path):
 
 def test_a_run_that_ends_before_it_is_judged_is_refused(tmp_path):
     name, experiment = load_experiment("ispace", {"runs": 1, "steps": 5}, {})
+    rules = {"ci-trace": experiment.estimators["ci-trace"]}
+    experiment = experiment.model_copy(update={"estimators": rules})
     with pytest.raises(BadInput, match="record more steps"):
         run_experiment(name, experiment, tmp_path / "out")
 

@@ -96,7 +96,7 @@ def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, t
     values = {"title": "mine", "study": "autoferry", "import": {"source": "autoferry"}, **own}
     experiment = build(Experiment, values, "experiment mine.toml")
     found = {}
-    for scenario in sorted(autoferry.glob("scenario*")):
+    for scenario in (autoferry / f"scenario{number}" for number in (2, 3, 5)):
         result = run_experiment("mine", experiment, tmp_path / scenario.name, data=scenario, logs=0)
         found[scenario.name] = [each.verdict for each in result.claims]
         gospa_m = STORED["metrics"][f"{label}.gospa_m.{scenario.name}"]
@@ -106,7 +106,7 @@ def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, t
     stored = STORED["metrics"][f"{label}.gospa_m.scenario5"]
     assert metrics[f"{label}.gospa_m"] == pytest.approx(stored, rel=1e-6)
     assert found.pop("scenario5") == ["confirmed", "confirmed"]
-    assert len(found) == 5
+    assert len(found) == 2
     assert {first for first, _ in found.values()} == {"no verdict"}
     assert "refuted" in {other for _, other in found.values()}
 

@@ -22,8 +22,19 @@ def run(name: str, folder: Path, settings: dict[str, Any], runs: int) -> dict[st
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """What no claim below is of is small: the straight case, and particles without separate sums."""
     folder = tmp_path_factory.mktemp("vehicles") / "result"
-    return folder, run("vehicles-ctm2", folder, {"options": {"few_runs": 2}}, 12)
+    particles = {
+        "particles-set": "set-100",
+        "associations": "associations-10",
+        "associations-topology": "associations-10-topology",
+    }
+    options = {
+        "few_runs": 2,
+        "cases": {"straight": {"duration_s": 5.0}},
+        "few": {label: {"kind": f"vehicle-particles:{method}"} for label, method in particles.items()},
+    }
+    return folder, run("vehicles-ctm2", folder, {"options": options}, 12)
 
 
 def verdict(result: dict[str, Any], start: str) -> str:

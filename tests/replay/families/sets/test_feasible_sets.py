@@ -166,7 +166,7 @@ def test_a_pseudo_ellipsoid_holds_the_exact_set(seed, landmarks, bound_rad, orde
 def test_straight_lines_are_half_planes(angle_deg):
     """At g = 0 and g = pi the circles are lines; the set is still the point-wise one."""
     pairs = make_pairs([[1.0, 0.0]], [[-1.0, 0.0]], [np.radians(angle_deg)], np.radians(4))
-    axes = np.linspace(-4.99, 4.99, 800)
+    axes = np.linspace(-4.99, 4.99, 400)
     grid = np.stack(np.meshgrid(axes, axes), axis=-1)
     inside = np.all(excess_rad(pairs, grid) <= 0, axis=-1)
     border = exact_set(pairs, ARENA)

@@ -56,6 +56,7 @@ def test_both_are_metrics(first, second, third, order, alpha):
         assert distance(first, third) <= distance(first, second) + distance(second, third) + 1e-9
 
 
+@settings(max_examples=30)
 @given(POINTS, POINTS)
 def test_parts_make_the_whole(estimates, truths):
     found = gospa(estimates, truths, 5, 2)
