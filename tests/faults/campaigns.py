@@ -32,9 +32,12 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
     end = time.monotonic() + seconds
     tried, notes = 0, []
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder, contextlib.chdir(folder):
-        kept = {command: _prepared(number, command) for number, command in enumerate(COMMANDS)}
+        kept: dict[str, tuple[Path, Path, dict[str, str]]] = {}
         while time.monotonic() < end and tried != most:
-            command = COMMANDS[tried % len(COMMANDS)]
+            number = tried % len(COMMANDS)
+            command = COMMANDS[number]
+            if command not in kept:
+                kept[command] = _prepared(number, command)
             own, others, whole = kept[command]
             shutil.copytree(own, "out.unfinished")
             done = [_meddle(Path("out.unfinished"), others, rng) for _ in range(int(rng.integers(1, 4)))]

@@ -36,7 +36,8 @@ TOKENS = (b"nan", b"inf", b"-1", b"0", b"1e308", b"1e-320", b"1e999", b"9" * 40,
           b"2026-01-01T00:00:00Z")
 # fmt: on
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
-# What a child has to import is imported before it is forked.
+# What a child has to import is imported before it is forked: these, and those of their modules that the
+# child of a whole sample needed.
 ROOMS = (
     *("fuselog", "tests", "pytest", "llvmlite", "rich", "pydantic"),
     *("pandas", "pyarrow", "scipy", "h5py", "rosbags", "mcap", "rerun", "matplotlib", "sqlite3"),
@@ -53,6 +54,8 @@ class Format(NamedTuple):
 def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Tally:
     """Mutate each format `MUTANTS` times, or `most`; it stops after 15 times `seconds`."""
     end = time.monotonic() + 15 * seconds
+    for room in ROOMS:
+        importlib.import_module(room)
     seed = int(rng.integers(1 << 32))
     tried, notes = 0, []
     whole: dict[str, Format] = {}

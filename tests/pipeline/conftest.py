@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -183,6 +183,48 @@ def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
             )
 
     return start
+
+
+# Names of modules that Python, a library or fuselog imports sooner or later.
+SHADOWS = (
+    *(
+        "abc",
+        "argparse",
+        "click",
+        "collections",
+        "distributed",
+        "fuselog",
+        "json",
+        "logging",
+        "matplotlib",
+    ),
+    *("numba", "numpy", "pandas", "pickle", "pipeline", "psutil", "pydantic", "random", "recorders"),
+    *("replay", "reprlib", "rerun", "rerun_cli", "rich", "scipy", "sitecustomize", "socket", "struct"),
+    *("subprocess", "threading", "usercustomize"),
+)
+SHADOW = """
+import os, sys
+with open(os.environ["SHADOWED"], "a") as told:
+    print(__file__, *sys.argv, file=told)
+"""
+
+
+@contextmanager
+def shadowed(folder: Path) -> Iterator[None]:
+    """Work in a folder with modules of these names, of which neither we nor a process may import one."""
+    with TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
+        told = Path(place, "told")
+        patch.setenv("SHADOWED", str(told))
+        patch.chdir(folder)
+        # what runs the tests may have the current folder on its path
+        patch.setattr(sys, "path", [each for each in sys.path if each])
+        for name in SHADOWS:
+            (folder / f"{name}.py").write_text(SHADOW)
+        yield
+        assert not told.exists(), told.read_text()
+        assert not {"", ".", str(folder)} & {*sys.path}
+        for name in SHADOWS:
+            (folder / f"{name}.py").unlink()
 
 
 @pytest.fixture(scope="session")

@@ -44,6 +44,7 @@ from fuselog.recorders.recording import record_run
 from fuselog.replay.foreign.naming import Allowed
 from fuselog.replay.judging.metrics.sums import BinnedSums
 from tests.bench import scaling
+from tests.pipeline.conftest import shadowed
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -552,23 +553,20 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, worked_off, monk
 
 @pytest.mark.paper
 @pytest.mark.usefixtures("all_cores")
-def test_a_dask_worker_uses_one_core_also_when_it_was_started_again() -> None:
+def test_dask_workers_give_the_same_bytes(place, files, tmp_path):
+    """Of `local:1`, and by its address as of a cluster that is there, whose worker may share no files.
+
+    A worker uses one core, also when it was started again, and imports no module of the current folder.
+    """
     distributed = pytest.importorskip("distributed")
-    with pool_for(None, "local:1", RUNS)() as pool:
+    with shadowed(tmp_path), pool_for(None, "local:1", RUNS)() as pool:
+        client = distributed.get_client()
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
-        distributed.get_client().restart()
+        for each in (lambda: nullcontext(pool), pool_for(None, client.scheduler.address, RUNS)):
+            assert run(place, each) == files
+            shutil.rmtree(place)
+        client.restart()
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
-
-
-@pytest.mark.paper
-def test_dask_workers_give_the_same_bytes(place, files, monkeypatch):
-    """Of a cluster that is there, whose worker may share no files, and of the same one as `local:1`."""
-    pytest.importorskip("distributed")
-    with executors._local_cluster("local:1") as cluster:
-        assert run(place, pool_for(None, cluster.scheduler_address, RUNS)) == files
-        shutil.rmtree(place)
-        monkeypatch.setattr(executors, "_local_cluster", lambda _: nullcontext(cluster))
-        assert run(place, pool_for(None, "local:1", RUNS)) == files
 
 
 def test_cells_of_a_library_that_was_compiled_again_are_not_used(tmp_path: Path) -> None:

@@ -720,9 +720,13 @@ def test_runs_without_end_say_what_they_would_take(experiment: str, fuselog: Fus
 
 @pytest.mark.paper
 @pytest.mark.usefixtures("here")
-def test_names_beyond_the_locale(world: Path) -> None:
-    """In the C locale, a name that is not ASCII reaches Python, Rerun and Arrow in three ways."""
+def test_names_beyond_the_locale_and_variables_of_rerun(world: Path) -> None:
+    """In the C locale, a name that is not ASCII reaches Python, Rerun and Arrow in three ways.
+
+    Rerun's own variables neither leave a timeline empty nor write to stderr.
+    """
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    plain |= {"RERUN": "off", "RERUN_FLUSH_NUM_ROWS": "x"}
     code = (
         "import sys; from fuselog.pipeline.command_line import main\n"
         "log, folder, timeline = sys.argv[1:]\n"
@@ -737,6 +741,7 @@ def test_names_beyond_the_locale(world: Path) -> None:
     assert said.stderr == ""
     assert said.stdout.splitlines()[-1] == "0 0 0"
     assert {path.name for path in Path().iterdir()} == {"ä", "ü.rrd"}
+    assert all(each.stat().st_size > 1000 for each in (Path("ü.rrd"), Path("ä/timeline.rrd")))
 
 
 @pytest.mark.paper
@@ -892,18 +897,6 @@ def test_an_environment_variable_that_cannot_be_is_named(
     assert said.code == 2
     assert said.err.startswith(f"fuselog: {name}={value}: {expected}")
     assert said.err.count("\n") == 1
-
-
-@pytest.mark.paper
-def test_variables_of_rerun_leave_a_timeline_as_it_is(
-    world: Path, tmp_path: Path, start_fuselog: Callable[..., Any]
-) -> None:
-    """In a process of its own, whose stderr a library writes to as well."""
-    view = ("view", str(world / "log.mcap"), "--save", str(tmp_path / "a.rrd"))
-    process = start_fuselog(*view, env={**os.environ, "RERUN": "off", "RERUN_FLUSH_NUM_ROWS": "x"})
-    _, said = process.communicate()
-    assert (process.returncode, said) == (0, "")
-    assert (tmp_path / "a.rrd").stat().st_size > 1000
 
 
 def test_a_replay_whose_only_run_failed_fails_a_build(fuselog: Fuselog, tmp_path: Path) -> None:

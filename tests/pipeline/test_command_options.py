@@ -184,6 +184,8 @@ MOVES = [
         {"--samples": "--samples 2", "--sampling": "--sampling random", "--seed": "--seed 2"},
     ),
 ]
+# by command, what is run twice to see that nothing but an option changes what comes out
+FIRST = {each.usual.split()[0]: each for each in reversed(MOVES) if " --out " not in each.usual}
 
 # what is moved in another file: of all commands, and the commands whose other options are
 OPTIONS_ELSEWHERE = {
@@ -283,7 +285,8 @@ def outcome(line: str, logs: Path, folder: Path) -> tuple[str, ...]:
 def test_every_option_changes_what_comes_out(moves: Moves, logs: Path, tmp_path: Path):
     place = tmp_path / "here"
     usual = outcome(moves.usual, logs, place)
-    assert outcome(moves.usual, logs, place) == usual or "--out" in moves.usual
+    if moves in FIRST.values():
+        assert outcome(moves.usual, logs, place) == usual
     same = {
         option
         for option, added in moves.options.items()

@@ -28,13 +28,17 @@ SAMPLE = in_order(np.random.default_rng(4))
 
 @pytest.mark.paper
 def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
-    """One kind of value in each field of every schema; each kind and each scenario is somewhere."""
+    """One kind of value in each field of every schema; each kind and each scenario is somewhere.
+
+    `info`, whose checks are those of `lint`, gets each kind and each scenario.
+    """
     schemas = {(schema_of(each), each.field): each for each in reversed(SAMPLE)}
     kinds = {each.kind: each for each in reversed(SAMPLE)}
     scenarios = {each.scenario: each for each in reversed(SAMPLE)}
-    chosen = {*schemas.values(), *kinds.values(), *scenarios.values()}
     assert len(schemas) > 50
-    assert [wrong for each in SAMPLE if each in chosen for wrong in complaints(each, QUICK)] == []
+    chosen = dict.fromkeys(schemas.values(), QUICK[1:])
+    chosen |= dict.fromkeys((*kinds.values(), *scenarios.values()), QUICK)
+    assert [wrong for each, lines in chosen.items() for wrong in complaints(each, lines)] == []
 
 
 def schema_of(planted: Planted) -> str:

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import chdir, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ from PIL import Image
 from fuselog.pipeline.command_line.group import fuselog
 from fuselog.pipeline.command_line.options import Output
 from fuselog.replay.timeline import viewer
-from tests.pipeline.conftest import Said, run_here
+from tests.pipeline.conftest import Said, run_here, shadowed
 from tests.pipeline.outputs_audit import (
     COMMANDS,
     SETTINGS,
@@ -78,11 +78,11 @@ def _painted() -> Iterator[None]:
 def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of inputs, and in `ours` what every command writes where nothing is in the place.
 
-    There each writes nothing else.
+    There each writes nothing else, and imports no module of the folder.
     """
     folder = tmp_path_factory.mktemp("audit")
     ours = folder / "ours"
-    with chdir(folder):
+    with shadowed(folder):
         prepare()
         earlier = _state(folder)
         ours.mkdir()
@@ -354,43 +354,20 @@ def test_the_root_is_no_result_folder(here: Path) -> None:
         _check_refusal(run_here(*command.split(), "--out", "/"), here, _state(here), "is the root")
 
 
-# Names of modules that Python, a library or fuselog imports sooner or later.
-SHADOWS = (
-    *(
-        "abc",
-        "argparse",
-        "click",
-        "collections",
-        "distributed",
-        "fuselog",
-        "json",
-        "logging",
-        "matplotlib",
-    ),
-    *("numba", "numpy", "pandas", "pickle", "pipeline", "psutil", "pydantic", "random", "recorders"),
-    *("replay", "reprlib", "rerun", "rerun_cli", "rich", "scipy", "sitecustomize", "socket", "struct"),
-    *("subprocess", "threading", "usercustomize"),
-)
-SHADOW = """
-import os, sys
-with open(os.environ["SHADOWED"], "a") as told:
-    print(__file__, *sys.argv, file=told)
-"""
-# Starts a worker as `--workers` and `--scheduler local:1` do, then runs commands one after another,
-# with the path that the console script has.
+# Starts a worker as `--workers` does, then runs commands one after another, with the path that the
+# console script has.
 DRIVER = """
 import json, sys
 from matplotlib.figure import Figure
 from fuselog.pipeline.command_line import main
-from fuselog.pipeline.runs.executors import dask, processes
+from fuselog.pipeline.runs.executors import processes
 if __name__ == "__main__":
     Figure.draw = lambda *_: None
-    for workers in (processes(1), dask("local:1")):
-        with workers() as pool:
-            assert pool.executor.submit(abs, -1).result() == 1
+    with processes(1)() as pool:
+        assert pool.executor.submit(abs, -1).result() == 1
     print(json.dumps([main(words) for words in json.load(sys.stdin)]))
 """
-# Commands without an output, and further ones that start processes: filters of others, and the viewer.
+# Commands without an output, and those that start processes: filters of others, and the viewer.
 OTHERS = """
 cache
 estimators
@@ -405,41 +382,35 @@ observability run.mcap
 replay run.mcap -e exec:/bin/true -o a.mcap
 replay run.mcap -e lib:./junk.so -o b.mcap
 report result --viewer --out viewer.html
+view result/timeline.rrd --screenshot view.png
 """
 # The viewer where there is no graphics driver, and filters that are none.
 MAY_FAIL = {"view", "report", "replay"}
 
 
 def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path: Path) -> None:
-    """Nor do the processes that commands start."""
-    for name in SHADOWS:
-        (here / f"{name}.py").write_text(SHADOW)
-    (here / "junk.so").write_bytes(b"no library")
-    by_name = {
-        each.words[0]: each.to(Path(f"{each.words[0]}{each.suffix}")) for each in COMMANDS.values()
-    }
-    lines = [*by_name.values(), *map(str.split, OTHERS.strip().splitlines())]
-    assert {words[0] for words in lines} == fuselog.commands.keys() - {"explore"}
-    driver, told = tmp_path / "driver.py", tmp_path / "told"
-    driver.write_text(DRIVER)
-    environment = os.environ | {"SHADOWED": str(told)}
+    """Nor do the processes that commands start; `before` has the commands with an output.
 
-    done = subprocess.run(
-        [sys.executable, driver],
-        input=json.dumps(lines),
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    failed = zip(lines, json.loads(done.stdout.splitlines()[-1]), strict=True)
-    assert {words[0] for words, code in failed if code} <= MAY_FAIL, done.stderr
-    script = Path(sys.executable).with_name("fuselog")
-    command = [script, "explore", "run.mcap", "-e", "ekf", "--no-browser"]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as exploring:
-        assert exploring.stdout is not None
-        assert b"http://" in exploring.stdout.readline()
-        exploring.terminate()
-    assert not told.exists(), told.read_text()
+    `test_campaigns.py` has the workers of Dask.
+    """
+    (here / "junk.so").write_bytes(b"no library")
+    lines = [*map(str.split, OTHERS.strip().splitlines())]
+    with_output = {each.words[0] for each in COMMANDS.values()}
+    assert with_output | {words[0] for words in lines} == fuselog.commands.keys() - {"explore"}
+    driver = tmp_path / "driver.py"
+    driver.write_text(DRIVER)
+    with shadowed(here):
+        done = subprocess.run(
+            [sys.executable, driver], input=json.dumps(lines), capture_output=True, text=True
+        )
+        failed = zip(lines, json.loads(done.stdout.splitlines()[-1]), strict=True)
+        assert {words[0] for words, code in failed if code} <= MAY_FAIL, done.stderr
+        script = Path(sys.executable).with_name("fuselog")
+        command = [script, "explore", "run.mcap", "-e", "ekf", "--no-browser"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as exploring:
+            assert exploring.stdout is not None
+            assert b"http://" in exploring.stdout.readline()
+            exploring.terminate()
 
 
 def test_settings_of_numba_in_the_current_folder_are_refused(here: Path) -> None:

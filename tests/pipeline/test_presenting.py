@@ -29,13 +29,14 @@ from fuselog.replay.timeline import catalog, viewer
 from fuselog.replay.timeline.show import read_moments
 
 pytest.importorskip("datafusion")
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 Fuselog = Callable[..., Any]
 RUNS = 5
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory, fuselog: Fuselog) -> Path:
+def result(tmp_path_factory: pytest.TempPathFactory, fuselog: Fuselog, blank_figures: None) -> Path:
     """A result of five runs, of which one log was kept; others add to what is next to it."""
     folder = tmp_path_factory.mktemp("presenting") / "result"
     options = ["--runs", RUNS, "--logs", 1, "--set", "duration_s=2", "--out", folder]

@@ -26,22 +26,25 @@ def test_the_readmes_line_completes_commands_options_names_and_settings() -> Non
     """What bash offers after what was typed so far, once the line has been run."""
     page = (ROOT / "README.md").read_text(encoding="utf-8")
     (line,) = re.findall(r"^eval .*_FUSELOG_COMPLETE=bash_source.*$", page, re.MULTILINE)
-    for words, expected in {
+    offered = {
         "fuselog re": {"record", "replay", "report"},
         "fuselog cache --": {"--clear"},
         "fuselog record landm": {"landmarks", "landmarks-adverse"},
         "fuselog replay run.mcap -e vehicle": {"vehicles", "vehicle-kalman", "vehicle-particles"},
         "fuselog replay run.mcap -e ekf --set ekf.sigma_ra": {"ekf.sigma_range_m"},
         "fuselog record landmarks --set dur": {"duration_s"},
-    }.items():
-        last = len(words.split()) - 1
-        script = (
-            f"{line}\nCOMP_WORDS=({words}); COMP_CWORD={last}\n"
-            "_fuselog_completion fuselog\nprintf '%s\\n' \"${COMPREPLY[@]}\""
-        )
-        environment = {**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
-        done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True)
-        assert expected <= set(done.stdout.split()), done
+    }
+    asked = "".join(
+        f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}; COMPREPLY=()\n"
+        '_fuselog_completion fuselog\necho "${COMPREPLY[*]}"\n'
+        for words in offered
+    )
+    environment = {**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-c", f"{line}\n{asked}"], env=environment, capture_output=True, text=True
+    )
+    for expected, told in zip(offered.values(), done.stdout.splitlines(), strict=True):
+        assert expected <= {*told.split()}, done
 
 
 @pytest.mark.paper

@@ -3,14 +3,18 @@
 import re
 from collections.abc import Callable
 from contextlib import chdir
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fuselog.pipeline.calibrating import study as calibration
+from fuselog.pipeline.calibrating.manoeuvres import drive
 from fuselog.pipeline.output.results import read_result
 from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
+from fuselog.pipeline.runs.runner import Runner
 from tests.claims.few_runs import opposite
 from tests.pipeline.conftest import assert_whole
 
@@ -98,6 +102,14 @@ WITHOUT_TIMELINE = {
     "tuning",
 }
 
+DRAW = Runner.draw
+
+
+def draw_first_case(runner: Runner, sources: Any, outputs: Any, folder: str = "") -> None:
+    """Draw the timeline of an experiment, and none of its further cases."""
+    if not folder:
+        DRAW(runner, sources, outputs)
+
 
 def test_each_that_ships_its_data_has_a_smallest_form_or_a_study() -> None:
     """Others import data, and `test_report` makes pages of their kept results."""
@@ -114,8 +126,14 @@ def test_each_that_ships_its_data_has_a_smallest_form_or_a_study() -> None:
 def test_its_smallest_form_is_run_reported_and_viewed(
     name: str, tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of faults together the first cause is sought; `test_battery.py` has several at once."""
+    """Of faults together the first cause is sought; `test_battery.py` has several at once.
+
+    Cars drive for a quarter of the time; `test_calibrating.py` has a whole drive. Of several cases the
+    timeline of the first is drawn; tests of studies draw those of all.
+    """
     monkeypatch.setattr("fuselog.pipeline.diagnosing.battery.together.MOST_SENTENCES", 1)
+    monkeypatch.setattr(calibration, "drive", partial(drive, duration_s=30.0))
+    monkeypatch.setattr(Runner, "draw", draw_first_case)
     runs, *settings = SMALLEST[name]
     smaller = [*runs.split(), *(part for each in settings for part in ("--set", each))]
     with chdir(tmp_path):

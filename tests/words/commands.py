@@ -89,6 +89,7 @@ def texts(folder: Path) -> dict[str, str]:
             found[command].append(_said([command, *others]))
         said: set[str] = set()
         for name in PAGES:
+            assert Path(name).is_file(), "\n".join(each for those in found.values() for each in those)
             lines = [*_page(Path(name).read_text(encoding="utf-8"))]
             found["report"].append(
                 f"# {name}\n" + "\n".join(each for each in lines if each not in said) + "\n"
