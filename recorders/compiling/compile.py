@@ -152,7 +152,8 @@ def _share(
     per_run: Sequence[KernelArgument] | None = None,
 ) -> None:
     """Share the runs among the cores."""
-    cores, lent = min(runs, core_count()), list[Memory]()
+    lent: list[Memory] = []
+    cores = min(runs, core_count())
 
     def prepared() -> Callable[[int, int], None]:
         if per_run is not None:

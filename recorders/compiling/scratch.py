@@ -6,19 +6,22 @@ from fuselog.recorders.compiling.kinds import KernelArgument
 
 
 class Memory:
-    """The working memory of one core, with its description for a kernel."""
+    """The working memory of one core, with its description for a kernel.
 
-    __slots__ = ("described", "value")
+    `is_kept` states whether it is kept for later calls, and so shares no arrays with other arguments.
+    """
 
-    def __init__(self, value: KernelArgument) -> None:
-        self.value = value
+    __slots__ = ("described", "is_kept", "value")
+
+    def __init__(self, value: KernelArgument, *, is_kept: bool = False) -> None:
+        self.value, self.is_kept = value, is_kept
         self.described: KernelArgument = None
 
 
 class Scratch:
     """A pool of working memory for the argument `scratch` of a loop, kept for later calls.
 
-    One instance serves one loop with arguments of the same sizes.
+    One instance serves one loop with arguments of the same sizes. The memory shares no arrays with them.
     """
 
     def __init__(self, make: Callable[[], KernelArgument]) -> None:
@@ -34,7 +37,7 @@ class Scratch:
         try:
             return self._free.pop()
         except IndexError:
-            return Memory(self._make())
+            return Memory(self._make(), is_kept=True)
 
     def take_back(self, memories: Sequence[Memory]) -> None:
         """Return memories to the pool when they are no longer in use."""

@@ -75,7 +75,7 @@ class Schema:
     def __iter__(self) -> Iterator[Field]:
         return iter(self.fields)
 
-    @property
+    @cached_property
     def full_name(self) -> str:
         """Return the protobuf name, such as `fuselog.Bearing`."""
         return f"{self.package}.{self.name}" if self.package else self.name

@@ -5,25 +5,30 @@ data and of the sizes.
 """
 
 import operator
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from fuselog.recorders.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
 from fuselog.recorders.compiling.kernels.values import STORED, Array, Record, combined
-from fuselog.recorders.compiling.kinds import Value
+from fuselog.recorders.compiling.kinds import AnyArray, Value
 from fuselog.recorders.errors import BadInput
 
 KNOWN = 64  # sizes up to this are constants of a kernel, and so are those of square matrices
 
 
 class KnownArray(NamedTuple):
-    """The layout of an array: NumPy's type letter, sizes (None if unknown), and contiguity."""
+    """The layout of an array: NumPy's type letter, sizes (None if unknown), and contiguity.
+
+    `is_apart` is true if no other array of the kernel shares its memory, as for most working memory.
+    """
 
     letter: str
     shape: tuple[int | None, ...]
     is_packed: bool
+    is_apart: bool = False
 
 
 _LETTERS: dict[str, str] = {np.dtype(stored).char: stored for stored in STORED}
@@ -36,35 +41,55 @@ _LAYOUT = _PACKED | _ALIGNED
 _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
 
 
-def describe(value: Value, varies: int, kinds: list[Value], numbers: list[Value]) -> None:
-    """Append an argument's kinds, for the kernel's key, and its words, for the call.
+def describe(values: Iterable[Value], varies: int, kinds: list[Value], numbers: list[Value]) -> None:
+    """Append the kinds of arguments, for the kernel's key, and their words, for the call.
 
-    The sizes of the first `varies` axes of an array are not part of the kinds. If a NamedTuple has an
+    The sizes of the first `varies` axes of arrays are not part of the kinds. If a NamedTuple has an
     attribute `varies`, it states this number for each of the fields.
     """
-    if isinstance(value, np.ndarray):
-        shape = value.shape
-        kinds.append((value.dtype, len(shape), shape[varies:], value.flags.num & _LAYOUT))
-        numbers.append(id(value))
-    elif isinstance(value, tuple):
-        kinds.append((type(value), len(value)))
-        own = getattr(value, "varies", None)
-        if own is None:
-            for each in value:
-                describe(each, varies, kinds, numbers)
+    for value in values:
+        if isinstance(value, np.ndarray):
+            shape = value.shape
+            kinds.append((value.dtype, len(shape), shape[varies:], value.flags.num & _LAYOUT))
+            numbers.append(id(value))
+        elif isinstance(value, tuple):
+            kinds.append((type(value), len(value)))
+            own = getattr(value, "varies", None)
+            if own is None:
+                describe(value, varies, kinds, numbers)
+            else:
+                for each, axes in zip(value, own, strict=True):
+                    describe((each,), axes, kinds, numbers)
         else:
-            for each, axes in zip(value, own, strict=True):
-                describe(each, axes, kinds, numbers)
-    else:
-        kinds.append(type(value))
-        numbers.append(value)
+            kinds.append(type(value))
+            numbers.append(value)
 
 
-def with_types(value: Value, kinds: Iterator[Value]) -> Value:
-    """Convert an argument's kinds in the key to the description that `value_of` needs."""
+def are_apart(value: Value) -> tuple[bool, ...]:
+    """Test for each array in an argument whether it shares no memory with the others.
+
+    Two arrays share memory if they are views of one array, or one is a view of the other.
+    """
+    owners = [id(each if each.base is None else each.base) for each in _arrays_in(value)]
+    uses = Counter(owners)
+    return tuple(uses[each] == 1 for each in owners)
+
+
+def _arrays_in(value: Value) -> Iterator[AnyArray]:
+    if isinstance(value, np.ndarray):
+        yield value
+    for each in value if isinstance(value, tuple) else ():
+        yield from _arrays_in(each)
+
+
+def with_types(value: Value, kinds: Iterator[Value], apart: Iterator[bool]) -> Value:
+    """Convert an argument's kinds in the key to the description that `value_of` needs.
+
+    `apart` has an entry for every array; see `KnownArray`.
+    """
     kind = next(kinds)
     if isinstance(value, tuple):
-        return type(value), tuple(with_types(each, kinds) for each in value)
+        return type(value), tuple(with_types(each, kinds, apart) for each in value)
     if isinstance(value, np.ndarray):
         dtype, axes, known, layout = kind
         is_usual = layout & _ALIGNED and dtype.isnative
@@ -74,7 +99,7 @@ def with_types(value: Value, kinds: Iterator[Value]) -> Value:
         is_square = len(known) > 1 and known[-1] == known[-2]
         sizes = (size if size <= KNOWN or is_square else None for size in known)
         shape = (*(None,) * (axes - len(known)), *sizes)
-        return KnownArray(dtype.char, shape, bool(layout & _PACKED))
+        return KnownArray(dtype.char, shape, bool(layout & _PACKED), next(apart))
     for types, name in _SCALARS:
         if issubclass(kind, types):
             return name
@@ -142,4 +167,4 @@ def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
             text = f"sdiv exact i64 {step}, {np.dtype(dtype).itemsize}"
             strides.append(emitter.number(WHOLE, text).code)
     data = _loaded_from("ptr", emitter, structure, _DATA)
-    return Array(dtype, data, tuple(shape), tuple(strides))
+    return Array(dtype, data, tuple(shape), tuple(strides), is_apart=kind.is_apart)

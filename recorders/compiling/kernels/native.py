@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
-from itertools import count
+from itertools import count, repeat
 from pathlib import Path
 from struct import Struct
 from threading import Lock
@@ -33,7 +33,13 @@ from fuselog.recorders.compiling.cache import (
     write_checked,
 )
 from fuselog.recorders.compiling.identity import digest_of, identity
-from fuselog.recorders.compiling.kernels.arguments import describe, letters, value_of, with_types
+from fuselog.recorders.compiling.kernels.arguments import (
+    are_apart,
+    describe,
+    letters,
+    value_of,
+    with_types,
+)
 from fuselog.recorders.compiling.kernels.lowering import lower
 from fuselog.recorders.compiling.kernels.numbers import WHOLE, Emitter, Number
 from fuselog.recorders.compiling.kernels.program import Program
@@ -47,21 +53,25 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class _Layout:
-    """The kinds of a core's working memory; equal kinds share one object, which makes lookup fast."""
+    """The kinds of a core's working memory; equal kinds share one object, which makes lookup fast.
 
-    def __init__(self, kinds: tuple[Value, ...]) -> None:
-        self.kinds = kinds
+    `apart` states for each array whether it is known to share no memory with other arrays.
+    """
+
+    def __init__(self, kinds: tuple[Value, ...], apart: tuple[bool, ...]) -> None:
+        self.kinds, self.apart = kinds, apart
 
 
 _layout_of = cache(_Layout)
 
 
-def _described(memory: Value) -> tuple[_Layout, list[Value]]:
+def _described(memory: Memory) -> tuple[_Layout, list[Value]]:
     """Describe working memory: its kinds, with all sizes known, and the words to pass."""
     kinds: list[Value] = []
     words: list[Value] = []
-    describe(memory, 0, kinds, words)
-    return _layout_of(tuple(kinds)), words
+    describe((memory.value,), 0, kinds, words)
+    apart = are_apart(memory.value)
+    return _layout_of(tuple(kinds), apart if memory.is_kept else (False,) * len(apart)), words
 
 
 class Kernel:
@@ -87,22 +97,18 @@ class Kernel:
         """
         kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Value] = []
-        for each in arguments:
-            describe(each, varies, kinds, numbers)
+        describe(arguments, varies, kinds, numbers)
         layout_of_memory = None
         if memory is not None:
-            memory.described = memory.described or _described(memory.value)
+            memory.described = memory.described or _described(memory)
             layout_of_memory, words = memory.described
             numbers += words
         key = layout_of_memory, *kinds
         known = self._entries.get(key)
         if known is None:
             with self._lock:
-                if memory is not None and layout_of_memory is not None:
-                    arguments = *arguments, memory.value
-                    kinds += layout_of_memory.kinds
                 known = self._entries.get(key) or self._entries.setdefault(
-                    key, self._layout_and_entry(arguments, iter(kinds))
+                    key, self._layout_and_entry(arguments, iter(kinds), memory)
                 )
         layout, entry = known
         given = layout.pack(*numbers)
@@ -113,11 +119,14 @@ class Kernel:
         return loop
 
     def _layout_and_entry(
-        self, arguments: Sequence[Value], kinds: Iterator[Value]
+        self, arguments: Sequence[Value], kinds: Iterator[Value], memory: Memory | None
     ) -> tuple[Struct, KernelFunction]:
         """Make the structure that packs arguments of these kinds, and the entry that takes them."""
         is_checked = next(kinds)
-        described = tuple(with_types(each, kinds) for each in arguments)
+        described = tuple(with_types(each, kinds, repeat(False)) for each in arguments)
+        if memory is not None:
+            layout, _ = memory.described
+            described += (with_types(memory.value, iter(layout.kinds), iter(layout.apart)),)
         key = is_checked, described
         if key not in self._loaded:
             make = _checked_entry if is_checked else _kept_entry

@@ -47,7 +47,8 @@ STORED = {
 class Array:
     """An array: its element type, its address, its sizes, and its strides in elements.
 
-    `is_local` is True if its memory is released when the function that made it returns.
+    `is_local` is True if its memory is released when the function that made it returns, `is_apart` if no
+    other argument of the kernel shares its memory.
     """
 
     dtype: str
@@ -55,6 +56,7 @@ class Array:
     shape: tuple[Size, ...]
     strides: tuple[Size, ...]
     is_local: bool = False
+    is_apart: bool = False
 
     @property
     def turned(self) -> "Array":
@@ -86,7 +88,7 @@ def leaves(value: Value) -> Iterator[Leaf]:
     if isinstance(value, Number):
         yield value.type, value.code
     elif isinstance(value, Array):
-        yield POINTER, value.pointer
+        yield f"{POINTER} noalias" if value.is_apart else POINTER, value.pointer
         for size in (*value.shape, *value.strides):
             if isinstance(size, str):
                 yield WHOLE, size

@@ -342,10 +342,12 @@ def specified(label: str, settings: Mapping[str, Setting]) -> tuple[AnyEstimator
 def code_of(name: str) -> Iterator[None]:
     """Add the estimator's name to exceptions that its code raises and to compilation errors."""
     try:
-        with foreign_code(f"estimator {name}"):
-            yield
+        yield
     except DoesNotCompile as error:
         raise BadInput(f"estimator {name}: {error}") from error
+    except Exception:
+        with foreign_code(f"estimator {name}"):
+            raise
 
 
 def bound_to(

@@ -282,7 +282,7 @@ class RunMonitor:
             found,
             scratch=_memory_of(size),
         )
-        (bad,) = np.nonzero(found != SOUND)
+        (bad,) = (found != SOUND).nonzero()
         for run in bad:
             row = rows[run]
             first = row == estimates.offsets[run]
@@ -310,8 +310,9 @@ class RunMonitor:
         Runs that have already failed are excluded.
         """
         coverages = [self._coverages[case] for case in self._states]
-        reaches_end = ((coverage.last_ns == self._last_ns).all() for coverage in coverages)
-        if not coverages or (not self._is_batch and any(reaches_end)):
+        ends = self._last_ns.tobytes()
+        reaches_end = any(coverage.last_ns.tobytes() == ends for coverage in coverages)
+        if not coverages or (not self._is_batch and reaches_end):
             return
         mute = ~reduce(np.logical_or, (coverage.has_estimates for coverage in coverages))
         found = mute

@@ -125,7 +125,7 @@ def copied(carried: CarriedType) -> CarriedType:
     """Copy a NamedTuple of arrays, which may contain other such NamedTuples."""
     columns: Columns = carried
     made: type[CarriedType] = type(carried)
-    return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
+    return made(*[copied(each) if isinstance(each, tuple) else each.copy() for each in columns])
 
 
 def of_runs(carried: CarriedType, runs: RowSlice) -> CarriedType:
@@ -184,7 +184,7 @@ def filled_rows(
     Returns:
         The filled rows (n,), or a slice if all rows are filled, and their offsets (runs + 1,).
     """
-    if (end == offsets[1:]).all():
+    if end.tobytes() == offsets[1:].tobytes():
         return slice(None), offsets
     run = run_of_rows(offsets)
     filled = np.arange(len(run)) < end[run]

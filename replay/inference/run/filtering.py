@@ -359,7 +359,7 @@ class Filter:
             results = RunResults(estimates._replace(end=ends[0]), innovations._replace(end=ends[1]))
             loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=scratch)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
-        if (carried.failure != before.failure).any():
+        if carried.failure.tobytes() != before.failure.tobytes():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
         after = state._replace(carried=carried, generators=generators)

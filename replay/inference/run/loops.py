@@ -87,7 +87,8 @@ def over_events(process: OnEvent, record: OnEvent, *, fails: bool = True) -> Fol
         results: AnyArgument,
         memory: AnyArgument,
     ) -> None:
-        for event in range(inputs.events.offsets[run], inputs.events.offsets[run + 1]):
+        begin = max(inputs.events.offsets[run], 0)  # so that no event counts from the end
+        for event in range(begin, inputs.events.offsets[run + 1]):
             has_failed = state.failure[run] != ALL_WELL if fails else False
             if has_failed:
                 break

@@ -8,7 +8,7 @@ ignored. The run ends when its belief becomes invalid.
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fuselog.recorders.log import schemas
 from fuselog.recorders.log.streams import computed_stream
-from fuselog.replay.engine.arrays import AnyArgument, Columns, Floats, Integers, RowSlice
+from fuselog.replay.engine.arrays import AnyArgument, Columns, Floats, Integers
 from fuselog.replay.engine.streams.blocks import Ragged, filled_rows
 from fuselog.replay.engine.streams.results import ALL_WELL, rows_of
 from fuselog.replay.inference.kalman.steps import (
@@ -170,30 +170,25 @@ def no_results(
         model: the model, for the sizes of state and tangent space.
         innovation_size: number of distinct components that the sensors measure.
     """
-    places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
-    memory = np.empty(places[-1][0].stop)
-    time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
-        memory[place].reshape(shape) for place, shape in places
-    )
-    estimates = EstimateRows(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
-    reference = target_id.view(np.uint32)[: len(target_id)]
-    innovations = InnovationRows(
-        recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
-    )
-    return estimates, innovations
+    size, places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
+    memory = np.empty(size, np.uint8)
+    columns = [np.ndarray(shape, dtype, memory, offset) for shape, dtype, offset in places]
+    estimates = EstimateRows(due[:-1].copy(), *columns[:3])
+    return estimates, InnovationRows(recorded[:-1].copy(), *columns[3:])
 
 
 @lru_cache(maxsize=64)
 def _places(
     estimates: int, innovations: int, n: int, t: int, m: int
-) -> tuple[tuple[RowSlice, tuple[int, ...]], ...]:
-    """Return the slice of the shared array and the shape of each column of the results."""
+) -> tuple[int, tuple[tuple[tuple[int, ...], str, int], ...]]:
+    """Return the size of the shared memory, and the shape, type and offset of each column, in bytes."""
+    types = "i8", "f8", "f8", "i8", "u4", "f8", "f8", "f8"
     shapes = (
         *((estimates, *shape) for shape in ((), (n,), (t, t))),
         *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
     )
-    ends = accumulate(map(math.prod, shapes), initial=0)
-    return tuple((slice(*both), shape) for both, shape in zip(pairwise(ends), shapes, strict=True))
+    *begins, size = accumulate((8 * math.prod(shape) for shape in shapes), initial=0)
+    return size, tuple(zip(shapes, types, begins, strict=True))
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:

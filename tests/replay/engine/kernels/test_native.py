@@ -19,6 +19,7 @@ import pytest
 from fuselog.recorders.compiling.compile import compile_over_runs
 from fuselog.recorders.compiling.identity import identity
 from fuselog.recorders.compiling.kernels import arguments, native
+from fuselog.recorders.compiling.scratch import Scratch
 from fuselog.replay.engine.arrays import varying
 
 # --- the key -----------------------------------------------------------------------------------------
@@ -167,6 +168,40 @@ def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, 
         assert out.tolist() == [1000.0 * columns + width + 1.0] * runs
         assert len(made) == min(count + 1, 4)
     assert len(list(kernels.iterdir())) == 4
+
+
+def overwritten(run: int, out: np.ndarray, work: tuple[np.ndarray, np.ndarray]) -> None:
+    first, second = work
+    first[0] = 1.0
+    second[0] = 2.0
+    out[run] += first[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: (np.empty(2), np.empty(2)), 1.0),
+        (lambda: (np.empty(2),) * 2, 2.0),
+        (lambda: (lambda whole: (whole, whole[:]))(np.empty(2)), 2.0),
+        (lambda: (lambda whole: (whole[0], whole[0]))(np.empty((1, 2))), 2.0),
+    ],
+    ids=["apart", "the same", "a view", "two views"],
+)
+@pytest.mark.usefixtures("kernels")
+def test_only_working_memory_that_is_not_shared_is_taken_to_be_apart(
+    make: Callable[[], tuple[np.ndarray, ...]], expected: float
+):
+    loop, own = compile_over_runs(overwritten), np.zeros(2)
+    for memory in [lambda: (np.empty(2), np.empty(2)), make]:  # the same kinds, shared otherwise
+        out = np.zeros(2)
+        loop(1, out, scratch=Scratch(memory))
+    assert out[0] == expected
+    loop(1, own, scratch=lambda: (np.empty(2), own))  # made for this call, so of its arguments
+    assert own.tolist() == [3.0, 0.0]
+    assert arguments.are_apart(make()) == (expected == 1.0,) * 2
+    known = [arguments.KnownArray("d", (2,), True, is_apart=each) for each in (False, True)]
+    text = native.program_of(overwritten, (known[0], (tuple, (known[1],) * 2))).text()
+    assert text.count("ptr noalias") == 4  # of two arrays, where they are defined and where given
 
 
 # --- what is kept ------------------------------------------------------------------------------------
