@@ -314,6 +314,22 @@ def test_intervals_of_delays_hold_the_truth_as_often_as_they_say() -> None:
     assert (found["high"] - found["low"]).median() < 0.08
 
 
+@pytest.mark.parametrize("has_prior", [True, False])
+def test_points_cost_together_what_each_costs_alone(*, has_prior: bool) -> None:
+    """Also those with other delays, of which one puts fixes after the end, and those that fail."""
+    log = recorded(drive(1, duration_s=10.0))
+    given = {name: log.streams[name] for name in log.topics if has_prior or "prior" not in name}
+    run = Run(Trial("ekf", Ensemble([replace(log, streams=given)]), OPEN))
+    objective = Objective(["forward_scale", "fix_delay_s"], [run], "likelihood", 0.2)
+    objective.begin(np.array([1.0, 0.0]))
+    objective.correct(np.array([1.0, 0.0]))
+    points = np.array([[1.0, 0.0], [1.1, 0.0], [1.0, 0.3], [0.9, -0.2], [1e200, 0.1], [-1.0, 0.1]])
+    together = objective(points)
+    assert together.tolist() == [objective(point[None]).item() for point in points]
+    assert len({*together.tolist()}) == len(points)
+    assert np.isinf(together).tolist() == [False, False, False, False, True, False]
+
+
 def test_noise_that_is_added_cancels_among_nearby_messages() -> None:
     log = recorded(drive(1, duration_s=10.0))
     bound = bind("ekf", [log], {"kind": "ekf"})
