@@ -12,7 +12,7 @@ with Applications to Tracking and Navigation, 2001, section 5.4; Durbin and Koop
 by State Space Methods, 2nd ed. 2012, chapter 7.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.pipeline.runs.trials import Trial
+from fuselog.pipeline.runs.trials import Trial, alike, in_memory_together, together
 from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
@@ -41,7 +41,6 @@ from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
-MOST_MESSAGES = 300_000  # largest number of messages of the runs that are replayed together
 EVER_NS = 2**62
 ROOM_NS = 86_400 * 10**9  # room for earlier stamps
 LEAST_SCORED = 0.5  # share of the measurements; a trial that scores fewer cannot be compared
@@ -145,16 +144,17 @@ class Likelihood:
 
         The log-likelihoods are minus infinity if the estimator fails or loses measurements.
         """
-        together: dict[Hashable, list[int]] = {}
+        groups: dict[Hashable, list[int]] = {}
         bound: dict[int, list[Bound]] = {}
         for place, trial in enumerate(trials):
             stated, key = _stated_by(trial), _key(trial)
             with suppress(BadInput):  # no run fits these settings
                 bound[place] = self._bound_to(trial, (key, stated))
-                together.setdefault((_alike(bound[place]) or key, stated), []).append(place)
+                groups.setdefault((alike(bound[place]) or key, stated), []).append(place)
         found = np.full((len(trials), count), -np.inf)
-        for alike in together.values():
-            for places in self._parts(trials, alike):
+        for group in groups.values():
+            repeated = [trials[group[0]].source] * part_count(self.starts)
+            for places in in_memory_together(group, repeated):
                 known = _Known()
                 scored = [self._scored(trials[place], bound[place], known) for place in places]
                 outputs = self._innovations([bound[place] for place in places], scored)
@@ -166,12 +166,6 @@ class Likelihood:
         """Make copies of a trial with noise added to the controls of its log."""
         copies = disturbed(trial.source, self._bound_to(trial))
         return [replace(trial, runs=[each]) for each in copies]
-
-    def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
-        """Divide trials into groups that fit in memory."""
-        messages = sum(map(len, trials[places[0]].source.streams.values())) * part_count(self.starts)
-        size = max(1, MOST_MESSAGES // max(messages, 1))
-        return (places[first : first + size] for first in range(0, len(places), size))
 
     def _bound_to(self, trial: Trial, key: Hashable = None) -> list[Bound]:
         key = key or (_key(trial), _stated_by(trial))
@@ -216,7 +210,7 @@ class Likelihood:
     ) -> list[list[dict[str, Stream]]]:
         """Replay trials of similar estimators; return innovations by part and topic, {} if they fail."""
         count = part_count(self.starts)
-        bound = [_together(each, count) for each in zip(*bounds, strict=True)]
+        bound = [together(each, count) for each in zip(*bounds, strict=True)]
         sources = [each.source for each in scored for _ in range(count)]
         begins_ns = [each.begin_ns for each in scored]
         try:
@@ -379,21 +373,6 @@ def _stated_by(trial: Trial) -> Hashable:
 
 def _key(trial: Trial) -> str:
     return repr(sorted(trial.settings.items()))
-
-
-def _alike(bound: Sequence[Bound]) -> Hashable:
-    """Return a key that is equal for estimators that can be replayed together; None for all others."""
-    keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
-    return tuple(keys) if len(keys) == len(bound) else None
-
-
-def _together(bounds: Sequence[Bound], count: int) -> Bound:
-    """Make one estimator for the runs of all trials: `count` runs with the parameters of each trial."""
-    first = bounds[0]
-    alike = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
-    if all(each is first for each in bounds):
-        return first
-    return alike[0].together(np.repeat([each.numbers for each in alike], count, axis=0))
 
 
 def _extents(stream: Stream) -> Floats:

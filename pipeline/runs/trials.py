@@ -1,16 +1,20 @@
 """An estimator with runs in memory, for repeated replays with other settings or altered runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
 
+import numpy as np
+
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.recorders.parameters import merge, nested
-from fuselog.replay.engine.replaying.estimator import Bound, bind
+from fuselog.replay.engine.replaying.estimator import Bound, Recursive, bind
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Ragged
 from fuselog.replay.engine.streams.sources import MemorySource
+
+MOST_MESSAGES = 300_000  # largest number of messages of the runs that are replayed together
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,28 @@ class Trial:
     def outputs(self) -> dict[str, Ragged]:
         """Replay the runs, and return the outputs by topic; raise BadInput as `replay` does."""
         return collect(replay(self.runs, self.bind()))
+
+
+def alike(bound: Sequence[Bound]) -> Hashable:
+    """Return a key that is equal for estimators that can be replayed together; None for all others."""
+    keys = [each.alike.key for each in bound if isinstance(each, Recursive) and each.alike]
+    return tuple(keys) if len(keys) == len(bound) else None
+
+
+def together(bounds: Sequence[Bound], count: int) -> Bound:
+    """Make one estimator of several that are alike, with the parameters of each for `count` runs."""
+    first = bounds[0]
+    if all(each is first for each in bounds):
+        return first
+    found = [each.alike for each in bounds if isinstance(each, Recursive) and each.alike]
+    return found[0].together(np.repeat([each.numbers for each in found], count, axis=0))
+
+
+def in_memory_together(places: Sequence[int], runs: Sequence[MemorySource]) -> Iterator[Sequence[int]]:
+    """Divide trials that all replay as many messages as `runs` into groups that fit in memory."""
+    messages = sum(len(stream) for run in runs for stream in run.streams.values())
+    size = max(1, MOST_MESSAGES // max(messages, 1))
+    return (places[first : first + size] for first in range(0, len(places), size))
 
 
 def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

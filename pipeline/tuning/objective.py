@@ -6,9 +6,9 @@ workers of a pool.
 """
 
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from fuselog.pipeline.runs.executors import WorkerPool, threads
-from fuselog.pipeline.runs.trials import Trial
+from fuselog.pipeline.runs.trials import Trial, alike, in_memory_together, together
 from fuselog.pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
@@ -33,7 +33,7 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.replaying.estimator import Bound, Estimator, Initialized, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
 from fuselog.replay.engine.streams.blocks import Ragged, gather
-from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.ensembles import Ensemble, ensemble_of
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, in_memory
 from fuselog.replay.judging.consistency.whiteness import whitened
@@ -64,6 +64,11 @@ class Run(NamedTuple):
     starts: Starts = {}
     parts: Ensemble[MemorySource] = Ensemble([])
     disturbed: Sequence[MemorySource] = ()
+
+    @property
+    def compared(self) -> Ensemble[MemorySource]:
+        """Return the runs whose likelihoods are compared: the log, or its copies for `starts`."""
+        return self.parts or ensemble_of(self.trial.runs)
 
 
 def log_in_memory(source: LogSource | MemorySource, bound: Iterable[Bound]) -> Ensemble[MemorySource]:
@@ -285,7 +290,7 @@ class Objective:
                     f"{name}: {self.label} fails with the start values of the search "
                     f"({failures[0]}); give other values with --set"
                 )
-            parts = self._parts(start, run)
+            parts = _outputs_of([self._bound(start, run)], run, run.compared)
             count = max(map(self._count, parts))
             total = self._total(parts, run, count)
             if self.by == "likelihood" and total and -np.inf in total.values():
@@ -377,28 +382,25 @@ class Objective:
 
     def lost_by_noise(self, points: Floats) -> Floats:
         """Compute the costs (n, pairs, 2) of pairs of opposite noises at points (n, k)."""
-        return np.array([
-            np.sum([self._lost(point, run, count) for run, count in self._corrected_runs], axis=0)
-            for point in points
-        ])  # fmt: skip
+        return np.sum([self._lost(points, run, count) for run, count in self._corrected_runs], axis=0)
 
     @property
     def _corrected_runs(self) -> list[tuple[Run, int]]:
         return [pair for pair in zip(self.runs, self._counts, strict=True) if pair[0].disturbed]
 
-    def _lost(self, values: Floats, run: Run, count: int) -> Floats:
-        """Compute the costs (pairs, 2) of pairs of opposite noises on one log; NaN if a replay fails."""
-        values = values.copy()
-        values[list(self.held)] = list(self.held.values())
+    def _lost(self, points: Floats, run: Run, count: int) -> Floats:
+        """Compute the costs (n, pairs, 2) of opposite noises on one log; NaN if a replay fails."""
+        points = points.copy()
+        points[:, list(self.held)] = list(self.held.values())
         size = part_count(run.starts)
         runs = Ensemble([each for each in (*run.trial.runs, *run.disturbed) for _ in range(size)])
-        outputs = self._outputs_of_parts(values, run, runs)
-        totals = [
-            self._total(outputs[first : first + size], run, count)
-            for first in range(0, len(outputs), size)
-        ]
-        without, *having = [np.nan if each is None else sum(each.values()) for each in totals]
-        return without - np.reshape(having, (-1, 2))
+        lost = []
+        for outputs in self._replayed(points, run, runs):
+            parts = (outputs[first : first + size] for first in range(0, len(runs), size))
+            totals = [self._total(each, run, count) for each in parts]
+            without, *having = [np.nan if each is None else sum(each.values()) for each in totals]
+            lost.append(without - np.reshape(having, (-1, 2)))
+        return np.array(lost)
 
     def begins_alike(self, values: Floats) -> bool:
         """Test whether filters would begin at the same stamps with these values (k,)."""
@@ -424,41 +426,41 @@ class Objective:
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """Replay a log with values (k,); return outputs by topic. Raise BadInput as `replay` does."""
-        bound = [
-            with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
-            for each in self._bound(values, run)
-        ]
-        return collect(replay(run.trial.runs, bound))
+        runs = ensemble_of(run.trial.runs)
+        [outputs] = _outputs_of([self._bound(values, run)], run._replace(starts={}), runs)
+        return outputs
 
     def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
         """Compute a log's sums at points (n, k); None at points where the number of messages changes."""
-        return [self._sums(point, run, count) for point in points]
+        parts = self._replayed(points, run, run.compared)
+        found = [self._total(each, run, count) for each in parts]
+        known = [place for place, total in enumerate(found) if total is not None]
+        if run.disturbed and known:
+            for place, lost in zip(known, self._lost(points[known], run, count), strict=True):
+                found[place] = {**(found[place] or {}), NOISE: float(np.mean(lost))}
+        return found
 
-    def _sums(self, values: Floats, run: Run, count: int) -> Sums | None:
-        try:
-            parts = self._parts(values, run)
-        except BadInput:  # for example, a batch that does not converge
-            return None
-        total = self._total(parts, run, count)
-        if total is None or not run.disturbed:
-            return total
-        return {**total, NOISE: float(np.mean(self._lost(values, run, count)))}
+    def _replayed(
+        self, points: Floats, run: Run, runs: Ensemble[MemorySource]
+    ) -> list[list[dict[str, Ragged]]]:
+        """Replay runs of a log at points (n, k); return outputs by point and run.
 
-    def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
-        """Return the outputs to compare, one set for each part of broad starts."""
-        if not run.starts:
-            return [self.outputs(values, run)]
-        return self._outputs_of_parts(values, run, run.parts)
-
-    def _outputs_of_parts(
-        self, values: Floats, run: Run, parts: Ensemble[MemorySource]
-    ) -> list[dict[str, Ragged]]:
-        """Return the outputs of an ensemble that repeats the log for each part of its starts."""
-        bound = [begun_at(each, run.starts) for each in self._bound(values, run)]
-        outputs = collect(replay(parts, bound)).items()
-        return [
-            {topic: gather([rows.of_run(part)]) for topic, rows in outputs} for part in range(len(parts))
-        ]
+        Points whose estimators differ only in numbers are replayed together. There are no outputs at a
+        point at which the estimator cannot be replayed, for example a batch that does not converge.
+        """
+        bound: dict[int, list[Bound]] = {}
+        groups: dict[Hashable, list[int]] = {}
+        for place, point in enumerate(points):
+            with suppress(BadInput):
+                bound[place] = self._bound(point, run)
+                groups.setdefault(alike(bound[place]) or place, []).append(place)
+        found: list[list[dict[str, Ragged]]] = [[] for _ in points]
+        for places in groups.values():
+            for some in in_memory_together(places, runs):
+                outputs = _outputs_by_point([bound[place] for place in some], run, runs)
+                for place, of_point in zip(some, outputs, strict=True):
+                    found[place] = of_point
+        return found
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
         """Sum over all parts; return None if all parts fail or their number of messages changes."""
@@ -497,6 +499,43 @@ def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
     }
 
 
+def _outputs_of(
+    bounds: Sequence[Sequence[Bound]], run: Run, runs: Ensemble[MemorySource]
+) -> list[dict[str, Ragged]]:
+    """Replay runs with each of some estimators that differ only in numbers; return outputs by run.
+
+    Raises BadInput as `replay` does.
+    """
+    ensemble = runs if len(bounds) == 1 else Ensemble([*runs] * len(bounds))
+    begun = [_begun(together(each, len(runs)), run) for each in zip(*bounds, strict=True)]
+    outputs = collect(replay(ensemble, begun)).items()
+    if len(ensemble) == 1:
+        return [dict(outputs)]
+    return [
+        {topic: gather([rows.of_run(run)]) for topic, rows in outputs} for run in range(len(ensemble))
+    ]
+
+
+def _outputs_by_point(
+    bounds: Sequence[Sequence[Bound]], run: Run, runs: Ensemble[MemorySource]
+) -> list[list[dict[str, Ragged]]]:
+    """Return the outputs of each estimator, by run; none if the estimator cannot be replayed."""
+    size = len(runs)
+    try:
+        found = _outputs_of(bounds, run, runs)
+    except BadInput:
+        alone = [] if len(bounds) == 1 else [_outputs_by_point([each], run, runs) for each in bounds]
+        return [found for [found] in alone] or [[]]
+    return [found[first : first + size] for first in range(0, len(found), size)]
+
+
+def _begun(bound: Bound, run: Run) -> Bound:
+    """Make an estimator that begins in every run as noted."""
+    if run.starts or bound.name not in run.begun:
+        return begun_at(bound, run.starts)
+    return with_find(bound, partial(_as_noted, run.begun[bound.name]))
+
+
 def _note(begun: dict[str, Initialized], bound: Bound, *first: Any) -> Initialized:
     initialization = initialization_of(bound)
     assert initialization is not None
@@ -504,8 +543,13 @@ def _note(begun: dict[str, Initialized], bound: Bound, *first: Any) -> Initializ
     return begun[bound.name]
 
 
-def _as_noted(opened: Initialized, *_: Any) -> Initialized:
-    return opened
+def _as_noted(begun: Initialized, first: Mapping[str, Ragged], *_: Any) -> Initialized:
+    """Repeat an initial state for every run."""
+    count = next(iter(first.values())).runs
+    return Initialized(
+        {topic: gather([rows.stream] * count) for topic, rows in begun.static.items()},
+        [gather([rows.stream] * count) for rows in begun.outputs],
+    )
 
 
 def _failures(outputs: Mapping[str, Ragged]) -> list[str]:

@@ -276,7 +276,7 @@ class Filter:
     @cached_property
     def delays_ns(self) -> Integers:
         """Delays of messages; see `delays_of`."""
-        return delays_of(self.bound_model, self.settings)
+        return delays_of(self.bound_model, self.settings if self.each_run is None else self.each_run)
 
     @cached_property
     def has_delays(self) -> bool:
@@ -301,7 +301,7 @@ class Filter:
             self.method,
             repr({name: value for name, value in self.parameters if name not in names}),
             origin_parameters(self.found, self.parameters),
-            self.delays_ns.tobytes(),
+            self.has_delays,
             self.gap_ns,
             *(
                 own_variances(self.bound_model, number, self.settings).tobytes()

@@ -40,16 +40,18 @@ def delays_of(bound_model: BoundModel, settings: Floats) -> Integers:
 
     Args:
         bound_model: the bound model, with the sensors of the log.
-        settings: (1 + sensors, fields); see `settings_of`.
+        settings: (1 + sensors, fields); see `settings_of`. Or (runs, 1 + sensors, fields).
 
     Returns:
-        (sensors + 2,) delays of the sensors, then 0 for NOTHING, then the delay of CONTROL.
+        (sensors + 2,) delays of the sensors, then 0 for NOTHING, then the delay of CONTROL; or (runs,
+        sensors + 2).
     """
     names, control = number_fields(bound_model.model.parameters), bound_model.model.control
     asked = [(number + 1, sensor.delay) for number, sensor in enumerate(bound_model.sensors)]
     asked += [(0, ""), (0, control.delay if control else "")]
-    delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
-    return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
+    zero = np.zeros(settings.shape[:-2])
+    delays_s = [settings[..., row, names.index(name)] if name else zero for row, name in asked]
+    return np.rint(1e9 * np.stack(delays_s, axis=-1)).astype(np.int64)
 
 
 def compensate_delays(
@@ -63,13 +65,14 @@ def compensate_delays(
     Args:
         bound_model: the bound model, with the sensors of the log.
         events: events in the order of their stamps.
-        delays_ns: (sensors + 2,); see `delays_of`.
+        delays_ns: (sensors + 2,) or (runs, sensors + 2); see `delays_of`.
         is_end: whether no more events will arrive.
     """
     run = run_of_rows(events.offsets)
-    time_ns = events.time_ns - delays_ns[events.source]
     last_ns = np.append(events.time_ns, 0)[events.offsets[1:] - 1]
-    settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
+    delays_ns = np.broadcast_to(delays_ns, (len(last_ns), delays_ns.shape[-1]))
+    time_ns = events.time_ns - delays_ns[run, events.source]
+    settled = is_end | (time_ns < (last_ns - delays_ns.max(axis=1))[run])
     waiting = select_events(events, ~settled)
     measured = select_events(events._replace(time_ns=time_ns), settled)
     order = np.lexsort((measured.time_ns, run[settled]))
