@@ -126,6 +126,10 @@ class Kernel:
         described = tuple(with_types(each, kinds, repeat(False)) for each in arguments)
         if memory is not None:
             layout, _ = memory.described
+            apart = are_apart((*arguments, memory.value))
+            assert not memory.is_kept or apart[len(apart) - len(layout.apart) :] == layout.apart, (
+                f"{self._title}: an argument is also in the memory that is kept for later calls"
+            )
             described += (with_types(memory.value, iter(layout.kinds), iter(layout.apart)),)
         key = is_checked, described
         if key not in self._loaded:

@@ -198,6 +198,8 @@ def test_only_working_memory_that_is_not_shared_is_taken_to_be_apart(
     assert out[0] == expected
     loop(1, own, scratch=lambda: (np.empty(2), own))  # made for this call, so of its arguments
     assert own.tolist() == [3.0, 0.0]
+    with pytest.raises(AssertionError, match="an argument is also in the memory"):
+        compile_over_runs(overwritten)(1, own, scratch=Scratch(lambda: (np.empty(2), own)))
     assert arguments.are_apart(make()) == (expected == 1.0,) * 2
     known = [arguments.KnownArray("d", (2,), True, is_apart=each) for each in (False, True)]
     text = native.program_of(overwritten, (known[0], (tuple, (known[1],) * 2))).text()
