@@ -309,8 +309,11 @@ def hash_of(path: Path) -> str:
 
 
 def import_writers() -> None:
-    """Import the libraries with which `write_outcome` writes, which takes a second."""
-    for name in ("pandas", "pyarrow.csv", "pyarrow.parquet", "matplotlib.backends.backend_svg"):
+    """Import the libraries with which results are summarised and written, which takes a second."""
+    for name in (
+        *("llvmlite.binding", "pandas", "pyarrow.csv", "pyarrow.pandas_compat", "pyarrow.parquet"),
+        *("matplotlib.backends.backend_svg", "matplotlib.figure", "matplotlib.mathtext"),
+    ):
         import_module(name)
 
 
