@@ -11,10 +11,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from fuselog.pipeline.api.catalog import LISTS, Entries, Entry, entry_or_why
 from fuselog.pipeline.api.lists import listed
@@ -41,6 +40,9 @@ from fuselog.recorders.recording import import_run, record_run
 from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.foreign.naming import allowed
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @without_warnings_of_numbers()
@@ -127,17 +129,19 @@ class ResultFolder(Showing):
         return shown_metrics(title, sentences, self.result.metrics, self.result.bounds)
 
     @property
-    def metrics(self) -> pd.DataFrame:
+    def metrics(self) -> "pd.DataFrame":
         """Return a table with a row per metric: estimator, quantity, case, value."""
         return summary_table(self.result.metrics)
 
     @property
-    def claims(self) -> pd.DataFrame:
+    def claims(self) -> "pd.DataFrame":
         """Return a table with a row per claim: statement, measured value, verdict and reason."""
+        import pandas as pd  # slow to import
+
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property
-    def tables(self) -> dict[str, pd.DataFrame]:
+    def tables(self) -> "dict[str, pd.DataFrame]":
         """Read all tables, by name."""
         paths = sorted((self.folder / "tables").glob("*.parquet"))
         return {path.stem: read_table(path) for path in paths}
