@@ -309,9 +309,13 @@ def hash_of(path: Path) -> str:
 
 
 def import_writers() -> None:
-    """Import the libraries with which results are summarised and written, which takes a second."""
+    """Import the libraries with which results are summarised, written and printed.
+
+    This takes seconds, so it is done while workers compute.
+    """
     for name in (
-        *("llvmlite.binding", "pandas", "pyarrow.csv", "pyarrow.pandas_compat", "pyarrow.parquet"),
+        *("llvmlite.binding", "scipy.special", "pandas", "pyarrow.pandas_compat"),
+        *("pyarrow.csv", "pyarrow.parquet"),
         *("matplotlib.backends.backend_svg", "matplotlib.figure", "matplotlib.mathtext"),
     ):
         import_module(name)
