@@ -7,13 +7,13 @@ them. The replay is in `fuselog.pipeline.api.replays`.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from fuselog.pipeline.api.catalog import LISTS, Entries, Entry, entry_or_why
 from fuselog.pipeline.api.lists import listed
@@ -22,8 +22,8 @@ from fuselog.pipeline.output.results import Result, read_table
 from fuselog.pipeline.output.showing import Showing, Shown, shown_metrics
 from fuselog.pipeline.output.summary import summary_table
 from fuselog.pipeline.output.terminal import PrintedTable
-from fuselog.pipeline.runs.ensemble import Progress, no_progress
-from fuselog.pipeline.runs.executors import PoolFactory, pool_for
+from fuselog.pipeline.runs.ensemble import Progress, no_progress, parts_of
+from fuselog.pipeline.runs.executors import PoolFactory, pool_for, started
 from fuselog.pipeline.runs.experiment import (
     Experiment,
     Stated,
@@ -40,6 +40,9 @@ from fuselog.recorders.recording import import_run, record_run
 from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 from fuselog.replay.foreign.naming import allowed
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @without_warnings_of_numbers()
@@ -126,17 +129,19 @@ class ResultFolder(Showing):
         return shown_metrics(title, sentences, self.result.metrics, self.result.bounds)
 
     @property
-    def metrics(self) -> pd.DataFrame:
+    def metrics(self) -> "pd.DataFrame":
         """Return a table with a row per metric: estimator, quantity, case, value."""
         return summary_table(self.result.metrics)
 
     @property
-    def claims(self) -> pd.DataFrame:
+    def claims(self) -> "pd.DataFrame":
         """Return a table with a row per claim: statement, measured value, verdict and reason."""
+        import pandas as pd  # slow to import
+
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property
-    def tables(self) -> dict[str, pd.DataFrame]:
+    def tables(self) -> "dict[str, pd.DataFrame]":
         """Read all tables, by name."""
         paths = sorted((self.folder / "tables").glob("*.parquet"))
         return {path.stem: read_table(path) for path in paths}
@@ -190,17 +195,17 @@ def run(
     folder = Path("out", stated.name) if out is None else Path(out)
     place = None if data is None else Path(data)
     check_folder(folder, {"input": [*_inputs(stated, found), *filter(None, [place])]})
-    open_pool = _pool(workers, scheduler, executor, [found])
-    result = run_experiment(
-        stated.name,
-        found,
-        folder,
-        data=place,
-        logs=logs,
-        errors=errors,
-        open_pool=open_pool,
-        progress=progress,
-    )
+    with _pool(workers, scheduler, executor, [found]) as open_pool:
+        result = run_experiment(
+            stated.name,
+            found,
+            folder,
+            data=place,
+            logs=logs,
+            errors=errors,
+            open_pool=open_pool,
+            progress=progress,
+        )
     return ResultFolder(folder, result)
 
 
@@ -251,8 +256,10 @@ def sweep(
     found = [stated.with_settings(merge(own, allowed(settings_at(point))), given) for point in points]
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": _inputs(stated, found[0])})
-    open_pool = _pool(workers, scheduler, executor, found)
-    result = run_sweep(stated.name, over, points, found, folder, open_pool=open_pool, progress=progress)
+    with _pool(workers, scheduler, executor, found) as open_pool:
+        result = run_sweep(
+            stated.name, over, points, found, folder, open_pool=open_pool, progress=progress
+        )
     return ResultFolder(folder, result)
 
 
@@ -276,12 +283,17 @@ def _pool(
     scheduler: str | None,
     executor: Executor | None,
     experiments: Sequence[Experiment],
-) -> PoolFactory:
-    """Choose the workers for experiments; if there is a scheduler, ignore the default of one process."""
+) -> AbstractContextManager[PoolFactory]:
+    """Choose the workers for experiments, and start them if there is more than one cell.
+
+    If there is a scheduler, the default of one process is ignored.
+    """
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)
-    return pool_for(workers, scheduler, runs, executor)
+    open_pool = pool_for(workers, scheduler, runs, executor)
+    is_one_cell = len(experiments) == 1 and len([*parts_of(runs)]) == 1
+    return nullcontext(open_pool) if is_one_cell else started(open_pool)
 
 
 class Catalog(Mapping[str, Entry]):

@@ -342,7 +342,8 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
     for series in panel.series:
         x, y, look = _known(series.x), _known(series.y), STYLES[series.style]
         axes.plot(x, y, color=colours[series.label], label=series.label, linewidth=1.0, **look)
-    axes.set_title(panel.title, fontsize=9)
+    # with y, matplotlib does not search for a factor above the y axis; a logarithmic axis never has one
+    axes.set_title(panel.title, fontsize=9, y=1.0 if panel.y.log else None)
     axes.grid(alpha=0.3)
     for name, of, axis in (("x", panel.x, axes.xaxis), ("y", panel.y, axes.yaxis)):
         axes.set(**{f"{name}label": of.label, f"{name}scale": "log" if of.log else "linear"})

@@ -309,8 +309,15 @@ def hash_of(path: Path) -> str:
 
 
 def import_writers() -> None:
-    """Import the libraries with which `write_outcome` writes, which takes a second."""
-    for name in ("pandas", "pyarrow.csv", "pyarrow.parquet", "matplotlib.backends.backend_svg"):
+    """Import the libraries with which results are summarised, written and printed.
+
+    This takes seconds, so it is done while workers compute.
+    """
+    for name in (
+        *("llvmlite.binding", "scipy.special", "pandas", "pyarrow.pandas_compat"),
+        *("pyarrow.csv", "pyarrow.parquet"),
+        *("matplotlib.backends.backend_svg", "matplotlib.figure", "matplotlib.mathtext"),
+    ):
         import_module(name)
 
 

@@ -1,10 +1,9 @@
 """Summaries of judged replays, with metrics, tables and charts."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from fuselog.pipeline.output.alarming import alarms_of
@@ -15,6 +14,9 @@ from fuselog.replay.engine.replaying.usage import Row
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, nis_by_bin
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.means import INSERTED
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST_COLUMNS = 3
 BINS = 60
@@ -32,6 +34,8 @@ def summarise(
         coverage: how many messages of each topic were used.
         parameters: parameters of the estimators by label, if known.
     """
+    import pandas as pd  # slow to import
+
     outcome = Outcome(alarms=alarms_of(judge, parameters or {}, coverage))
     if coverage:
         outcome.tables["coverage"] = coverage_table(coverage)
@@ -71,13 +75,15 @@ def error_charts(judge: Judge) -> dict[str, Chart]:
     return {case: error_chart(each, case) for case, each in shown.items()}
 
 
-def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
+def summary_table(metrics: Mapping[str, MetricValue]) -> "pd.DataFrame":
     """Make a table with a row per metric: estimator, quantity, case, value."""
+    import pandas as pd  # slow to import
+
     rows = [(*split_metric(key), value) for key, value in metrics.items()]
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
-def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
+def error_chart(judged: "list[tuple[Errors, pd.DataFrame]]", case: str) -> Chart:
     """Draw RMSE and NEES over time for all runs together, with the 95 % band of a consistent estimator.
 
     Each panel shows one estimator, so curves never overlap. The panels of a row share their axes.
@@ -122,8 +128,10 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     return Chart(title=title, panels=panels, columns=max(1, min(len(rmse), MOST_COLUMNS)), legend=False)
 
 
-def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis:
+def _log_axis(label: str, tables: "Sequence[pd.DataFrame]", *columns: str) -> Axis:
     """Make one logarithmic axis that covers the positive values of all tables."""
+    import pandas as pd  # slow to import
+
     values = pd.concat([table[name] for table in tables for name in columns if name in table])
     positive = values[(values > 0) & (values < float("inf"))]
     if positive.empty:
@@ -132,7 +140,7 @@ def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis
     return Axis(label=label, log=True, limits=(float(low) / 1.5, float(high) * 1.2))
 
 
-def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
+def _title(label: str, steps: "pd.DataFrame", quantity: str, low: str) -> str:
     """Write an estimator's name and the share of steps at which the quantity is outside its interval."""
     known = steps[[quantity, low, low.replace("_low", "_high")]].dropna()
     if known.empty:
@@ -149,14 +157,14 @@ def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
     return f"{label}: outside {where}"
 
 
-def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:
+def by_case(table: "pd.DataFrame", draw: "Callable[[pd.DataFrame, str], Chart]") -> dict[str, Chart]:
     """Apply `draw` to the rows of each case, and return the charts."""
     if table.empty:
         return {}
     return {str(case): draw(rows, str(case)) for case, rows in table.groupby("case", sort=False)}
 
 
-def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
+def mode_chart(modes: "pd.DataFrame", case: str) -> Chart:
     """Draw the probability of each mode over time, averaged over all runs, one panel per estimator."""
     x, y = Axis(label="time (s)"), Axis(label="mean probability", limits=(0.0, 1.0))
     panels = {name: Panel(x=x, y=y, title=name) for name in modes["estimator"].unique()}
@@ -169,7 +177,7 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
     return Chart(title=title, panels=list(panels.values()))
 
 
-def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
+def effective_chart(effective: "pd.DataFrame", case: str) -> Chart:
     """Draw the effective share of the particles over time, averaged over all runs."""
     x, y = Axis(label="time (s)"), Axis(label="effective share", limits=(0.0, 1.0))
     series = [
@@ -180,7 +188,7 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
     return Chart(title=title, panels=[Panel(x=x, y=y, series=series)])
 
 
-def late_counts(late: pd.DataFrame) -> pd.DataFrame:
+def late_counts(late: "pd.DataFrame") -> "pd.DataFrame":
     """Count out-of-sequence messages, with a row per estimator, case and outcome; see `Judge.late`.
 
     Each row contains the mean delay in seconds, and how many messages were reprocessed as a result.
@@ -193,7 +201,7 @@ def late_counts(late: pd.DataFrame) -> pd.DataFrame:
     return counts.reset_index()
 
 
-def late_chart(late: pd.DataFrame, case: str) -> Chart:
+def late_chart(late: "pd.DataFrame", case: str) -> Chart:
     """Draw the delay of out-of-sequence messages over time by their outcome, one panel per estimator."""
     counts, panels = late_counts(late), []
     for name, rows in late.groupby("estimator", sort=False):

@@ -14,9 +14,9 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import cache, partial
-from importlib import resources
+from importlib import import_module, resources
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import active_children, get_context, parent_process
@@ -147,9 +147,34 @@ def processes(count: int) -> PoolFactory:
                 for worker in set(active_children()) - others:
                     worker.terminate()
                 raise
-            pool.shutdown()
+            pool.shutdown(wait=False)  # the processes end while this one goes on
 
     return begin
+
+
+@contextmanager
+def started(open_pool: PoolFactory) -> Iterator[PoolFactory]:
+    """Start workers while this process prepares their work.
+
+    Yields a factory that first gives the pool whose workers were started, and then opens others.
+    """
+    with ExitStack() as stack:
+        pools = [stack.enter_context(open_pool())]
+        with suppress(BrokenExecutor):  # the first cell is submitted to it, too
+            for _ in range(pools[0].workers):
+                pools[0].executor.submit(_import_cells)
+
+        @contextmanager
+        def begin() -> Iterator[WorkerPool]:
+            with stack.pop_all() as now:
+                yield pools.pop() if pools else now.enter_context(open_pool())
+
+        yield begin
+
+
+def _import_cells() -> None:
+    """Import what a worker needs to compute a cell."""
+    import_module("fuselog.pipeline.runs.campaigns")
 
 
 def _begin_worker() -> None:

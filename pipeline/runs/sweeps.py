@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from fuselog.pipeline.altering.changes import is_of_topic
 from fuselog.pipeline.output.charts import Axis, Chart, Panel, band, curve
@@ -35,6 +34,7 @@ from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.metrics.measuring import metric_key
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 Sampling = Literal["sobol", "random"]
@@ -191,6 +191,8 @@ def run_sweep(
     Raises BadInput if the study of the experiment does more than replay and judge, or if the experiment
     cannot be run.
     """
+    import pandas as pd  # slow to import
+
     for experiment in experiments:
         if experiment.study != "localization":
             raise BadInput(
@@ -226,11 +228,13 @@ def run_sweep(
         return write_outcome(part, name, settings, outcome)
 
 
-def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
+def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> "pd.DataFrame":
     """Tabulate the metrics at a point: the value over all runs and the range of the middle 90 % of runs.
 
     NEES and NIS also have their expected value, and the 95 % range of a consistent estimator.
     """
+    import pandas as pd  # slow to import
+
     runs, bounds = judge.runs_table, judge.bounds
     sizes = {
         metric_key(each.estimator, name, each.case): float(size)
@@ -253,7 +257,7 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
     return pd.DataFrame(rows)
 
 
-def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
+def errors_of_runs(number: int, judge: Judge) -> "pd.DataFrame":
     """Select the errors of every run at a point, so that points can be compared run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
@@ -275,7 +279,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
     return in_few_words(next((each.meaning for each in of_scenario if each.name == key), ""))
 
 
-def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
+def metrics_of(table: "pd.DataFrame", points: int) -> dict[str, MetricValue]:
     """Collect every metric as a list by point, with NaN for points at which the metric is missing."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
@@ -284,7 +288,7 @@ def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
     return found
 
 
-def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
+def figures_of(table: "pd.DataFrame", over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
     """Draw each quantity in each case: a heat map if two numeric parameters are swept, else curves."""
     numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
     grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
@@ -302,7 +306,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
     return figures
 
 
-def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
+def curves(rows: "pd.DataFrame", over: Sequence[Over], quantity: str, case: str = "") -> Chart:
     """Draw the quantity over each parameter, averaged over the other swept parameters."""
     panels = []
     for each in over:
@@ -324,7 +328,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
     return Chart(title=title, panels=panels)
 
 
-def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
+def heat_maps(rows: "pd.DataFrame", over: Sequence[Over], name: str) -> "Figure":
     """Draw the quantity over two parameters, a map per estimator, with a cross at the smallest error."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure

@@ -24,7 +24,7 @@ from fuselog.pipeline.output.charts import Axis, Chart, Panel, curve, draw, leve
 from fuselog.pipeline.runs.campaigns import Cell, cells_of
 from fuselog.pipeline.runs.checkpoints import checkpoints_of
 from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE
-from fuselog.pipeline.runs.executors import processes
+from fuselog.pipeline.runs.executors import processes, started
 from fuselog.pipeline.runs.experiment import Setting, load_experiment, run_experiment
 from tests.bench.parts import time_parts
 from tests.bench.timing import seconds
@@ -89,7 +89,8 @@ def measure() -> Measured:
 
 def _campaign(folder: Path, workers: int) -> None:
     name, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
-    run_experiment(name, experiment, folder / "result", logs=0, open_pool=processes(workers))
+    with started(processes(workers)) as open_pool:
+        run_experiment(name, experiment, folder / "result", logs=0, open_pool=open_pool)
 
 
 def _measured_cells(folder: Path) -> tuple[float, float, int]:

@@ -29,6 +29,7 @@ from fuselog.pipeline.runs.executors import (
     WorkerPool,
     pool_for,
     processes,
+    started,
     version_of_code,
 )
 from fuselog.pipeline.runs.experiment import (
@@ -318,6 +319,32 @@ def test_a_cell_waits_for_each_worker_and_is_not_blamed_for_its_death(tmp_path):
         assert [*work_off(cells, one_worker, checkpoints, Pace(3), go_on)] == [0, 1, 2]
     assert waiting == [2, 2, 2, 2, 2, 1]
     assert not deaths
+
+
+def test_workers_begin_before_their_work_is_ready_and_others_when_these_died():
+    begun: list[Waiting] = []
+    ended: list[Waiting] = []
+
+    @contextmanager
+    def two_workers():
+        begun.append(Waiting())
+        yield WorkerPool(begun[-1], 2)
+        ended.append(begun[-1])
+
+    with started(two_workers) as open_pool:
+        assert len(begun[0].waiting) == 2
+        with open_pool() as pool:
+            assert pool.executor is begun[0]
+            assert not ended
+        assert ended == begun
+        with open_pool() as pool:
+            assert pool.executor is begun[1]
+            assert not begun[1].waiting
+    assert len(begun) == 2
+    assert ended == begun
+    with started(two_workers):
+        assert len(ended) == 2
+    assert ended == begun
 
 
 # What a worker says of its cores: threads of libraries, and cores of kernels.

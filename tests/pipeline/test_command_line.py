@@ -531,6 +531,7 @@ LISTED = (
             "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process"),
             "scenarios landmarks": HEAVY,
             "estimators ekf": (),
+            "run landmarks --parameters": HEAVY,  # what `run` imports before its workers begin
         },
         {
             "replay log.mcap -e ekf -e ukf": (*HEAVY, "fuselog.pipeline.runs.experiment"),
