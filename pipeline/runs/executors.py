@@ -160,7 +160,8 @@ def started(open_pool: PoolFactory) -> Iterator[PoolFactory]:
     """
     with ExitStack() as stack:
         pools = [stack.enter_context(open_pool())]
-        with suppress(BrokenExecutor):  # the first cell is submitted to it, too
+        # if a worker cannot start, the first cell fails with the same error
+        with suppress(BrokenExecutor), _interrupts_kept_off():
             for _ in range(pools[0].workers):
                 pools[0].executor.submit(_import_cells)
 
@@ -170,6 +171,19 @@ def started(open_pool: PoolFactory) -> Iterator[PoolFactory]:
                 yield pools.pop() if pools else now.enter_context(open_pool())
 
         yield begin
+
+
+@contextmanager
+def _interrupts_kept_off() -> Iterator[None]:
+    """Delay interrupts; a process that is started meanwhile never gets them, even while it imports."""
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _import_cells() -> None:

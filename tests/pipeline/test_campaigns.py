@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -364,10 +365,17 @@ def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("all_cores")
 def test_a_worker_uses_one_core() -> None:
-    """Also in SciPy, whose library is another than NumPy's, and is loaded only when it is used."""
-    with processes(1)() as pool:
+    """Also in SciPy, whose library is another than NumPy's, and is loaded only when it is used.
+
+    Ctrl-C, which all processes of a terminal get, does not reach it while it is started.
+    """
+    with started(processes(1)) as open_pool, open_pool() as pool:
         assert not pool.executor.submit(eval, "'scipy' in __import__('sys').modules").result()
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
+        if hasattr(signal, "pthread_sigmask"):
+            blocked = pool.executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+            assert signal.SIGINT in blocked
+            assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.paper
