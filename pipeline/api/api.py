@@ -22,7 +22,7 @@ from fuselog.pipeline.output.results import Result, read_table
 from fuselog.pipeline.output.showing import Showing, Shown, shown_metrics
 from fuselog.pipeline.output.summary import summary_table
 from fuselog.pipeline.output.terminal import PrintedTable
-from fuselog.pipeline.runs.ensemble import Progress, no_progress, parts_of
+from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Progress, no_progress
 from fuselog.pipeline.runs.executors import PoolFactory, pool_for, started
 from fuselog.pipeline.runs.experiment import (
     Experiment,
@@ -292,7 +292,7 @@ def _pool(
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)
     open_pool = pool_for(workers, scheduler, runs, executor)
-    is_one_cell = len(experiments) == 1 and len([*parts_of(runs)]) == 1
+    is_one_cell = len(experiments) == 1 and runs <= RUNS_AT_ONCE
     return nullcontext(open_pool) if is_one_cell else started(open_pool)
 
 
