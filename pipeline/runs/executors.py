@@ -132,6 +132,28 @@ def threads() -> Iterator[WorkerPool]:
         yield WorkerPool(pool, count)
 
 
+class _Processes(ProcessPoolExecutor):
+    """Local processes, which never get interrupts, even while they start and import."""
+
+    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit work to a process, and start one if none is idle."""
+        with _interrupts_kept_off():
+            return super().submit(work, *args, **kwargs)
+
+
+@contextmanager
+def _interrupts_kept_off() -> Iterator[None]:
+    """Delay interrupts; a process that is started meanwhile never gets them, even while it imports."""
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def processes(count: int) -> PoolFactory:
     """Make a pool of `count` processes with one core each, which end with this process."""
 
@@ -139,7 +161,7 @@ def processes(count: int) -> PoolFactory:
     def begin() -> Iterator[WorkerPool]:
         others = set(active_children())
         with safe_spawning():
-            pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
+            pool = _Processes(count, get_context("spawn"), _begin_worker)
             try:
                 yield WorkerPool(pool, count, queued=1)
             except BaseException:
@@ -161,7 +183,7 @@ def started(open_pool: PoolFactory) -> Iterator[PoolFactory]:
     with ExitStack() as stack:
         pools = [stack.enter_context(open_pool())]
         # if a worker cannot start, the first cell fails with the same error
-        with suppress(BrokenExecutor), _interrupts_kept_off():
+        with suppress(BrokenExecutor):
             for _ in range(pools[0].workers):
                 pools[0].executor.submit(_import_cells)
 
@@ -171,19 +193,6 @@ def started(open_pool: PoolFactory) -> Iterator[PoolFactory]:
                 yield pools.pop() if pools else now.enter_context(open_pool())
 
         yield begin
-
-
-@contextmanager
-def _interrupts_kept_off() -> Iterator[None]:
-    """Delay interrupts; a process that is started meanwhile never gets them, even while it imports."""
-    if not hasattr(signal, "pthread_sigmask"):  # on Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _import_cells() -> None:

@@ -369,7 +369,7 @@ def test_a_worker_uses_one_core() -> None:
 
     Ctrl-C, which all processes of a terminal get, does not reach it while it is started.
     """
-    with started(processes(1)) as open_pool, open_pool() as pool:
+    with processes(1)() as pool:
         assert not pool.executor.submit(eval, "'scipy' in __import__('sys').modules").result()
         assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
         if hasattr(signal, "pthread_sigmask"):
