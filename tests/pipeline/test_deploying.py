@@ -1,6 +1,7 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
+import shutil
 import subprocess
 import sys
 from contextlib import chdir
@@ -40,6 +41,12 @@ from tests.replay.estimators.test_attitude import carried
 # two sensors that state different sigmas under one name
 ROBOT = {"duration_s": 10.0, "range": {"rate_hz": 2.0, "sigma_range_m": 0.5}}
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler here")
+
+
+@pytest.fixture(autouse=True)
+def unmeasured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No filter is compiled once more for the memory in its certificate; one test undoes this."""
+    monkeypatch.setattr("fuselog.pipeline.deploying.certificate._memory", lambda *_: None)
 
 
 def recorded(tmp_path: Path, scenario: str, **parameters: Any) -> Path:
@@ -159,7 +166,10 @@ def test_check_says_whether_the_c_is_as_the_golden(
     assert "/estimates/ekf/robot1/" in said.out
 
 
-def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
+def test_certificate_counts_what_a_step_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
     log = recorded(tmp_path, "landmarks", duration_s=2.0)
     folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot")
     found = json.loads((folder / "certificate.json").read_text())
@@ -170,6 +180,9 @@ def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
     assert found["worst"]["flops"] == sum(each["flops"] for each in found["steps"].values())
     # F P F' of 3 states, lower half of the second product, and P H', H P H' of 2 components
     assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
+    if shutil.which("gcc"):
+        assert found["memory"]["text"] > 1000  # some thousand bytes, and two covariances on the stack
+        assert found["memory"]["stack"] > 2 * 9 * 8
 
 
 def folded(x: Any, _: Any) -> Any:
