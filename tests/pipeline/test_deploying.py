@@ -166,9 +166,7 @@ def test_check_says_whether_the_c_is_as_the_golden(
     assert "/estimates/ekf/robot1/" in said.out
 
 
-def test_certificate_counts_what_a_step_takes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_certificate_counts_what_a_step_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     log = recorded(tmp_path, "landmarks", duration_s=2.0)
     folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot")

@@ -22,8 +22,6 @@ from tests.older_cpu import older_cpu
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
-SIMULATED = [name for name, recipe in RECIPES.items() if not recipe.importer]
-IMPORTED = [name for name, recipe in RECIPES.items() if recipe.importer]
 # what rounding once decided: vertices, half turns, searches that end early (`test_biometrics` has ties);
 # with the variables of `tests.older_cpu`, `make test` runs all tests so
 FRAGILE = ("navigation-unknown-heading", "set-filter")
@@ -60,20 +58,18 @@ def streams_of(golden: Golden) -> dict[str, Any]:
     return {topic: each for run in golden["runs"].values() for topic, each in run["streams"].items()}
 
 
-@pytest.mark.parametrize("name", SIMULATED)
-def test_simulated(name: str) -> None:
-    assert_is_golden(name, {})
-
-
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where real data are unpacked."""
     return tmp_path_factory.mktemp("goldens")
 
 
-@pytest.mark.parametrize("name", IMPORTED)
-def test_imported(name: str, real_data: Path, scratch: Path) -> None:
-    assert_is_golden(name, unpack(real_data, [RECIPES[name].importer], scratch))
+@pytest.mark.parametrize("name", RECIPES)
+def test_golden(name: str, scratch: Path, request: pytest.FixtureRequest) -> None:
+    importer, places = RECIPES[name].importer, {}
+    if importer:
+        places = unpack(request.getfixturevalue("real_data"), [importer], scratch)
+    assert_is_golden(name, places)
 
 
 def test_what_rounding_once_decided_is_the_same_on_an_older_cpu() -> None:

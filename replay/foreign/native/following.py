@@ -37,6 +37,7 @@ from fuselog.replay.inference.run.recursion import (
 
 # Codes of failures that any filter can have; a filter's own status s has the code OWN + s.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, UNDEFINED, OWN = 5, 6, 7, 8, 8
+FAILED = -10  # the status FAILED - code means the failure of that code; the header's statuses are larger
 NOBODY = -1  # the caller if no estimate is requested
 FAILURES = {
     0: "a variance of the filter's covariance is negative",
@@ -132,14 +133,14 @@ def advance(
             if status == WELL and caller != NOBODY:
                 status = tell(run, event, caller, given, carried, made)
         if status != WELL:
-            carried.failure[run] = OWN + status if status > 0 else -status - 10
+            carried.failure[run] = OWN + status if status > 0 else FAILED - status
             carried.time_ns[run] = time_ns
 
 
 def outcome(status: int) -> int:
     """Convert the return value of a filter's function to WELL or the code of a failure."""
     if status < REJECTED:
-        return -10 - UNDEFINED
+        return FAILED - UNDEFINED
     return max(status, WELL)
 
 
@@ -192,7 +193,7 @@ def take(
     size = drop_missing(kept)
     squared, determinant = whiten(kept, size)
     if np.isnan(squared):
-        return -10 - INNOVATION_UNSOUND
+        return FAILED - INNOVATION_UNSOUND
     accepted = size > 0 and status != REJECTED
     innovations.numbers[row, 0] = squared
     innovations.numbers[row, 1] = 0.0
@@ -214,7 +215,7 @@ def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made
         return outcome(status)
     fault = fault_of(estimates.mean[row], estimates.covariance[row])
     if fault != ALL_WELL:
-        return -10 - fault
+        return FAILED - fault
     estimates.time_ns[row] = events.time_ns[event]
     made.issued_ns[row] = events.time_ns[event]
     if events.arrival.shape[1] > 0:
