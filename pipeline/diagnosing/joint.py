@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.search import WIDE, Peak
-from fuselog.pipeline.optimise import curvature, profile_ends
+from fuselog.pipeline.optimise import curvature, profile_ends, rises
 from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.confidence import confidence
 from fuselog.pipeline.tuning.search import (
@@ -116,8 +116,8 @@ def fit(
         are_estimates = [bool(is_free[own].all()) for own in together.places]
         return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
     cost_at = coordinates.over(together.cost)
-    _, bent = curvature(cost_at, point, range(len(point)), 1.0 / UNIT)
-    is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
+    around, bent = curvature(cost_at, point, range(len(point)), 1.0 / UNIT)
+    is_top = rises(around, bent)
     losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
     if has_converged and is_top and not at_bounds.any():
         covariance = confidence(range(len(point)), bent).covariance
@@ -146,7 +146,7 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
     point = coordinates.of(together.start)
     cost_at = coordinates.over(together.cost)
     around, bent = curvature(cost_at, point, range(len(point)), CURVATURE_STEP)
-    if not np.isfinite(bent).all() or (len(bent) and np.linalg.eigvalsh(bent)[0] <= 0.0):
+    if not rises(around, bent):
         return np.inf
     down = np.linalg.solve(bent, around.slopes)
     return faults[-1][0].gain + 0.5 * WIDE * float(around.slopes @ down)
