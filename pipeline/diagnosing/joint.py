@@ -164,6 +164,7 @@ class _Together:
 
     def __init__(self, likelihood: Likelihood, base: Trial, faults: Sequence[Supposed]) -> None:
         self.likelihood, self.base, self.faults = likelihood, base, faults
+        self.known: dict[bytes, float] = {}
         self.start = np.array([number for each in faults for number in each.numbers])
         places = iter(range(len(self.start)))
         self.places = [[next(places) for _ in each.numbers] for each in faults]
@@ -182,12 +183,18 @@ class _Together:
         ]
 
     def cost(self, points: Floats) -> Floats:
-        """Compute negative log-likelihoods (n,) of the log with faults of values (n, k) corrected."""
+        """Compute negative log-likelihoods (n,) of the log with faults of values (n, k) corrected.
+
+        The parts of a fit ask for some points again, so known values are kept.
+        """
+        new = {key: point for point in points if (key := point.tobytes()) not in self.known}
         of_points = [
             [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
-            for point in points
+            for point in new.values()
         ]
-        return -np.array(self.likelihood([corrected(self.base, faults) for faults in of_points]))
+        found = self.likelihood([corrected(self.base, faults) for faults in of_points]) if new else []
+        self.known.update(zip(new, found, strict=True))
+        return -np.array([self.known[point.tobytes()] for point in points])
 
     def is_flat(self, point: Floats) -> NDArray[np.bool_]:
         """Test which values (k,) have no effect near a point (k,)."""
