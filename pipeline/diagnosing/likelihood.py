@@ -241,7 +241,7 @@ class Likelihood:
             until.append(total if np.isfinite(total) else -np.inf)
         if not np.isfinite(until).all():
             return np.full(count, -np.inf)
-        return np.diff(until, prepend=0.0)
+        return np.subtract(until, [0.0, *until[:-1]])
 
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float
