@@ -33,6 +33,7 @@ END = 1e-3  # relative accuracy of an interval end
 SHARES = 0.05, 0.95  # bounds of the next value, as shares of the bracket
 DOUBLINGS = 12  # most doublings of the step while an end is bracketed
 NARROWINGS = 40  # most iterations that narrow a bracket
+ROUNDING = 1e-13  # relative error of a cost: the sum of about 1e5 to 1e6 rounded terms
 LARGEST = 1e12  # largest drop of a gain, for values that cannot be evaluated
 
 
@@ -160,6 +161,26 @@ def curvature(
             mixed = (both - plus - minus + neither) / 4.0
         found[i, j] = found[j, i] = mixed / (around.steps[i] * around.steps[j])
     return around, found
+
+
+def rises(around: Beside, curvature: Floats) -> bool:
+    """Test whether a cost bends upwards in every direction, by more than rounding may explain.
+
+    An element of the curvature is a difference of four costs, divided by the product of two steps. An
+    error of `ROUNDING` in each cost changes no eigenvalue by more than the sum, over all coordinates, of
+    four such errors divided by the square of the step.
+
+    Args:
+        around: the costs from which the curvature was computed.
+        curvature: (m, m) the second derivatives, which may not be finite.
+    """
+    if not len(curvature):
+        return True
+    if not np.isfinite(curvature).all():
+        return False
+    largest = np.max(np.abs([around.here, *around.ahead, *around.behind]))
+    error = 4.0 * ROUNDING * largest * np.sum(np.square(1.0 / around.steps))
+    return bool(np.linalg.eigvalsh(curvature)[0] > error)
 
 
 def _differences(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fuselog.pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from fuselog.pipeline.diagnosing.likelihood import Likelihood
 from fuselog.pipeline.diagnosing.search import WIDE, Peak
-from fuselog.pipeline.optimise import curvature, profile_ends
+from fuselog.pipeline.optimise import curvature, profile_ends, rises
 from fuselog.pipeline.runs.trials import Trial
 from fuselog.pipeline.tuning.confidence import confidence
 from fuselog.pipeline.tuning.search import (
@@ -116,8 +116,8 @@ def fit(
         are_estimates = [bool(is_free[own].all()) for own in together.places]
         return Fit(faults, found, [np.inf] * len(faults), are_estimates, unknown)
     cost_at = coordinates.over(together.cost)
-    _, bent = curvature(cost_at, point, range(len(point)), 1.0 / UNIT)
-    is_top = np.isfinite(bent).all() and (not len(bent) or np.linalg.eigvalsh(bent)[0] > 0.0)
+    around, bent = curvature(cost_at, point, range(len(point)), 1.0 / UNIT)
+    is_top = rises(around, bent)
     losses, ends, at_bounds = [np.inf] * len(faults), unknown, coordinates.at_bounds(point)
     if has_converged and is_top and not at_bounds.any():
         covariance = confidence(range(len(point)), bent).covariance
@@ -146,7 +146,7 @@ def promised(likelihood: Likelihood, base: Trial, faults: Sequence[tuple[Peak, H
     point = coordinates.of(together.start)
     cost_at = coordinates.over(together.cost)
     around, bent = curvature(cost_at, point, range(len(point)), CURVATURE_STEP)
-    if not np.isfinite(bent).all() or (len(bent) and np.linalg.eigvalsh(bent)[0] <= 0.0):
+    if not rises(around, bent):
         return np.inf
     down = np.linalg.solve(bent, around.slopes)
     return faults[-1][0].gain + 0.5 * WIDE * float(around.slopes @ down)
@@ -164,6 +164,7 @@ class _Together:
 
     def __init__(self, likelihood: Likelihood, base: Trial, faults: Sequence[Supposed]) -> None:
         self.likelihood, self.base, self.faults = likelihood, base, faults
+        self.known: dict[bytes, float] = {}
         self.start = np.array([number for each in faults for number in each.numbers])
         places = iter(range(len(self.start)))
         self.places = [[next(places) for _ in each.numbers] for each in faults]
@@ -182,12 +183,18 @@ class _Together:
         ]
 
     def cost(self, points: Floats) -> Floats:
-        """Compute negative log-likelihoods (n,) of the log with faults of values (n, k) corrected."""
+        """Compute negative log-likelihoods (n,) of the log with faults of values (n, k) corrected.
+
+        The parts of a fit ask for some points again, so known values are kept.
+        """
+        new = {key: point for point in points if (key := point.tobytes()) not in self.known}
         of_points = [
             [Supposed(each.of, at) for each, at in zip(self.faults, self.values(point), strict=True)]
-            for point in points
+            for point in new.values()
         ]
-        return -np.array(self.likelihood([corrected(self.base, faults) for faults in of_points]))
+        found = self.likelihood([corrected(self.base, faults) for faults in of_points]) if new else []
+        self.known.update(zip(new, found, strict=True))
+        return -np.array([self.known[point.tobytes()] for point in points])
 
     def is_flat(self, point: Floats) -> NDArray[np.bool_]:
         """Test which values (k,) have no effect near a point (k,)."""

@@ -36,7 +36,7 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Stream
 from fuselog.replay.engine.replaying.estimator import Bound, Reading, Recursive
 from fuselog.replay.engine.replaying.replaying import collect, replay
-from fuselog.replay.engine.streams.ensembles import Ensemble
+from fuselog.replay.engine.streams.ensembles import Ensemble, ensemble_of
 from fuselog.replay.engine.streams.sources import MemorySource
 
 Floats = NDArray[np.float64]
@@ -100,6 +100,8 @@ class Likelihood:
     broad: Mapping[str, float] = field(default_factory=dict)
     later_ns: int = 0
     _bound: dict[Hashable, list[Bound]] = field(default_factory=dict)
+    # by the metadata of channels, runs to which estimators are bound; messages do not matter for that
+    _runs: dict[Hashable, Ensemble[MemorySource]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
         """Set the trial with which other trials are compared, and return its innovations by topic.
@@ -167,10 +169,12 @@ class Likelihood:
         copies = disturbed(trial.source, self._bound_to(trial))
         return [replace(trial, runs=[each]) for each in copies]
 
-    def _bound_to(self, trial: Trial, key: Hashable = None) -> list[Bound]:
+    def _bound_to(self, trial: Trial, key: tuple[str, Hashable] | None = None) -> list[Bound]:
         key = key or (_key(trial), _stated_by(trial))
         if key not in self._bound:
-            self._bound[key] = trial.bind()
+            _, stated = key
+            runs = self._runs.setdefault(stated, ensemble_of(trial.runs))
+            self._bound[key] = replace(trial, runs=runs).bind()
         return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
@@ -237,7 +241,7 @@ class Likelihood:
             until.append(total if np.isfinite(total) else -np.inf)
         if not np.isfinite(until).all():
             return np.full(count, -np.inf)
-        return np.diff(until, prepend=0.0)
+        return np.subtract(until, [0.0, *until[:-1]])
 
     def _of_start(
         self, scored: Scored, innovations: Mapping[str, Stream], share: float

@@ -146,8 +146,10 @@ class BodyMotion:
 
     def _lags(self, windows: Windows, against: str) -> Iterator[Lag]:
         for source in chain(self.body.speeds, self.body.velocities):
+            if source.topic == against:
+                continue
             found = timing(windows, source, travelled, tolerance_s=_hold_s(source))
-            if found is not None and source.topic != against:
+            if found is not None:
                 yield Lag(source.topic, against, found)
 
     @cached_property

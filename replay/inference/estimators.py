@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, create_model
 from pydantic.fields import FieldInfo
@@ -25,6 +25,7 @@ from fuselog.replay.engine.replaying.truth import refuse_named_truths
 from fuselog.replay.engine.streams.blocks import Findings
 from fuselog.replay.inference.kalman.methods import Method
 from fuselog.replay.inference.model.augmentation import (
+    Added,
     Start,
     augmented,
     augmented_model,
@@ -34,6 +35,7 @@ from fuselog.replay.inference.model.augmentation import (
     with_gauss_markov,
 )
 from fuselog.replay.inference.model.binding import (
+    Found,
     first_and_more,
     in_its_plane,
     offers_of,
@@ -44,7 +46,11 @@ from fuselog.replay.inference.model.binding import (
 from fuselog.replay.inference.model.bound_model import BoundModel, bound_model_of
 from fuselog.replay.inference.model.model import Model, Motion, Sensor
 from fuselog.replay.inference.model.own_parameters import check_tables, with_own_parameters
-from fuselog.replay.inference.model.parameters import CombinedParameters, ModelParameters
+from fuselog.replay.inference.model.parameters import (
+    CombinedParameters,
+    ModelParameters,
+    number_fields,
+)
 from fuselog.replay.inference.model.settings import (
     assumed_of,
     settings_of,
@@ -303,6 +309,7 @@ def bind_model(
     method: Method,
 ) -> list[Bound]:
     """Return a bound estimator for every object in the log that this model describes."""
+    numeric = {*number_fields(model.parameters)} - {*method.parameters.model_fields}
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -335,36 +342,95 @@ def bind_model(
             except BadInput as error:
                 raise BadInput(f"estimator {label}: {error}") from error
         bound_model = bound_models[model, own.sensors]
-        name = label + found.prefix
-        samplers = samplers_of(bound_model, method, parameters)
-        settings = with_gauss_markov(numbers, added)
-        made_of = (name, found, bound_model, method, parameters, settings, samplers)
-        filtering = (method.filtering or Filter)(*made_of)
-        control = [found.control.name] if found.control else []
-        read = (*found.fallbacks, *found.sensors)
-        streams = (*control, *(topic.name for _, topic in read))
-        initialization = Initializer(name, found, own, numbers, assumed).initialization
-        static = filtering.static(topics)
-        priors = {found.prior.name: model.state}
-        begun = begin(label, found.prior.name, own, added, numbers)
-        start, run, finish = begun(filtering.start), filtering.run, filtering.finish
-        made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        is_random = method.is_random or any(each.redrawn for each in samplers)
-        made = replace(
-            made,
-            initialization=initialization,
-            assumed=assumed,
-            offers=offers_of(model, found, topics),
-            is_random=is_random,
-            reading=partial(reading_of, own, found, numbers),
-            truth=found.truth,
-            is_bound=filtering.is_bound,
-        )
-        if type(filtering) is Filter and not (is_random or added.names):
-            together = partial(_together, made, filtering)
-            made = replace(made, alike=Alike(filtering.beside_settings, settings, together))
-        bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
+        offers = offers_of(model, found, topics)
+        thing = _Thing(label, topics, found, own, bound_model, method, added, offers)
+        made = _bound_with(thing, parameters, assumed, numbers)
+        if made.alike is not None and parameters is given:  # no topic has its own parameters
+            again = partial(_again, thing, parameters, numeric)
+            made = replace(made, alike=made.alike._replace(again=again))
+        bound.append(made)
     return bound
+
+
+class _Thing(NamedTuple):
+    """An object in a log, and everything that binds it to a model, except the parameters.
+
+    Attributes:
+        label: the estimator's label.
+        topics: topics of the log.
+        found: topics of the object.
+        own: the model with the sensors of the log.
+        bound_model: the same with the components that are added to its state, and traced functions.
+        method: the method.
+        added: components that are added to the state.
+        offers: see `offers_of`.
+    """
+
+    label: str
+    topics: Mapping[str, Topic]
+    found: Found
+    own: BoundModel
+    bound_model: BoundModel
+    method: Method
+    added: Added
+    offers: Mapping[str, str]
+
+
+def _bound_with(
+    thing: _Thing, parameters: CombinedParameters, assumed: Mapping[str, float], numbers: Floats
+) -> Recursive:
+    """Bind parameters to an object; see `assumed_of` and `settings_of` for the last two arguments."""
+    label, topics, found, own, bound_model, method, added, offers = thing
+    name = label + found.prefix
+    samplers = samplers_of(bound_model, method, parameters)
+    settings = with_gauss_markov(numbers, added)
+    made_of = (name, found, bound_model, method, parameters, settings, samplers)
+    filtering = (method.filtering or Filter)(*made_of)
+    control = [found.control.name] if found.control else []
+    read = (*found.fallbacks, *found.sensors)
+    streams = (*control, *(topic.name for _, topic in read))
+    initialization = Initializer(name, found, own, numbers, assumed).initialization
+    static = filtering.static(topics)
+    priors = {found.prior.name: own.model.state}
+    begun = begin(label, found.prior.name, own, added, numbers)
+    start, run, finish = begun(filtering.start), filtering.run, filtering.finish
+    is_random = method.is_random or any(each.redrawn for each in samplers)
+    made = Recursive(
+        name,
+        streams,
+        static,
+        start,
+        run,
+        priors,
+        finish=finish,
+        parameters=parameters,
+        initialization=initialization,
+        assumed=assumed,
+        is_random=is_random,
+        offers=offers,
+        reading=partial(reading_of, own, found, numbers),
+        truth=found.truth,
+        is_bound=filtering.is_bound,
+    )
+    reprocessing = partial(_reprocessing, made, filtering, begun)
+    alike = None
+    if type(filtering) is Filter and not (is_random or added.names):
+        alike = Alike(filtering.beside_settings, settings, partial(_together, made, filtering))
+    return replace(made, out_of_sequence=reprocessing, alike=alike)
+
+
+def _again(
+    thing: _Thing, parameters: CombinedParameters, names: set[str], values: Mapping[str, float]
+) -> Recursive | None:
+    """Bind the same object with other values of numbers; None if other settings than `names` differ."""
+    if not values.keys() <= names:
+        return None
+    given = {name: getattr(parameters, name) for name in parameters.model_fields_set}
+    own, found = thing.own, thing.found
+    changed = build(type(parameters), {**given, **values}, f"estimator {thing.label}")
+    assumed = assumed_of(thing.label, own, found, changed)
+    numbers = settings_of(thing.label, own, found, changed, assumed)
+    return _bound_with(thing, changed, assumed, numbers)
 
 
 def _check_role(label: str, role: str, roles: Collection[str]) -> None:

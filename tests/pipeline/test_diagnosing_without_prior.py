@@ -202,6 +202,7 @@ class Paraboloid(NamedTuple):
     best: np.ndarray
     bend: np.ndarray
     count: Mapping[str, int] = {}
+    greatest: float = 0.0
 
     def __call__(self, trials: Sequence[np.ndarray]) -> list[float]:
         """The gains over all parts."""
@@ -214,7 +215,7 @@ class Paraboloid(NamedTuple):
     def over_parts(self, trials: Sequence[np.ndarray], count: int) -> np.ndarray:
         """The gains over so many parts, which agree."""
         apart = np.array(trials) - self.best
-        gains = -0.5 * np.einsum("ni,ij,nj->n", apart, self.bend, apart)
+        gains = self.greatest - 0.5 * np.einsum("ni,ij,nj->n", apart, self.bend, apart)
         return np.repeat(gains[:, None] / count, count, axis=1)
 
     @property
@@ -256,9 +257,11 @@ def test_causes_are_fitted_together_and_what_is_superfluous_goes() -> None:
     )
 
 
-def test_a_fit_that_does_not_converge_has_no_interval() -> None:
-    """Only the sum of both numbers is told."""
-    flat = Paraboloid(np.array([2.0, 1.0]), 100.0 * np.ones((2, 2)))
+@pytest.mark.parametrize("rounding", [-1e-8, 0.0, 1e-8])
+def test_a_fit_that_does_not_converge_has_no_interval(rounding: float) -> None:
+    """Only the sum of both numbers is told; the gains of their difference are lost in rounding."""
+    bend = 100.0 * np.ones((2, 2)) + rounding * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    flat = Paraboloid(np.array([2.0, 1.0]), bend, greatest=-1e4)
     likelihood: Any = flat
     supposed = [Supposed(of, 1.0) for of in flat.faults]
     found = fit(likelihood, np.zeros(2), supposed, has_ends=True)  # type: ignore[arg-type]

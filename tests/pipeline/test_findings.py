@@ -34,21 +34,10 @@ def clipped(values: np.ndarray) -> np.ndarray:
     return np.clip(values, *np.quantile(values, [0.1, 0.9]))
 
 
+# Of values, losses, stamps, factors and delays, which a diagnosis treats in different ways, one each.
 # What is planted: into which topic, how, or by which fault of the car; and what is to be told.
 PLANTED: dict[str, tuple[str, Change | str, str, str]] = {
     "clipped": (ODOMETRY, column("turn_radps", clipped), "values", "turn_radps is saturated"),
-    "saturated": (
-        ODOMETRY,
-        column("forward_mps", lambda speed: np.minimum(speed, 9.5)),
-        "values",
-        "forward_mps is saturated",
-    ),
-    "rounded": (
-        FIX,
-        column("position_m", lambda x: np.round(x / 4.0) * 4.0),
-        "values",
-        "is rounded to 4",
-    ),
     "lost": (
         ODOMETRY,
         rows(lambda n: np.flatnonzero(np.random.default_rng(1).random(n) > 0.2)),
@@ -56,9 +45,7 @@ PLANTED: dict[str, tuple[str, Change | str, str, str]] = {
         "loses 19 % of its messages",
     ),
     "repeated": (FIX, rows(lambda n: np.sort([*range(n), 40, 90])), "stamps", "are duplicates"),
-    "a gap": (FIX, rows(lambda n: np.r_[0:120, 160:n]), "gap", "is silent for 20.5 s"),
     "a sign": (ODOMETRY, "turn rate's sign", "sign", "turn_radps has the wrong sign"),
-    "a unit": (ODOMETRY, "speed x 3.6", "unit", "3.6 times too large, as when km/h are read as m/s"),
     "a delay": (FIX, "fixes 18 s late", "delay", "its stamps are 18 s late"),
 }
 ON_A_PAGE = "clipped", "lost", "a sign"  # the page does not depend on what is told

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import gammaln
 
-from fuselog.pipeline.optimise import DROP_95, QUANTILE, beside, curvature, minimum, profile_ends
+from fuselog.pipeline.optimise import DROP_95, QUANTILE, beside, curvature, minimum, profile_ends, rises
 
 CURVATURE = np.array([[4.0, 1.2, 0.0], [1.2, 1.0, -0.3], [0.0, -0.3, 9.0]])
 MIDDLE = np.array([0.3, -2.0, 1.0])
@@ -47,6 +47,21 @@ def test_differences_of_a_parabola_are_exact() -> None:
         lambda points: np.where(points[:, 0] > 1.0, np.inf, parabola(points)), point, places, 0.1
     )
     assert np.isfinite(edged).tolist() == [[True, False], [False, False]]
+
+
+@pytest.mark.parametrize(("bend", "is_one"), [(-1e-7, False), (0.0, False), (1e-7, False), (1e-3, True)])
+def test_a_direction_that_bends_less_than_rounding_is_none(bend: float, *, is_one: bool) -> None:
+    """Costs of 1e4 are off by 1e-9, which steps of 0.1 make 1e-7 times 4 of a curvature, twice."""
+    flat = np.ones((2, 2)) + 0.5 * bend * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    around, bent = curvature(
+        lambda points: 1e4 + 0.5 * np.einsum("ni,ij,nj->n", points, flat, points),
+        np.zeros(2),
+        range(2),
+        0.1,
+    )
+    assert rises(around, bent) == is_one
+    assert rises(around, np.empty((0, 0)))
+    assert not rises(around, np.full((2, 2), np.nan))
 
 
 def test_ends_of_a_parabola_are_its_standard_errors() -> None:

@@ -492,7 +492,7 @@ def test_any_number_of_cores_finds_the_same(
     found = []
     for cores in (1, 5):
         on_cores(cores)
-        tuned = fl.tune(seen, "ekf", ["sigma_range_m", "bias_range_m"], set={"sigma_range_m": 0.5})
+        tuned = fl.tune(seen, "ekf", "sigma_range_m", set={"sigma_range_m": 0.5})
         found.append((tuned.found.optimum.tobytes(), tuned.standard_errors.tobytes()))
     assert found[0] == found[1]
 

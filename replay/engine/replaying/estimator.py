@@ -8,7 +8,7 @@ results, bit for bit, as its runs replayed one by one.
 
 import re
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Generic, NamedTuple
@@ -124,11 +124,15 @@ class Alike(NamedTuple):
         numbers: the numerical settings of this estimator.
         together: together(settings of each run) -> an estimator in which each run has its own settings.
             The initialization must not depend on the settings.
+        again: again(values of parameters) -> the estimator bound with these values in place of its own,
+            or None if that needs more than other numbers. It raises BadInput if a value is invalid. None
+            if the estimator always has to be bound from the start.
     """
 
     key: Hashable
     numbers: NDArray[np.float64]
     together: "Callable[[NDArray[np.float64]], Recursive]"
+    again: "Callable[[Mapping[str, float]], Recursive | None] | None" = None
 
 
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
@@ -375,7 +379,8 @@ def require_values(sources: Iterable[Source], bound: Bound) -> None:
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
-    The ensemble caches the estimators last bound to it, so binding with the same settings again is free.
+    The ensemble caches the estimators last bound to it, so binding with the same settings again is free,
+    and binding with other numbers is faster.
 
     Raises BadInput if the estimator does not fit the log, or if its topics differ from run to run.
 
@@ -390,7 +395,29 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Setting])
         hash(key)
     except TypeError:  # a list or a table among the settings
         return _bound(label, ensemble, settings)
-    return list(ensemble.findings.once(key, lambda: _bound(label, ensemble, settings)))
+    return list(ensemble.findings.once(key, lambda: _bound_again(label, ensemble, settings)))
+
+
+def _bound_again(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Setting]) -> list[Bound]:
+    """Bind an estimator; if it is known with other numbers, only these change."""
+    others = ((name, value) for name, value in settings.items() if not isinstance(value, float))
+    numbers = tuple(name for name, value in settings.items() if isinstance(value, float))
+    key = label, numbers, *((name, type(value), value) for name, value in others)
+    known, bound = ensemble.bound.once(key, lambda: (dict(settings), _bound(label, ensemble, settings)))
+    changed = {name: settings[name] for name in numbers if settings[name] != known[name]}
+    if not changed:
+        return bound
+    made = [again for each in bound if (again := _with_numbers(label, each, changed)) is not None]
+    return made if len(made) == len(bound) else _bound(label, ensemble, settings)
+
+
+def _with_numbers(label: str, bound: Bound, numbers: Mapping[str, float]) -> Bound | None:
+    """Bind an estimator with other numbers; None if it has to be bound from the start."""
+    again = bound.alike.again if isinstance(bound, Recursive) and bound.alike else None
+    if again is not None:
+        with suppress(BadInput), code_of(label):
+            return again(numbers)
+    return None
 
 
 def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Setting]) -> list[Bound]:

@@ -29,12 +29,14 @@ class Ensemble(list[SourceType]):
     """List of runs that are replayed together and have the same topics.
 
     An ensemble is replayed many times, so topics that are in memory are concatenated once and cached,
-    together with values computed from them (`findings`). Runs must not be added or removed.
+    together with values computed from them (`findings`), and with the estimators that were bound to it
+    first (`bound`), of which others may differ only in numbers. Runs must not be added or removed.
     """
 
     def __init__(self, sources: Iterable[SourceType]) -> None:
         super().__init__(sources)
         self.findings = Findings()
+        self.bound = Findings()
         self._kept: dict[tuple[str, Clock], Ragged] = {}
         self._alike: set[str] = set()
 

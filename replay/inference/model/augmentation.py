@@ -174,6 +174,8 @@ def with_gauss_markov(settings: Floats, added: Added) -> Floats:
         settings: (1 + sensors, fields).
         added: components that are added to the state.
     """
+    if not added.processes:
+        return settings
     numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 

@@ -3,6 +3,7 @@
 `check_model` calls the functions at random states; a failure is one sentence with file and line.
 """
 
+import operator
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
@@ -36,7 +37,8 @@ from fuselog.replay.inference.model.validation import (
     check_switching,
     switching_of,
 )
-from fuselog.replay.tracing.functions import arguments_like, place_of, traced
+from fuselog.replay.tracing.functions import TracedFunction, arguments_like, place_of, traced
+from fuselog.replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
@@ -72,6 +74,13 @@ class _Call(NamedTuple):
 
     def value(self, state: Floats, *others: Floats) -> Floats:
         return np.array(self.function(tuple(state), *map(tuple, others), *self.rest), dtype=float)
+
+    @property
+    def traced(self) -> TracedFunction:
+        """The function with its graph; tracing raises BadInput."""
+        shapes = [(0.0,) * n for n in (len(self.state), *(n for n, _ in self.inputs.values()))]
+        made: TracedFunction = traced(self.function, *arguments_like((*shapes, *self.rest)))
+        return made
 
     def others(self, rng: np.random.Generator) -> list[Floats]:
         return [np.zeros(n) if zero else rng.normal(size=n) for n, zero in self.inputs.values()]
@@ -227,10 +236,8 @@ def _derivatives_of(call: _Call) -> Derivatives:
     counts = {name: n for name, (n, _) in call.inputs.items()}
     inputs = [Input("state", kinds, "state")]
     inputs += [Input(name, ("linear",) * n, name if n else "") for name, n in counts.items()]
-    shapes = [(0.0,) * n for n in (len(kinds), *counts.values())]
     try:
-        function = traced(call.function, *arguments_like((*shapes, *call.rest)))
-        linearise = derivative(function, inputs, outputs)
+        linearise = derivative(call.traced, inputs, outputs)
     except BadInput as error:
         raise AssertionError(str(error)) from error
     rows, sizes = tangent_size(outputs), {"state": tangent_size(kinds), **counts}
@@ -384,22 +391,47 @@ def _check_length(call: _Call, value: Floats) -> None:
             )
 
 
+def _over_states(function: TracedFunction, arguments: Sequence[AnyArgument]) -> list[Floats]:
+    """Compute what a function returns (n,) for n states together: the state's components are (n,).
+
+    NumPy may round functions of arrays in another way than functions of numbers.
+    """
+    found: dict[Node, Floats] = {}
+    for node in needed(function.result.returned):
+        values = [found[each] for each in node.arguments]
+        if node.operation == INPUT:
+            argument, entry = node.value
+            given = arguments[argument]
+            if entry is not None:
+                given = getattr(given, entry) if isinstance(entry, str) else given[entry]
+            found[node] = np.asarray(given)
+        elif node.operation == CONSTANT:
+            found[node] = np.asarray(node.value)
+        elif node.operation == POWER:
+            found[node] = np.power(values[0], float(node.value))
+        elif node.operation == SELECT:
+            found[node] = np.where(*values)
+        elif node.operation == operator.not_:
+            found[node] = np.logical_not(*values)
+        else:
+            found[node] = node.operation(*values)
+    return [np.broadcast_to(found[each], len(arguments[0][0])) for each in function.result.returned]
+
+
 def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
     """Find components that are declared linear but jump by a full turn along a path, as angles do."""
     kinds = tuple(call.state.values())
     add, scales = boxplus(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
     linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]
+    function = call.traced
     for path in range(PATHS if linear else 0):
         others, direction = call.others(rng), np.empty(tangent_size(kinds))
         for kind, _, t, width in manifold_blocks(kinds):
             direction[t : t + width] = scales[kind] * rng.normal(size=width)
         along = np.repeat(states[path % len(states)][:, None], STEPS + 1, axis=1)
         add(along, np.outer(direction, np.arange(STEPS + 1) / STEPS - 0.5))
-        rest = (*map(tuple, others), *call.rest)
-        values = np.array(
-            [call.function(state, *rest) for state in zip(*along, strict=True)], dtype=float
-        )
-        change = np.diff(values[:, linear], axis=0)
+        values = _over_states(function, (tuple(along), *map(tuple, others), *call.rest))
+        change = np.diff(np.stack([values[index] for index in linear], axis=1), axis=0)
         usual = np.abs(change)
         is_jump = np.abs(usual - TURN) < 0.5
         calm = np.minimum(np.roll(usual, 1, axis=0), np.roll(usual, -1, axis=0)) < 0.5

@@ -284,7 +284,7 @@ def sensor_table(
                 np.zeros(len(stream), bool),
             )
         without_covariance = without_covariance | over_columns(np.logical_and, np.isnan(value))
-        parts = [value, spread[:, *np.tril_indices(m)]]
+        parts = [value, spread[:, *_lower(m)]]
     else:
         parts = [without_covariance_of(sensor, ragged)]
     rows = None
@@ -316,6 +316,13 @@ def sensor_table(
         filled += part.shape[1]
     data[:, filled:] = np.nan
     return Table(data, source, target, without_covariance, rows)
+
+
+@lru_cache(maxsize=64)
+def _lower(size: int) -> tuple[Integers, Integers]:
+    """Return the rows and columns of the lower triangle of a matrix, row by row."""
+    rows, columns = np.tril_indices(size)
+    return rows, columns
 
 
 def own_variances(bound_model: BoundModel, number: int, settings: Floats) -> Floats:

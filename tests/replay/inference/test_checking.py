@@ -9,8 +9,9 @@ import pytest
 
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.inference.estimators import registered_models
-from fuselog.replay.inference.model.checking import check_model
+from fuselog.replay.inference.model.checking import _over_states, check_model
 from fuselog.replay.inference.model.model import Correction, Model, Motion
+from fuselog.replay.tracing.functions import traced
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -31,6 +32,21 @@ MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "
 def test_right_models_pass(name: str) -> None:
     """All that are registered, and those of the tests: angles, an axis, a quaternion, all noises."""
     check_model(MODELS[name], PARAMETERS.get(name), seed=5)
+
+
+def branched(state: Any, width: Any) -> Any:
+    x, y = state
+    outside = x * x + y * y > width
+    first = np.sinc(x) if outside & ~(y > 0.0) else x**3
+    return first, width, y**-2
+
+
+def test_a_function_of_many_states_together_is_that_of_each() -> None:
+    states = np.random.default_rng(1).normal(size=(2, 50))
+    together = _over_states(traced(branched, 2, None), (tuple(states), 1.5))
+    each = [branched(state, 1.5) for state in states.T]
+    assert np.transpose(together) == pytest.approx(np.array(each), rel=1e-12)
+    assert 0 < np.sum(np.isclose(together[0], states[0] ** 3)) < 50  # either way is taken
 
 
 def test_what_was_checked_is_said() -> None:
