@@ -82,13 +82,13 @@ class Scene:
     moments: Sequence[Moment] = ()
     divergences: Mapping[str, Divergence] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def estimators(self) -> list[str]:
         """Return the labels of the estimators, in the given order."""
         names = [split_topic(topic)[0] for topic in self.outputs]
         return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
-    @property
+    @cached_property
     def cases(self) -> list[str]:
         """Return the cases with estimates or a truth, such as `robot1`; a single case may be ""."""
         estimated = [split_topic(topic)[1] for topic in self.outputs]
