@@ -23,7 +23,6 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.exploring.curves import BIN_S, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.curves import Path as Track
-from fuselog.pipeline.exploring.page import NewestFirst
 from fuselog.pipeline.exploring.session import Session, numbers_of, open_session
 from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.results import Result
@@ -305,6 +304,9 @@ def test_the_page_draws_and_says_what_was_replayed(
 
 
 def test_the_newest_work_wins() -> None:
+    pytest.importorskip("bokeh")
+    from fuselog.pipeline.exploring.page import NewestFirst
+
     begun, go_on, done, ended = Event(), Event(), [], Event()
     worker = NewestFirst(done.append)
 
