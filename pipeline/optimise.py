@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import ndtri
 
 Floats = NDArray[np.float64]
@@ -58,6 +57,8 @@ def minimum(
         The minimum (k,), and whether the search converged.
     """
     low, high = bounds
+    from scipy.optimize import minimize  # slow to import
+
     # points that cannot be evaluated get a high finite cost, so that the search turns back
     at_start = float(cost(start[None])[0])
     wall = (10.0 * abs(at_start) if np.isfinite(at_start) else 0.0) + 1e6

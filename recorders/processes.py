@@ -93,3 +93,9 @@ def keep_off_settings_here() -> None:
     if os.path.lexists(_OF_MATPLOTLIB):
         with chdir(Path(__file__).parent):
             import matplotlib  # noqa: F401
+
+
+def in_notebook() -> bool:
+    """Test whether this process is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")

@@ -33,6 +33,7 @@ from fuselog.recorders.atomic import scratch_folder
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.errors import BadInput, choices, without_warnings_of_numbers
 from fuselog.recorders.log import open_log, schemas, topics_of
+from fuselog.recorders.processes import in_notebook
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.linting import of_first_messages
 from fuselog.replay.engine.streams.sources import LogSource, MemorySource, Source
@@ -263,7 +264,7 @@ class Replay(Showing):
         with scratch_folder("fuselog-view") as folder:
             rrd = folder / "timeline.rrd"
             self._draw(run, focus, rrd)
-            show = viewer.view_inline if viewer.in_notebook() else viewer.view
+            show = viewer.view_inline if in_notebook() else viewer.view
             show(rrd)
 
     def _draw(self, run: int, focus: str | None, rrd: Path) -> None:

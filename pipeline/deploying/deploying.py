@@ -16,9 +16,11 @@ from fuselog.pipeline.deploying.c_source.names import CFilter, identifier, text_
 from fuselog.pipeline.deploying.c_test import test_text, vectors_of, vectors_text
 from fuselog.pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from fuselog.pipeline.deploying.folder import cmake_text, readme_text
+from fuselog.pipeline.output.outputs import check_folder
 from fuselog.pipeline.runs.ensemble import Settings
-from fuselog.recorders.atomic import whole_folder
+from fuselog.recorders.atomic import settled, whole_folder
 from fuselog.recorders.errors import BadInput, without_warnings_of_numbers
+from fuselog.recorders.remote.paths import located
 from fuselog.replay.engine.replaying.estimator import Reading, Recursive, bind, configure
 from fuselog.replay.foreign.filters import description_of_library
 from fuselog.replay.foreign.naming import shorthand
@@ -76,7 +78,8 @@ def deploy(
     ['CMakeLists.txt', 'README.md', 'certificate.json']
     """
     [(label, settings)] = settings_of(estimator).items()
-    place = Path(out)
+    place = settled(Path(out))
+    check_folder(place, {"log": [located(log)]})
     _check_empty(place)
     run, name = open_source(log), identifier(place.resolve().name)
     precision = SINGLE if single else DOUBLE

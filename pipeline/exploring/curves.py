@@ -21,7 +21,7 @@ from fuselog.replay.judging.errors.evaluation import (
     nis_by_bin,
     split_topic,
 )
-from fuselog.replay.timeline.drawing import canvas
+from fuselog.replay.timeline.drawing.extremes import extremes as extremes_of
 
 BIN_S = 1.0  # time in s over which NIS is averaged for its curve
 LINES = 400  # largest number of points in a curve; more would delay it behind the slider
@@ -186,7 +186,7 @@ def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
         return np.arange(count)
     edges = np.linspace(0, count, most // 2 + 1).astype(np.int64)
     of_span = np.searchsorted(edges, np.arange(count), "right") - 1
-    return canvas.extremes(of_span, np.where(np.isfinite(values), values, 0.0))
+    return extremes_of(of_span, np.where(np.isfinite(values), values, 0.0))
 
 
 def typical_time_s(case: Case) -> float | None:

@@ -11,8 +11,8 @@ from fuselog.pipeline.output.terminal import say
 from fuselog.pipeline.runs.settings import settings_of_estimators, split_texts
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import open_log
+from fuselog.recorders.processes import in_notebook
 from fuselog.replay.engine.streams.sources import LogSource
-from fuselog.replay.timeline import viewer
 
 if TYPE_CHECKING:
     from fuselog.pipeline.exploring.serving import Explorer
@@ -53,7 +53,7 @@ def explore(
             raise
         raise BadInput('explore needs Bokeh: pip install "fuselog[explore]"') from None
     explorer = Explorer(session)
-    if show and not viewer.in_notebook():
+    if show and not in_notebook():
         webbrowser.open(explorer.url)
     return explorer
 

@@ -40,7 +40,6 @@ from fuselog.replay.judging.errors.evaluation import chi_square_interval
 from fuselog.replay.judging.intervals import Interval
 from fuselog.replay.judging.judge import Judge
 from fuselog.replay.judging.verdicts import Consistency, Squares, decisive
-from fuselog.replay.timeline import viewer
 
 Values = Mapping[str, float]
 MOST = 2  # largest number of filters side by side
@@ -288,6 +287,8 @@ class Session:
 
         Raises BadInput if there is no screen, or if the viewer cannot run.
         """
+        from fuselog.replay.timeline import viewer  # slow to import
+
         with scratch_folder("fuselog-explore") as folder:
             rrd = folder / "timeline.rrd"
             chosen = {label: {"kind": label, **self.settings(label, values)} for label in self.filters}

@@ -54,11 +54,15 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
             raise BadInput(
                 f"{path}: exists and is not {kind.what}; give another name, or remove the file yourself"
             )
+        _refuse_closed(path)
         taken[_identity(path)] = f"output {path}"
 
 
 def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
-    """Raise BadInput if a folder that would be replaced is a link or a root, or contains an input."""
+    """Raise BadInput if a folder that would be replaced is a link or a root, or contains an input.
+
+    Also raises BadInput if the folder could not be created.
+    """
     folder = settled(folder)
     if not folder.name:
         raise BadInput(f"{folder}: is the root of a file system; give a folder in it")
@@ -68,6 +72,7 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
             place = path if isinstance(path, RemotePath) else Path(os.path.realpath(path))
             if _identity(folder) in map(_identity, (place, *place.parents)):
                 raise BadInput(f"{folder}: the {role} {path} is in it; give another folder")
+    _refuse_closed(folder)
 
 
 def check_outputs(
@@ -88,6 +93,17 @@ def check_outputs(
 def _refuse_link(path: Path) -> None:
     if path.is_symlink():
         raise BadInput(f"{path}: is a symbolic link; give the path that it leads to, or another name")
+
+
+def _refuse_closed(path: Path) -> None:
+    """Raise BadInput if a path is in a file, or in a folder in which this user may not create files."""
+    folder = next(each for each in path.absolute().parents if each.exists())
+    if not folder.is_dir():
+        raise BadInput(f"{path}: cannot be written, as {folder} is not a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(
+            f"{path}: cannot be written, as you may not write to {folder}; give another place"
+        )
 
 
 def _is_of_result(path: Path) -> bool:

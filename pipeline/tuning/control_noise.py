@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import hadamard
 
 from fuselog.pipeline.altering import alterations as alter
 from fuselog.pipeline.altering.entries import entries_of
@@ -52,6 +51,8 @@ def disturbed(
     There are no copies if the model states no noise or no noise is visible. Each of several logs has its
     own noise, selected by the number `log`. `pairs` is a power of two.
     """
+    from scipy.linalg import hadamard  # slow to import
+
     noises = [noise for each in bound for noise in _noises(source, each)]
     rng = np.random.default_rng([SEED, log])
     copies = [source] * (2 * pairs if noises else 0)

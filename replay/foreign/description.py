@@ -34,6 +34,28 @@ class ForeignParameters(Parameters):
     seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
 
 
+class StreamParameters(ForeignParameters):
+    """Settings of a program that answers messages.
+
+    Attributes:
+        command: the command to start, with its arguments.
+    """
+
+    command: str = ""
+
+
+class ProgramParameters(StreamParameters):
+    """Settings of a program that reads a log and writes estimates.
+
+    Attributes:
+        time_limit_s: time limit for one run; a run that exceeds it fails.
+        truth: topic of the truth; by default, the only truth in the log.
+    """
+
+    time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 600.0
+    truth: str = ""
+
+
 class _Part(BaseModel):
     """Part of a description; unknown names, NaN and infinity are refused."""
 

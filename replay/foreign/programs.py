@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,7 @@ from fuselog.recorders.atomic import scratch_folder
 from fuselog.recorders.errors import BadInput, choices
 from fuselog.recorders.log import RunMetadata, Stream, Topic, open_log, read_streams, schemas, write_log
 from fuselog.recorders.log.streams import empty_stream, make_stream
-from fuselog.recorders.parameters import build, has_role
+from fuselog.recorders.parameters import build
 from fuselog.recorders.trajectories import read_trajectory
 from fuselog.replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from fuselog.replay.engine.replaying.truth import TRUTH, truths_among
@@ -24,7 +24,11 @@ from fuselog.replay.engine.streams.failures import Failure
 from fuselog.replay.engine.streams.results import failures_by_run
 from fuselog.replay.engine.vectors.components import Components, stated_components
 from fuselog.replay.engine.vectors.tangent import tangent_components
-from fuselog.replay.foreign.description import Description, ForeignParameters
+from fuselog.replay.foreign.description import (
+    Description,
+    ProgramParameters,
+    StreamParameters,
+)
 from fuselog.replay.foreign.filters import bind_all, bind_apart, unspecified
 from fuselog.replay.foreign.naming import split_command, what_runs
 from fuselog.replay.foreign.processes.isolation import Ended, Limits, Program, Ran, in_threads, state_of
@@ -39,28 +43,6 @@ LIMITS = ("time_limit_s", "memory_limit_mb")  # these limits also apply while a 
 
 MAGIC = b"\x89MCAP0"
 KEPT = (schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name)
-
-
-class StreamParameters(ForeignParameters):
-    """Settings of a program that answers messages.
-
-    Attributes:
-        command: the command to start, with its arguments.
-    """
-
-    command: str = ""
-
-
-class ProgramParameters(StreamParameters):
-    """Settings of a program that reads a log and writes estimates.
-
-    Attributes:
-        time_limit_s: time limit for one run; a run that exceeds it fails.
-        truth: topic of the truth; by default, the only truth in the log.
-    """
-
-    time_limit_s: Annotated[float, Field(gt=0), has_role("setting")] = 600.0
-    truth: str = ""
 
 
 @dataclass(frozen=True)

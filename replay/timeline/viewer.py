@@ -188,12 +188,6 @@ def view_inline(rrd: Path) -> None:
     display(widget)
 
 
-def in_notebook() -> bool:
-    """Test whether this process is the kernel of a notebook."""
-    ipython = sys.modules.get("IPython")
-    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
-
-
 @contextmanager
 def listen(folder: Path, *options: str) -> Iterator[Listener]:
     """Run `rerun OPTIONS` as a receiver on the loopback interface, with `folder` as its home directory.

@@ -1,19 +1,16 @@
-"""The site is built as `make docs` builds it, and its notebooks run."""
+"""The site is built as `make docs` builds it, and its notebooks run.
+
+Tests import what builds and runs: every process of the suite reads this file.
+"""
 
 import re
 from pathlib import Path
 
-import nbformat
 import pytest
-from mkdocs.commands.build import build
-from mkdocs.config import load_config
-from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
 from PIL import Image
 
 from fuselog.pipeline.runs.inputs import shipped
-from tests.docs import first_views, gallery, hooks, notebooks, reference
+from tests.docs import first_views, gallery, reference
 from tests.replay.timeline.test_first_view import FIRST
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +23,11 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path, monkeypatch: pytest
 
     As `mkdocs build --strict` builds it, in this process.
     """
+    from mkdocs.commands.build import build
+    from mkdocs.config import load_config
+
+    from tests.docs import notebooks
+
     monkeypatch.chdir(ROOT)
     config = load_config(str(ROOT / "mkdocs.yml"), strict=True, site_dir=str(tmp_path))
     config.plugins.on_startup(command="build", dirty=False)
@@ -44,6 +46,8 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path, monkeypatch: pytest
 
 
 def test_what_a_page_must_not_have() -> None:
+    from tests.docs import hooks
+
     for bad in (
         '<script src="https://cdn.org/a.js">',
         "<link href=//fonts.org/a.css>",
@@ -58,6 +62,13 @@ def test_what_a_page_must_not_have() -> None:
 
 def test_links_of_notebooks_lead_to_pages() -> None:
     """As they stand they lead to the sources; one to a page that is not there stops the build."""
+    from mkdocs.config import load_config
+    from mkdocs.exceptions import PluginError
+    from mkdocs.structure.files import File, Files
+    from mkdocs.structure.pages import Page
+
+    from tests.docs import hooks
+
     config = load_config(str(ROOT / "mkdocs.yml"))
     names = ["your-model.md", "notebooks/own-model.ipynb"]
     files = Files(
@@ -110,6 +121,10 @@ def test_the_reference_has_every_name() -> None:
 
 @pytest.mark.paper
 def test_notebooks_print_what_is_kept() -> None:
+    import nbformat
+
+    from tests.docs import notebooks
+
     not_drawn = "from matplotlib.figure import Figure\nFigure.draw = lambda *_: None"
     done = notebooks.executed(*notebooks.NOTEBOOKS, before=not_drawn)
     for path, ran in zip(notebooks.NOTEBOOKS, done, strict=True):

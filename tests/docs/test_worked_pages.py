@@ -52,7 +52,6 @@ WORKED = [
     pytest.param("navigation", marks=pytest.mark.paper),
 ]
 FLIGHT = "sensors/sensors-data.tar.xz", "ulog/sample_logging_tagged_and_default_params.ulg"
-UNCOMPILED = ["your-model"]  # a model of the page's own: quicker in Python than its kernels are compiled
 PEERS = (
     "evo",
     "filterpy",
@@ -112,8 +111,6 @@ def test_a_page_can_be_worked_through(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if name in UNCOMPILED:
-        request.getfixturevalue("uncompiled")
     if name == "flight":
         _unpack_flight(request.getfixturevalue("real_data"))
     names: dict[str, Any] = {}

@@ -23,7 +23,6 @@ import pytest
 import fuselog as fl
 from fuselog.pipeline.exploring.curves import BIN_S, extremes, fewer, typical_time_s
 from fuselog.pipeline.exploring.curves import Path as Track
-from fuselog.pipeline.exploring.page import NewestFirst
 from fuselog.pipeline.exploring.session import Session, numbers_of, open_session
 from fuselog.pipeline.output.report.evidence import findings
 from fuselog.pipeline.output.results import Result
@@ -305,6 +304,9 @@ def test_the_page_draws_and_says_what_was_replayed(
 
 
 def test_the_newest_work_wins() -> None:
+    pytest.importorskip("bokeh")
+    from fuselog.pipeline.exploring.page import NewestFirst
+
     begun, go_on, done, ended = Event(), Event(), [], Event()
     worker = NewestFirst(done.append)
 
@@ -483,7 +485,7 @@ def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subproce
         with urllib.request.urlopen(url[0]) as answer:
             assert answer.status == 200
         host, path = url[0].removeprefix("http://").split("/", 1)
-        for each in 3 * (
+        for each in 2 * (
             "ws",
             "ws?a=\x9b2J",
             "ws/../x",
@@ -511,6 +513,7 @@ import fuselog as fl
 if __name__ == "__main__":
     atexit.register(lambda: print(threading.active_count()))  # after all that is registered later
     fl.explore(sys.argv[1], "ekf", show=False)
+    assert not {"rerun", "scipy.optimize"} & sys.modules.keys()  # slow to import, for views and searches
 """
 
 

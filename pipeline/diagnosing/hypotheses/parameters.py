@@ -35,7 +35,7 @@ from fuselog.recorders.parameters import (
 from fuselog.recorders.units import unit_of
 from fuselog.replay.engine.replaying.estimator import Bound, Reading
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.foreign.programs import ProgramParameters
+from fuselog.replay.foreign.description import ProgramParameters
 
 GATE = 0.999
 REOPENS_S, NEVER_S = 1.0, 1e9

@@ -126,25 +126,25 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
     """Draw users' effects: a few users get poor fingers, others better ones, to keep the marginals."""
-    from scipy.stats import norm  # which takes long to import
+    from scipy.special import ndtr, ndtri  # slow to import
 
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
     genuine, probe, gallery = np.split(effects, 3, axis=1)
     share = parameters.poor_fingers_share
-    quantile = norm.cdf(genuine[:, FINGERS])
+    quantile = ndtr(genuine[:, FINGERS])
     low = (LOWEST - share) / (1 - share)
     below = quantile * LOWEST / (low or 1.0)  # zero users at the greatest share
     others = np.where(quantile < low, below, LOWEST + (quantile - low) * (1 - share))
     poor = np.zeros((parameters.users, 1), bool)
     poor[rng.permutation(parameters.users)[: round(share * parameters.users)]] = True
     mixed = np.where(poor, rng.uniform(0, LOWEST, quantile.shape), others)
-    genuine[:, FINGERS] = norm.ppf(mixed)
+    genuine[:, FINGERS] = ndtri(mixed)
     return Users(genuine, probe, gallery)
 
 
 def _impostors(users: Users, rng: np.random.Generator) -> Floats:
     """Draw standard normal numbers (users, users, matchers) of all comparisons, normalized by rank."""
-    from scipy.stats import norm, rankdata  # which take long to import
+    from scipy.special import ndtri  # slow to import
 
     count = len(users.probe)
     correlation = _rest_correlation()
@@ -162,8 +162,8 @@ def _impostors(users: Users, rng: np.random.Generator) -> Floats:
         + np.sqrt(REST_VARIANCE) * rest
     )
     different = ~np.eye(count, dtype=bool)
-    ranks = rankdata(z[different], axis=0)
-    z[different] = norm.ppf((ranks - 0.5) / len(ranks))
+    ranks = np.argsort(np.argsort(z[different], axis=0), axis=0)  # from 0; no two numbers are equal
+    z[different] = ndtri((ranks + 0.5) / len(ranks))
     return z
 
 

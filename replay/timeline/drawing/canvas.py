@@ -22,6 +22,7 @@ from fuselog.replay.engine.streams.sources import Source
 from fuselog.replay.judging.consistency.divergence import Divergence
 from fuselog.replay.judging.errors.evaluation import Errors, Floats, split_topic
 from fuselog.replay.judging.errors.moments import Moment
+from fuselog.replay.timeline.drawing.extremes import extremes
 
 Board = rrb.Container | rrb.View
 Times = NDArray[np.int64]
@@ -81,13 +82,13 @@ class Scene:
     moments: Sequence[Moment] = ()
     divergences: Mapping[str, Divergence] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def estimators(self) -> list[str]:
         """Return the labels of the estimators, in the given order."""
         names = [split_topic(topic)[0] for topic in self.outputs]
         return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
-    @property
+    @cached_property
     def cases(self) -> list[str]:
         """Return the cases with estimates or a truth, such as `robot1`; a single case may be ""."""
         estimated = [split_topic(topic)[1] for topic in self.outputs]
@@ -342,22 +343,6 @@ def thin_scatter(count: int) -> NDArray[np.int64]:
     if count <= DRAWN_ROWS:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, DRAWN_ROWS, replace=False))
-
-
-def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
-    """Return the rows of the minimum and maximum of every span; among equal values, the first.
-
-    Args:
-        of_span: (n,), sorted: the index of each value's span, from zero.
-        values: (n,); NaN is never an extreme.
-    """
-    first = np.flatnonzero(np.diff(of_span, prepend=-1))
-    sizes = np.diff(first, append=len(of_span))
-    is_extreme = np.zeros(len(values), bool)
-    for extreme in (np.fmin, np.fmax):
-        rows = np.flatnonzero(values == np.repeat(extreme.reduceat(values, first), sizes))
-        is_extreme[rows[np.diff(of_span[rows], prepend=-1) > 0]] = True
-    return np.flatnonzero(is_extreme)
 
 
 def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:

@@ -11,7 +11,8 @@ from fuselog.recorders.log import Clock, Field, RunMetadata, Stream, Topic, sche
 from fuselog.replay.engine.streams.failures import join_streams
 from fuselog.replay.engine.streams.sources import DerivedSource, Source, is_sensed
 from fuselog.replay.judging.errors.evaluation import MAY_BE_NONE, PER_ROW, Errors, Floats, errors_at
-from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS, extremes
+from fuselog.replay.timeline.drawing.canvas import DRAWN_ROWS
+from fuselog.replay.timeline.drawing.extremes import extremes
 
 Times = NDArray[np.int64]
 # Number of messages kept of a topic; fewer are drawn, see `canvas.DRAWN_ROWS`.

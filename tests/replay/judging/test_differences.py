@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import fuselog as fl
 from fuselog.pipeline.comparing.candidates import Candidate, of_replay
 from fuselog.replay.judging.errors.differences import paired_difference, target_of
+from fuselog.replay.judging.intervals import RESAMPLES
 
 PAIRS, RUNS = 200, 50
 CALLED = ("better", "worse", "higher", "lower")
@@ -32,6 +34,25 @@ def test_of_pairs_without_a_difference_five_in_a_hundred_are_called(alike: Candi
         verdicts = [paired_difference(*values[split], target, 0.0).verdict for split in splits]
         shares[quantity] = np.mean(np.isin(verdicts, CALLED))
     assert all(0.02 <= share <= 0.09 for share in shares.values()), shares
+
+
+@pytest.mark.parametrize("runs", [5, 12, 3000])
+def test_the_interval_is_the_bootstraps_of_scipy(runs: int) -> None:
+    """Of percentiles that are widened for few runs, to the last bit, also in several batches."""
+    first, second = np.random.default_rng(runs).lognormal(size=(2, runs))
+    widened = np.sqrt(runs / (runs - 1)) * stats.t.ppf(0.975, runs - 1)
+    theirs = stats.bootstrap(
+        (first, second),
+        lambda first, second, axis: second.mean(axis) - first.mean(axis),
+        paired=True,
+        n_resamples=RESAMPLES,
+        confidence_level=2.0 * stats.norm.cdf(widened) - 1.0,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    ours = paired_difference(first, second, "low", 0.0)
+    assert (ours.more.low, ours.more.high) == theirs.confidence_interval
+    assert ours.sure == np.mean(np.sign(theirs.bootstrap_distribution) == np.sign(ours.more.value))
 
 
 def test_a_verdict_says_where_the_interval_lies() -> None:

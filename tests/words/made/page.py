@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 from fuselog.pipeline.api.api import record
-from fuselog.pipeline.exploring.page import NewestFirst
 from fuselog.pipeline.exploring.session import open_session
 from fuselog.recorders.errors import BadInput
 
@@ -20,7 +19,7 @@ def pressed() -> Iterator[str]:
     from bokeh.document import Document
 
     from fuselog.pipeline.exploring import widgets
-    from fuselog.pipeline.exploring.page import Page
+    from fuselog.pipeline.exploring.page import NewestFirst, Page
 
     source = record("landmarks", seed=3, duration_s=2.0, landmarks=4)
     document = Document()

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
-from sklearn.mixture import GaussianMixture
 
 from fuselog.pipeline.families.biometrics.study import PAPER_FUSED, SINGLE
 from fuselog.pipeline.runs.experiment import load_experiment
@@ -119,6 +118,8 @@ def test_relative_rate_increase_of_the_printed_rates():
 
 def test_one_state_is_a_gaussian_mixture():
     """Started alike, Baum-Welch with one state reaches scikit-learn's mixture."""
+    from sklearn.mixture import GaussianMixture  # slow to import
+
     rng = np.random.default_rng(5)
     vectors = np.concatenate([rng.normal(size=(300, 2)), rng.normal(4, 2, size=(200, 2))])
     model = fit(vectors[:, None], Fit(2, False, 1e-6, 2000, 1e-10), rng)
