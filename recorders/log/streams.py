@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 Clock = Literal["publish_time", "log_time"]
 
+# Positions in a short stream, shared by all of them.
+_FIRST_POSITIONS = np.arange(1 << 13)
+_FIRST_POSITIONS.flags.writeable = False
+
 
 @dataclass(frozen=True, repr=False)
 class Stream:
@@ -244,7 +248,9 @@ def computed_stream(
         columns: columns by field, (n,) or (n, width).
         metadata: metadata of the channel, as text.
     """
-    return Stream(topic, schema, time_ns, time_ns, columns, np.arange(len(time_ns)), metadata)
+    count = len(time_ns)
+    position = _FIRST_POSITIONS[:count] if count <= len(_FIRST_POSITIONS) else np.arange(count)
+    return Stream(topic, schema, time_ns, time_ns, columns, position, metadata)
 
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:

@@ -347,7 +347,8 @@ def bind_model(
         static = filtering.static(topics)
         priors = {found.prior.name: model.state}
         begun = begin(label, found.prior.name, own, added, numbers)
-        start, run, finish = begun(filtering.start), filtering.run, filtering.finish
+        start, run = begun(filtering.start), filtering.run
+        finish = filtering.finish if filtering.has_end else None
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
         is_random = method.is_random or any(each.redrawn for each in samplers)
         made = replace(

@@ -221,6 +221,8 @@ class Filter:
         self, state: FilterState, events: FilterEvents, *, is_end: bool
     ) -> tuple[FilterState, FilterEvents]:
         """Return the events that need not wait, and a state that contains the waiting events."""
+        if not self.waits and self.parameters.every_s is None:
+            return state, events
         next_output, waiting, unsettled = state.next_output, None, None
         if self.has_delays:
             if state.unsettled is not None:
@@ -263,6 +265,17 @@ class Filter:
         tail = fill_control(self.bound_model, hold_control(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether events may have to wait for later messages."""
+        control = self.bound_model.model.control
+        return self.has_delays or (control is not None and control.interpolated)
+
+    @property
+    def has_end(self) -> bool:
+        """Whether `finish` may return outputs."""
+        return self.waits or type(self).finish is not Filter.finish
 
     @property
     def gap_ns(self) -> float:
@@ -362,7 +375,7 @@ class Filter:
         if carried.failure.tobytes() != before.failure.tobytes():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
-        after = state._replace(carried=carried, generators=generators)
+        after = FilterState(carried, state.context, generators, *state[3:])
         return after, filled(estimates, due), made
 
     def parts(

@@ -180,9 +180,9 @@ def no_results(
 @lru_cache(maxsize=64)
 def _places(
     estimates: int, innovations: int, n: int, t: int, m: int
-) -> tuple[int, tuple[tuple[tuple[int, ...], str, int], ...]]:
+) -> tuple[int, tuple[tuple[tuple[int, ...], Columns, int], ...]]:
     """Return the size of the shared memory, and the shape, type and offset of each column, in bytes."""
-    types = "i8", "f8", "f8", "i8", "u4", "f8", "f8", "f8"
+    types = tuple(map(np.dtype, ("i8", "f8", "f8", "i8", "u4", "f8", "f8", "f8")))
     shapes = (
         *((estimates, *shape) for shape in ((), (n,), (t, t))),
         *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
@@ -198,10 +198,10 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
         results: estimates or innovations, with the `end` of each run's filled rows.
         offsets: (runs + 1,) first row of each run.
     """
-    end, *columns = results
-    rows, kept = filled_rows(offsets, end)
+    rows, kept = filled_rows(offsets, results[0])
     if isinstance(rows, slice):
         return results, kept
+    columns: Columns = results[1:]
     made: Columns = type(results)
     return made(kept[1:], *(column.take(rows, axis=0) for column in columns)), kept
 
