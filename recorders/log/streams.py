@@ -81,13 +81,8 @@ class Stream:
             columns = {name: column.take(places, axis=0) for name, column in self.columns.items()}
         else:
             columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(
-            self,
-            publish_time_ns=stamps_ns,
-            log_time_ns=self.log_time_ns[rows],
-            columns=columns,
-            position=self.position[rows],
-        )
+        logged_ns, position = self.log_time_ns[rows], self.position[rows]
+        return Stream(self.topic, self.schema, stamps_ns, logged_ns, columns, position, self.metadata)
 
     def pandas(self) -> "pd.DataFrame":
         """Convert to a data frame with a row for every message: both stamps in ns, then the fields.
