@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 
 from fuselog.recorders.errors import BadInput
@@ -11,9 +12,15 @@ UNCOMPILED, BOUNDSCHECK, TRACEBACK = "FUSELOG_UNCOMPILED", "FUSELOG_BOUNDSCHECK"
 CORES, REMOTE_GB = "NUMBA_NUM_THREADS", "FUSELOG_REMOTE_GB"
 
 
+# The encoded variables in which os.environ looks up names. Every kernel call asks for variables that are
+# usually not set; os.environ itself raises two exceptions for each and takes thirty times as long.
+_STORED: Mapping[object, object] | None = getattr(os.environ, "_data", None)
+_key, _ON = cache(os.environ.encodekey), os.environ.encodevalue("1")
+
+
 def is_on(name: str) -> bool:
     """Test whether a variable is 1."""
-    return os.environ.get(name) == "1"
+    return os.environ.get(name) == "1" if _STORED is None else _STORED.get(_key(name)) == _ON
 
 
 def is_set(name: str) -> bool:

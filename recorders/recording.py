@@ -55,9 +55,11 @@ def named_generator(
     """
     seed = rng.bit_generator.seed_seq
     assert isinstance(seed, np.random.SeedSequence)
-    key = [numbers[name]] if numbers and name in numbers else name.encode()
+    # all letters in one array, since the numbers of a key are converted one by one
+    letters: Any = np.frombuffer(name.encode(), np.uint8).astype(np.uint32)
+    key = numbers[name] if numbers and name in numbers else letters
     child = np.random.SeedSequence(
-        seed.entropy, spawn_key=(*seed.spawn_key, *key), pool_size=seed.pool_size
+        seed.entropy, spawn_key=(*seed.spawn_key, key), pool_size=seed.pool_size
     )
     return np.random.Generator(type(rng.bit_generator)(child))
 

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, wraps
+from functools import cache, cached_property, lru_cache, partial, wraps
 from itertools import pairwise
 from types import FunctionType
 from typing import ParamSpec, Protocol, TypeVar, cast
@@ -154,21 +154,29 @@ def _share(
     """Share the runs among the cores."""
     lent: list[Memory] = []
     cores = min(runs, core_count())
-
-    def prepared() -> Callable[[int, int], None]:
-        if per_run is not None:
-            return _one_by_one(loop, arguments, per_run)
-        if scratch is None:
-            return loop.of(arguments)
-        lent.append(scratch.lend() if isinstance(scratch, Scratch) else Memory(scratch()))
-        return loop.of(arguments, lent[-1])
-
     if cores <= 1:
-        prepared()(0, runs)
+        _prepared(loop, arguments, scratch, per_run, lent)(0, runs)
     else:
-        _on_cores(cores, runs, prepared)
+        _on_cores(cores, runs, partial(_prepared, loop, arguments, scratch, per_run, lent))
     if isinstance(scratch, Scratch):
         scratch.take_back(lent)
+
+
+def _prepared(
+    loop: Loop,
+    arguments: Sequence[KernelArgument],
+    scratch: Callable[[], KernelArgument] | None,
+    per_run: Sequence[KernelArgument] | None,
+    lent: list[Memory],
+) -> Callable[[int, int], None]:
+    """Return a function that processes runs on one core; its working memory is added to `lent`."""
+    if per_run is not None:
+        return _one_by_one(loop, arguments, per_run)
+    if scratch is None:
+        return loop.of(arguments)
+    memory = scratch.lend() if isinstance(scratch, Scratch) else Memory(scratch())
+    lent.append(memory)
+    return loop.of(arguments, memory)
 
 
 def _one_by_one(

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 Clock = Literal["publish_time", "log_time"]
 
+# Positions in a short stream, shared by all of them.
+_FIRST_POSITIONS = np.arange(1 << 13)
+_FIRST_POSITIONS.flags.writeable = False
+
 
 @dataclass(frozen=True, repr=False)
 class Stream:
@@ -77,13 +81,8 @@ class Stream:
             columns = {name: column.take(places, axis=0) for name, column in self.columns.items()}
         else:
             columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(
-            self,
-            publish_time_ns=stamps_ns,
-            log_time_ns=self.log_time_ns[rows],
-            columns=columns,
-            position=self.position[rows],
-        )
+        logged_ns, position = self.log_time_ns[rows], self.position[rows]
+        return Stream(self.topic, self.schema, stamps_ns, logged_ns, columns, position, self.metadata)
 
     def pandas(self) -> "pd.DataFrame":
         """Convert to a data frame with a row for every message: both stamps in ns, then the fields.
@@ -244,7 +243,9 @@ def computed_stream(
         columns: columns by field, (n,) or (n, width).
         metadata: metadata of the channel, as text.
     """
-    return Stream(topic, schema, time_ns, time_ns, columns, np.arange(len(time_ns)), metadata)
+    count = len(time_ns)
+    position = _FIRST_POSITIONS[:count] if count <= len(_FIRST_POSITIONS) else np.arange(count)
+    return Stream(topic, schema, time_ns, time_ns, columns, position, metadata)
 
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:

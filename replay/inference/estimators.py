@@ -343,16 +343,16 @@ def bind_model(
                 raise BadInput(f"estimator {label}: {error}") from error
         bound_model = bound_models[model, own.sensors]
         offers = offers_of(model, found, topics)
-        thing = _Thing(label, topics, found, own, bound_model, method, added, offers)
-        made = _bound_with(thing, parameters, assumed, numbers)
+        described = _Described(label, topics, found, own, bound_model, method, added, offers)
+        made = _bound_with(described, parameters, assumed, numbers)
         if made.alike is not None and parameters is given:  # no topic has its own parameters
-            again = partial(_again, thing, parameters, numeric)
+            again = partial(_again, described, parameters, numeric)
             made = replace(made, alike=made.alike._replace(again=again))
         bound.append(made)
     return bound
 
 
-class _Thing(NamedTuple):
+class _Described(NamedTuple):
     """An object in a log, and everything that binds it to a model, except the parameters.
 
     Attributes:
@@ -377,10 +377,10 @@ class _Thing(NamedTuple):
 
 
 def _bound_with(
-    thing: _Thing, parameters: CombinedParameters, assumed: Mapping[str, float], numbers: Floats
+    described: _Described, parameters: CombinedParameters, assumed: Mapping[str, float], numbers: Floats
 ) -> Recursive:
     """Bind parameters to an object; see `assumed_of` and `settings_of` for the last two arguments."""
-    label, topics, found, own, bound_model, method, added, offers = thing
+    label, topics, found, own, bound_model, method, added, offers = described
     name = label + found.prefix
     samplers = samplers_of(bound_model, method, parameters)
     settings = with_gauss_markov(numbers, added)
@@ -393,7 +393,8 @@ def _bound_with(
     static = filtering.static(topics)
     priors = {found.prior.name: own.model.state}
     begun = begin(label, found.prior.name, own, added, numbers)
-    start, run, finish = begun(filtering.start), filtering.run, filtering.finish
+    start, run = begun(filtering.start), filtering.run
+    finish = filtering.finish if filtering.has_end else None
     is_random = method.is_random or any(each.redrawn for each in samplers)
     made = Recursive(
         name,
@@ -420,17 +421,17 @@ def _bound_with(
 
 
 def _again(
-    thing: _Thing, parameters: CombinedParameters, names: set[str], values: Mapping[str, float]
+    described: _Described, parameters: CombinedParameters, names: set[str], values: Mapping[str, float]
 ) -> Recursive | None:
     """Bind the same object with other values of numbers; None if other settings than `names` differ."""
     if not values.keys() <= names:
         return None
     given = {name: getattr(parameters, name) for name in parameters.model_fields_set}
-    own, found = thing.own, thing.found
-    changed = build(type(parameters), {**given, **values}, f"estimator {thing.label}")
-    assumed = assumed_of(thing.label, own, found, changed)
-    numbers = settings_of(thing.label, own, found, changed, assumed)
-    return _bound_with(thing, changed, assumed, numbers)
+    own, found = described.own, described.found
+    changed = build(type(parameters), {**given, **values}, f"estimator {described.label}")
+    assumed = assumed_of(described.label, own, found, changed)
+    numbers = settings_of(described.label, own, found, changed, assumed)
+    return _bound_with(described, changed, assumed, numbers)
 
 
 def _check_role(label: str, role: str, roles: Collection[str]) -> None:

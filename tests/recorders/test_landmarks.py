@@ -79,6 +79,15 @@ def test_sensors_draw_as_before_they_had_generators_by_name() -> None:
         assert own.random() == children[number].random()
 
 
+@pytest.mark.parametrize("run", [(), (3,)])
+def test_a_name_is_a_key_of_its_letters(run: tuple[int, ...]) -> None:
+    outer = named_generator(np.random.default_rng(np.random.SeedSequence(5, spawn_key=run)), "robot1")
+    keys = (*run, *b"robot1"), (*run, *b"robot1", *b"gyro"), (*run, *b"robot1", 0)
+    drawn = [own.random() for own in (outer, named_generator(outer, "gyro"), *outer.spawn(1))]
+    seeds = [np.random.SeedSequence(5, spawn_key=key) for key in keys]
+    assert drawn == [np.random.default_rng(seed).random() for seed in seeds]
+
+
 @pytest.mark.parametrize("landmarks", [5, 0])
 def test_runs_that_are_simulated_together_equal_the_same_runs_alone(landmarks: int) -> None:
     sensor = {"rate_hz": 3.0, "maximum_range_m": 5.0, "dropout_probability": 0.2}

@@ -24,6 +24,7 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
+from fuselog.recorders import environment
 from fuselog.recorders.compiling.cache import (
     cache_folder,
     in_turn,
@@ -95,7 +96,7 @@ class Kernel:
         The function keeps the arguments alive. The kernel does not rely on the sizes of the first
         `varies` axes of arrays, except in the working memory; see `describe`.
         """
-        kinds: list[Value] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
+        kinds: list[Value] = [environment.is_on(environment.BOUNDSCHECK)]
         numbers: list[Value] = []
         describe(arguments, varies, kinds, numbers)
         layout_of_memory = None

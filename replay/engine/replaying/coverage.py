@@ -26,7 +26,7 @@ class Coverage:
 
     def __init__(self, topic: str, starts_ns: Integers) -> None:
         self.topic = topic
-        self.last_ns = starts_ns.copy()
+        self.last_ns = starts_ns
         self.has_estimates = np.zeros(len(starts_ns), bool)
         self._runs = len(starts_ns)
         self._last_block: tuple[Integers, ...] = ()
@@ -37,9 +37,13 @@ class Coverage:
         offsets, time_ns = estimates.offsets, estimates.stream.publish_time_ns
         self._last_block = offsets, time_ns, self.last_ns
         if len(time_ns):
-            has_some = offsets[1:] > offsets[:-1]
-            self.has_estimates = self.has_estimates | has_some
-            self.last_ns = np.where(has_some, time_ns[offsets[1:] - 1], self.last_ns)
+            ends = offsets[1:]
+            has_some = ends > offsets[:-1]
+            last_ns = time_ns.take(ends - 1)
+            if np.count_nonzero(has_some) < len(has_some):  # keep those of runs without stamps
+                last_ns = np.where(has_some, last_ns, self.last_ns)
+                has_some |= self.has_estimates
+            self.has_estimates, self.last_ns = has_some, last_ns
 
     @cached_property
     def _counts(self) -> Integers:

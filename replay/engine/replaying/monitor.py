@@ -85,9 +85,9 @@ class RunMonitor:
         self._is_batch = is_batch
         self._is_part = is_part
         # a run gets no messages from this time on
-        self._end_ns = np.full(runs, FOREVER)
+        self._end_ns = _repeated(FOREVER, runs).copy()
         self._has_ends = False
-        self._first_ns, self._last_ns = np.full(runs, FOREVER), np.full(runs, -1)
+        self._first_ns, self._last_ns = _repeated(FOREVER, runs), _repeated(-1, runs)
         self._unable: dict[int, str] = {}
         self._failed: dict[int, Failure] = {}
         self._failures: dict[str, list[Ragged]] = {}
@@ -200,13 +200,16 @@ class RunMonitor:
 
     def _starts(self) -> Integers:
         """Return the stamps (runs,) from which batch estimates cover each run; -1 for a recursion."""
-        return self._first_ns if self._is_batch else np.full(self.runs, -1)
+        return self._first_ns if self._is_batch else _repeated(-1, self.runs)
 
     def _note_span(self, streams: Streams) -> None:
         for ragged in streams.values():
             first, last = ragged.findings.once(self._order, partial(_span_of, ragged, self._order))
-            np.minimum(self._first_ns, first, out=self._first_ns)
-            np.maximum(self._last_ns, last, out=self._last_ns)
+            if self._last_ns is _repeated(-1, self.runs):  # no messages so far
+                self._first_ns, self._last_ns = first, last
+                continue
+            self._first_ns = np.minimum(self._first_ns, first)
+            self._last_ns = np.maximum(self._last_ns, last)
 
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
         """Return the messages of every run before its end (runs,)."""
@@ -267,7 +270,7 @@ class RunMonitor:
         if stream.schema.full_name != GAUSSIAN or not len(stream):
             return None
         coverage = self._coverages.get(stream.topic.rpartition("/")[0])
-        before_ns = coverage.last_ns if coverage else np.full(self.runs, -1)
+        before_ns = coverage.last_ns if coverage else _repeated(-1, self.runs)
         rows, found = np.empty(self.runs, np.int64), np.empty(self.runs, np.int64)
         mean, covariance = (np.ascontiguousarray(stream[name]) for name in ("mean", "covariance"))
         size = isqrt(covariance.shape[1])
@@ -282,8 +285,9 @@ class RunMonitor:
             found,
             scratch=_memory_of(size),
         )
-        (bad,) = (found != SOUND).nonzero()
-        for run in bad:
+        if rows.tobytes() == _repeated(FOREVER, self.runs).tobytes():
+            return None
+        for run in np.flatnonzero(found != SOUND):
             row = rows[run]
             first = row == estimates.offsets[run]
             last_ns = before_ns[run] if first else stream.publish_time_ns[row - 1]
@@ -292,7 +296,7 @@ class RunMonitor:
             if known is None or time_ns < known.time_ns:
                 self._failed[int(run)] = Failure(time_ns, UNSOUND[found[run]])
             self._end(int(run), min(int(self._end_ns[run]), time_ns))
-        return rows if len(bad) else None
+        return rows
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
         """Remove each run's rows from its first invalid row on, and rows after the run has ended."""
@@ -330,6 +334,14 @@ class RunMonitor:
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
             reason = f"there is no estimate in the last {silent_s:.1f} s of the measurements"
             self._failed[run] = Failure(int(last_ns[run]), reason)
+
+
+@lru_cache(maxsize=8)
+def _repeated(value: int, runs: int) -> Integers:
+    """Return an array (runs,) that repeats a value and cannot be changed."""
+    every = np.full(runs, value)
+    every.flags.writeable = False
+    return every
 
 
 @lru_cache(maxsize=64)

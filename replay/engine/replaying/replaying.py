@@ -256,6 +256,8 @@ def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str,
     If only some of the bound estimators of a label (one for each robot, say) cannot start, only those
     fail.
     """
+    if all(start.why is None for start in starts):
+        return {}
     errors_of: dict[str, list[BadInput | None]] = {}
     for bound, start in zip(estimators, starts, strict=True):
         errors_of.setdefault(bound.name.partition("/")[0], []).append(start.why)
@@ -280,8 +282,11 @@ def _advance(
     if state is _REFUSED:
         return state, []
     block = block_of(streams)
-    with code_of(bound.name):
+    try:
         return bound.run(state, block)
+    except Exception:  # enter the context only here, since it costs time for every block
+        with code_of(bound.name):
+            raise
 
 
 def _finish(
@@ -298,8 +303,9 @@ def _refuse_old_priors(
     bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput if an estimator would start a span from a prior that is older than the span."""
-    for topic in (bound.priors.keys() & static.keys()) - bound.given.keys():
-        for run, start_ns in ensemble.starts_ns.items():
+    starts_ns = ensemble.starts_ns
+    for topic in (bound.priors.keys() & static.keys()) - bound.given.keys() if starts_ns else ():
+        for run, start_ns in starts_ns.items():
             times_ns = static[topic].of_run(run).times(order)[:1]
             if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(

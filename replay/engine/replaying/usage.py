@@ -142,7 +142,7 @@ class Usage:
             facts = self.facts.setdefault(topic, Counter())
             if self.begins_ns is not None:
                 begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
-                facts[EARLY] += int((stream.times(order) < begins_ns).sum())
+                facts[EARLY] += int(np.count_nonzero(stream.times(order) < begins_ns))
             repeated = ragged.findings.once("repeated", partial(_repeated, stream))
             facts["repeat the previous message"] += repeated
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
@@ -156,7 +156,7 @@ class Usage:
         for each in outputs:
             stream = each.stream
             if stream.schema.full_name == INNOVATION:
-                accepted = int((stream["accepted"] != 0).sum())
+                accepted = int(np.count_nonzero(stream["accepted"]))
                 self.used += accepted
                 self.gated += len(stream) - accepted
                 self.speaks = True

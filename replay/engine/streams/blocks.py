@@ -149,9 +149,9 @@ def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArra
         chosen: (n,) whether a row is chosen.
         offsets: (runs + 1,) offsets of all rows.
     """
-    if chosen.all():
+    if np.count_nonzero(chosen) == len(chosen):
         return offsets
-    return np.concatenate([[0], np.cumsum(chosen)])[offsets]
+    return np.searchsorted(np.flatnonzero(chosen), offsets)
 
 
 def run_of_rows(offsets: NDArray[np.int64]) -> NDArray[np.int64]:

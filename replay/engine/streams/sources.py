@@ -8,6 +8,7 @@ from itertools import accumulate, pairwise
 from typing import Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fuselog.recorders.errors import BadInput, UnknownName, choices
 from fuselog.recorders.log import (
@@ -363,10 +364,15 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
     cuts = accumulate(map(len, streams), initial=0)
     placed = {
-        stream.topic: replace(stream, position=ranks[first:end])
+        stream.topic: _at(ranks[first:end], stream)
         for stream, (first, end) in zip(streams, pairwise(cuts), strict=True)
     }
     return MemorySource(placed, run, f"run {run.run} of {run.scenario}")
+
+
+def _at(position: NDArray[np.int64], of: Stream) -> Stream:
+    stamps_ns = of.publish_time_ns, of.log_time_ns
+    return Stream(of.topic, of.schema, *stamps_ns, of.columns, position, of.metadata)
 
 
 def in_memory(source: LogSource | MemorySource, topics: Iterable[str] | None = None) -> MemorySource:

@@ -184,6 +184,8 @@ def placed_settings(
 ) -> Floats:
     """Repeat the settings (1 + sensors, fields) for each run; insert the origin of its tangent plane.
 
+    The result is not to be changed, since for one run it may be a view of the settings.
+
     Args:
         settings: see `settings_of`; or (runs, 1 + sensors, fields) if each run has its own.
         names: names of the columns.
@@ -193,13 +195,16 @@ def placed_settings(
             is stated; None without fixes.
         runs: number of runs.
     """
+    own_origins = origins if found.origin is None else None
+    if own_origins is None and runs == 1:
+        return settings.reshape(1, *settings.shape[-2:])
     placed = np.empty((runs, *settings.shape[-2:]))
     placed[:] = settings
-    if origins is None or found.origin is not None:
+    if own_origins is None:
         return placed
-    known = np.isfinite(origins[:, 0])
+    known = np.isfinite(own_origins[:, 0])
     for name in origin_parameters(found, parameters):
-        placed[known, :, names.index(name)] = origins[known, ORIGIN.index(name), None]
+        placed[known, :, names.index(name)] = own_origins[known, ORIGIN.index(name), None]
     return placed
 
 

@@ -412,6 +412,14 @@ def not_driven(name: str, control: Control, found: Found, events: FilterEvents) 
     return Ragged(stream, ragged_rows(in_gap, events.offsets))
 
 
+@lru_cache(maxsize=64)
+def _may_pass_over(bound_model: BoundModel) -> bool:
+    """Test whether there can be messages that are skipped, even if there are none in a block."""
+    control = bound_model.model.control
+    drops = control is not None and control.interpolated
+    return drops or any(sensor.covariance for sensor in bound_model.sensors)
+
+
 def passed_over(
     name: str, bound_model: BoundModel, found: Found, block: Block, without_covariance: Booleans
 ) -> list[Ragged]:
@@ -424,10 +432,7 @@ def passed_over(
         block: messages of these topics.
         without_covariance: whether each message (n,) is skipped; see `filter_events`.
     """
-    control = bound_model.model.control
-    drops = control is not None and control.interpolated
-    drops |= any(sensor.covariance for sensor in bound_model.sensors)
-    if not drops and not without_covariance.any():
+    if not np.count_nonzero(without_covariance) and not _may_pass_over(bound_model):
         return []
     sensors = {topic.name: sensor for sensor, topic in found.sensors}
     reasons = [

@@ -15,7 +15,8 @@ from fuselog.recorders.log.planes import in_frame
 from fuselog.recorders.log.streams import computed_stream
 from fuselog.replay.engine import chi2
 from fuselog.replay.engine.arrays import Floats, Integers, RowSlice
-from fuselog.replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
+from fuselog.replay.engine.streams.blocks import Block, Findings, Ragged, copied, of_runs, ragged_rows
+from fuselog.replay.engine.streams.ensembles import FEW_MESSAGES
 from fuselog.replay.engine.streams.geodetic import origins_of
 from fuselog.replay.engine.streams.priors import gaussians
 from fuselog.replay.engine.streams.results import ALL_WELL, failures_of, named, rows_of, wrapped
@@ -221,6 +222,8 @@ class Filter:
         self, state: FilterState, events: FilterEvents, *, is_end: bool
     ) -> tuple[FilterState, FilterEvents]:
         """Return the events that need not wait, and a state that contains the waiting events."""
+        if not self.waits and self.parameters.every_s is None:
+            return state, events
         next_output, waiting, unsettled = state.next_output, None, None
         if self.has_delays:
             if state.unsettled is not None:
@@ -263,6 +266,17 @@ class Filter:
         tail = fill_control(self.bound_model, hold_control(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether events may have to wait for later messages."""
+        control = self.bound_model.model.control
+        return self.has_delays or (control is not None and control.interpolated)
+
+    @property
+    def has_end(self) -> bool:
+        """Whether `finish` may return outputs."""
+        return self.waits or type(self).finish is not Filter.finish
 
     @property
     def gap_ns(self) -> float:
@@ -338,8 +352,7 @@ class Filter:
         loop, _ = _compiled(self.bound_model, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
-        due = ragged_rows(events.wants_estimate, events.offsets)
-        recorded = ragged_rows(events.source >= 0, events.offsets)
+        due, recorded = self.rows_due(events)
         innovation_size = len(self.measured)
         estimates, innovations = self.no_results(due, recorded, innovation_size)
         if any(len(sensor.measured) < innovation_size for sensor in sensors):
@@ -362,8 +375,23 @@ class Filter:
         if carried.failure.tobytes() != before.failure.tobytes():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
-        after = state._replace(carried=carried, generators=generators)
+        after = FilterState(carried, state.context, generators, *state[3:])
         return after, filled(estimates, due), made
+
+    def rows_due(self, events: FilterEvents) -> tuple[Integers, Integers]:
+        """Return the first row (runs + 1,) of each run in estimates and in innovations.
+
+        They are stored for few events, because a short log is often replayed again. The events are
+        stored with them, so that no other events can have their id.
+        """
+        if len(events.time_ns) > FEW_MESSAGES:
+            return _rows_due(events)
+        (due, recorded), _ = self._stored.once(id(events), lambda: (_rows_due(events), events))
+        return due, recorded
+
+    @cached_property
+    def _stored(self) -> Findings:
+        return Findings(2)
 
     def parts(
         self, generators: tuple[Samples, ...], events: FilterEvents
@@ -444,6 +472,11 @@ class Filter:
         """Make the stream of innovations of a filter with sensors; see `states`."""
         topic = f"/estimates/{self.name}/innovation"
         return recorded_innovations(topic, self.innovation_metadata, innovations, offsets)
+
+
+def _rows_due(events: FilterEvents) -> tuple[Integers, Integers]:
+    offsets = events.offsets
+    return ragged_rows(events.wants_estimate, offsets), ragged_rows(events.source >= 0, offsets)
 
 
 @lru_cache(maxsize=64)

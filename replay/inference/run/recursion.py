@@ -40,6 +40,8 @@ from fuselog.replay.inference.model.model import Model
 from fuselog.replay.inference.model.settings import ReadSettings
 from fuselog.replay.inference.run.loops import Follow, over_events
 
+# Columns of results share one array up to this size.
+SHARED_BYTES = 1 << 24
 CONTROL = -1  # source of an event; sensors count from zero, and NOTHING means only a time
 NOTHING = -2
 
@@ -162,7 +164,8 @@ def no_results(
     """Allocate results; for run r, estimates begin at row due[r], innovations at row recorded[r].
 
     All columns share one array. With many arrays, the operating system would map the pages of each array
-    separately; this alone takes half as long as running a small filter.
+    separately; this alone takes half as long as running a small filter. Large columns are separate,
+    since only arrays of less than 32 MB can be made of freed memory, see `executors.keep_freed_memory`.
 
     Args:
         due: (runs + 1,) offsets of the estimates.
@@ -171,8 +174,11 @@ def no_results(
         innovation_size: number of distinct components that the sensors measure.
     """
     size, places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
-    memory = np.empty(size, np.uint8)
-    columns = [np.ndarray(shape, dtype, memory, offset) for shape, dtype, offset in places]
+    if size < SHARED_BYTES:
+        memory = np.empty(size, np.uint8)
+        columns = [np.ndarray(shape, dtype, memory, offset) for shape, dtype, offset in places]
+    else:
+        columns = [np.empty(shape, dtype) for shape, dtype, _ in places]
     estimates = EstimateRows(due[:-1].copy(), *columns[:3])
     return estimates, InnovationRows(recorded[:-1].copy(), *columns[3:])
 
@@ -180,9 +186,9 @@ def no_results(
 @lru_cache(maxsize=64)
 def _places(
     estimates: int, innovations: int, n: int, t: int, m: int
-) -> tuple[int, tuple[tuple[tuple[int, ...], str, int], ...]]:
+) -> tuple[int, tuple[tuple[tuple[int, ...], Columns, int], ...]]:
     """Return the size of the shared memory, and the shape, type and offset of each column, in bytes."""
-    types = "i8", "f8", "f8", "i8", "u4", "f8", "f8", "f8"
+    types = tuple(map(np.dtype, ("i8", "f8", "f8", "i8", "u4", "f8", "f8", "f8")))
     shapes = (
         *((estimates, *shape) for shape in ((), (n,), (t, t))),
         *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
@@ -198,10 +204,10 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
         results: estimates or innovations, with the `end` of each run's filled rows.
         offsets: (runs + 1,) first row of each run.
     """
-    end, *columns = results
-    rows, kept = filled_rows(offsets, end)
+    rows, kept = filled_rows(offsets, results[0])
     if isinstance(rows, slice):
         return results, kept
+    columns: Columns = results[1:]
     made: Columns = type(results)
     return made(kept[1:], *(column.take(rows, axis=0) for column in columns)), kept
 

@@ -93,7 +93,7 @@ class Truths:
     def _note_twice(self, block: dict[str, Stream]) -> None:
         """Record the differences between truths of one object in a block, by linear component."""
         for topic, stream in block.items():
-            again = np.flatnonzero(np.diff(stream.publish_time_ns) == 0)
+            again = np.flatnonzero(stream.publish_time_ns[1:] == stream.publish_time_ns[:-1])
             if len(again):
                 states = _states(stream).items()
                 apart = {name: np.abs(np.diff(state)[again]) for name, state in states}

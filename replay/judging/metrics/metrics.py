@@ -134,7 +134,8 @@ def _add_nees(state: Consistent, errors: Errors) -> Consistent:
         if squared is None:
             block = errors.covariance[:, errors.position][:, :, errors.position]
             squared = normalized_error_squared(errors.error[:, errors.position], block)
-        known = squared[np.isfinite(squared)]
+        is_known = np.isfinite(squared)
+        known = squared if is_known.all() else squared[is_known]
         state.places += len(known)
         state.of_places += float(known.sum())
     state.by_step.add(step, nees[:, None])
@@ -203,10 +204,9 @@ def _log_likelihoods(innovations: Innovations) -> Sums:
     """Sum log-likelihoods; NaN if the likelihood of an accepted measurement is not stated."""
     stated = innovations.log_likelihood
     accepted_likelihood = np.array([np.nan]) if stated is None else stated[innovations.accepted]
-    return {
-        "log_likelihood": float(accepted_likelihood.sum()),
-        "runs": set(innovations.run[np.flatnonzero(np.diff(innovations.run, prepend=-1))].tolist()),
-    }
+    run = innovations.run
+    runs = {*run[np.flatnonzero(run[1:] != run[:-1])].tolist(), *run[-1:].tolist()}
+    return {"log_likelihood": float(accepted_likelihood.sum()), "runs": runs}
 
 
 def likelihood(sums: Sums) -> dict[str, float]:

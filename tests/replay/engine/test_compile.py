@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from fuselog.recorders import environment
 from fuselog.recorders.compiling.cache import cache_folder, in_turn
 from fuselog.recorders.compiling.compile import compile_over_runs, compiled
 from fuselog.recorders.compiling.kernels import native
@@ -472,3 +473,15 @@ def test_cores_work_in_memory_of_their_own_also_in_a_forked_process(
     made, total = told[0].split()
     assert int(made) <= 3
     assert (float(total), told[1]) == (499500.0, "0")
+
+
+@pytest.mark.parametrize("stored", [environment._STORED, None])
+def test_a_variable_is_read_again_whenever_it_changes(
+    stored: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "_STORED", stored)
+    for value in ("1", "0", "", "1"):
+        monkeypatch.setenv("FUSELOG_OF_A_TEST", value)
+        assert environment.is_on("FUSELOG_OF_A_TEST") == (value == "1")
+    monkeypatch.delenv("FUSELOG_OF_A_TEST")
+    assert not environment.is_on("FUSELOG_OF_A_TEST")
