@@ -18,7 +18,7 @@ from fuselog.replay.timeline.catalog import EXTRA, PROPERTIES, Dataset, has_cata
 from fuselog.replay.timeline.viewer import Listener, screenshot, serving, showing
 
 # Fewer runs are drawn sooner by this process than by others, which have to start.
-PAYING_SEGMENTS = 3
+PAYING_SEGMENTS = 6
 
 
 def view_path(paths: Sequence[Path], options: Options) -> None:
