@@ -472,6 +472,6 @@ def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
         stream.stream.publish_time_ns,
         stream["accepted"] != 0,
         stream["normalised_innovation_squared"],
-        over_columns(np.add, np.isfinite(stream["innovation"]).view(np.int8)).astype(np.int64),
+        over_columns(np.add, np.isfinite(stream["innovation"]).astype(np.int64)),
         stream.stream.columns.get("log_likelihood"),
     )

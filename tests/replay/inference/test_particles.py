@@ -235,7 +235,7 @@ def test_rotations() -> None:
     """One update of an orientation and a bias: what a hundred times as many plain samples give."""
     whole, _, gyro = attitude.simulate(21)
     counts = {"/prior": 1, "/gyro": 5, "/force": 1}
-    kept = [whole.streams[topic].take(slice(0, count)) for topic, count in counts.items()]
+    kept = [whole.streams[topic].take(np.arange(count)) for topic, count in counts.items()]
     kept[0].columns["covariance"][:] /= 25
     kept[2].columns["value"][:] = 0.4, -0.5, 9.7
     found = outputs(ATTITUDE, "particles", [memory_source(Recording(kept), whole.run)], particles=1000)
