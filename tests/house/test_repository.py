@@ -222,8 +222,9 @@ def test_processes_are_started_in_known_places() -> None:
             for alias in node.names
         }
         for node in nodes:
-            if isinstance(node, ast.Call):
-                *of, name = ast.unparse(node.func).rsplit(".", 1)
+            called = [node.func] if isinstance(node, ast.Call) else getattr(node, "bases", [])
+            for each in called:
+                *of, name = ast.unparse(each).rsplit(".", 1)
                 is_start = name in STARTS and (of[0] in MODULES if of else name in starting)
                 if is_start or (of == ["os"] and name.startswith(("exec", "spawn"))):
                     found.add((path.as_posix(), name))
