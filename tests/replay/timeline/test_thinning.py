@@ -136,7 +136,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
     """A log of several blocks: errors and their plots are there while blocks are still to come."""
     monkeypatch.setattr("fuselog.replay.timeline.show.LIVE_MESSAGES", 250)
     log, live = tmp_path / "log.mcap", tmp_path / "live.rrd"
-    recording, run = record_run("landmarks", {"duration_s": 750.0}, 3, 0)
+    recording, run = record_run("landmarks", {"duration_s": 900.0}, 3, 0)
     write_log(log, recording.streams, run)
     blocks: list[int] = []  # rows drawn after each
 
@@ -165,6 +165,6 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
             block_messages=1500,
             progress=watched,
         )
-        assert len(blocks) > 5
+        assert len(blocks) > 6
         assert 0 < blocks[2] < 15_000
         assert drawn(10_000) >= 10_000
