@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             function collects garbage less often, and ends the process.
     """
     if arguments is None:
-        gc.set_threshold(50_000, 20, 100)  # there is no garbage to collect while libraries are imported
+        gc.set_threshold(200_000, 20, 100)  # imports leave up to 200,000 objects and no garbage
         try:
             code = _code_of(arguments)
         except Exception:

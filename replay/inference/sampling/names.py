@@ -43,7 +43,7 @@ PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-
 class Sampling(BaseModel, ABC):  # type: ignore[explicit-any]
     """Method of sampling N(0, I) in any dimension; `str` returns its name."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
     family: ClassVar[str]
     number: ClassVar[str | None] = None
     """Field that is set by the number after the family's name."""
