@@ -257,8 +257,7 @@ class Judge:
         """Return the degrees of freedom, number of values and expected value of NEES and NIS, by key."""
         found: dict[str, tuple[int, int, int]] = {}
         for quantities in self._quantities.values():
-            errors, cells = quantities.errors, quantities.by_time.filled()[0]
-            runs = len(np.unique(cells[:, 0]))
+            errors, runs = quantities.errors, len(quantities.by_time.by_group()[0])
             sizes = {"nees": len(errors.components), "position_nees": len(errors.position)}
             for name, size in sizes.items():
                 if runs and size:

@@ -100,10 +100,7 @@ def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
 def run_table(quantities: Quantities) -> pd.DataFrame:
     """Make a table with one row per run."""
     errors = quantities.errors
-    cells, count, sums = quantities.by_time.filled()
-    runs, place = np.unique(cells[:, 0], return_inverse=True)
-    counts: Floats = np.bincount(place, count, len(runs)).astype(float)
-    totals: Floats = np.stack([np.bincount(place, each, len(runs)) for each in sums.T], axis=1)
+    runs, counts, totals = quantities.by_time.by_group()
     columns: dict[str, object] = {
         "estimator": errors.estimator,
         "case": errors.case,

@@ -160,8 +160,8 @@ class InnovationSums:
 
     def by_run(self) -> tuple[Integers, OfRuns]:
         """Return the runs (runs,) that have innovations, and their sums."""
-        cells, count, sums = self._sums.filled()
-        return cells[:, 0], OfRuns(count, *sums.T)
+        runs, count, sums = self._sums.by_group()
+        return runs, OfRuns(count, *sums.T)
 
     @property
     def total(self) -> OfRuns:

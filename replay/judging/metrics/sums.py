@@ -87,6 +87,12 @@ class BinnedSums:
         cells[:, 0] += self._first
         return cells, rows[:, 0], rows[:, 1:]
 
+    def by_group(self) -> tuple[Integers, Floats, Floats]:
+        """Return the groups with rows (m,), counts (m,), and sums over all bins (m, columns)."""
+        sums = self._sums[: self._groups, : self._bins].sum(axis=1)
+        groups = np.flatnonzero(sums[:, 0] > 0)
+        return groups + self._first, sums[groups, 0], sums[groups, 1:]
+
     def _widen(self, position: int) -> None:
         while self._limit is not None and position // self.width >= self._limit:
             self._double()
