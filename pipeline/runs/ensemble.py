@@ -18,6 +18,7 @@ from fuselog.pipeline.altering.sources import note_of
 from fuselog.pipeline.output.coverage import added, replayed_note, rows_of, untaken
 from fuselog.pipeline.runs.initial_states import Origin, start_from
 from fuselog.pipeline.runs.settings import meanings_of
+from fuselog.recorders.compiling.compile import core_count
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import Clock, LogWriter, Mirrors, RunMetadata
 from fuselog.recorders.log.impossible import Rejections
@@ -268,8 +269,12 @@ def _told(progress: Progress, title: str) -> Iterator[Callable[[], object]]:
 def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
     """Process items in order in a background thread; yields a function that submits an item.
 
-    An exception in the thread is raised when the next item is submitted, or at the end.
+    An exception in the thread is raised when the next item is submitted, or at the end. If this process
+    has only one core, there is no thread, and items are processed immediately.
     """
+    if core_count() == 1:
+        yield work
+        return
     with ThreadPoolExecutor(1) as pool:
         working: list[Future[None]] = []
 

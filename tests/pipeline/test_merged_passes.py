@@ -1,6 +1,8 @@
 """Sums of passes, orders of failures, limits of settings: boundaries that only a direct look shows."""
 
+from collections.abc import Callable
 from pathlib import Path
+from threading import current_thread, main_thread
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 
 from fuselog.pipeline.output.outputs import check_outputs
 from fuselog.pipeline.output.report.kinds import _forest
-from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Pass, cut_in_parts
+from fuselog.pipeline.runs.ensemble import RUNS_AT_ONCE, Pass, cut_in_parts, in_background
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.simulators import landmarks
 from fuselog.recorders.simulators.landmarks_parameters import LandmarksParameters
@@ -37,6 +39,26 @@ def test_a_part_says_whether_it_is_all_the_runs(blocks: int) -> None:
     parts = list(cut_in_parts([SimpleNamespace()] * count, []))  # type: ignore[list-item]
     assert [each.first_run for each in parts] == list(range(0, count, RUNS_AT_ONCE))
     assert [each.is_all for each in parts] == [blocks == 1] * blocks
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_blocks_are_judged_in_order_on_the_cores_that_there_are(
+    cores: int, on_cores: Callable[[int], None]
+) -> None:
+    """An error in the judge reaches the caller, also for the last block."""
+    on_cores(cores)
+    done: list[int] = []
+
+    def judge(block: int) -> None:
+        assert (current_thread() is main_thread()) == (cores == 1)
+        done.append(10 // block)
+
+    with in_background(judge) as hand_over:
+        for block in (1, 2, 5):
+            hand_over(block)
+    assert done == [10, 5, 2]
+    with pytest.raises(ZeroDivisionError), in_background(judge) as hand_over:
+        hand_over(0)
 
 
 def test_differences_are_in_percent_of_what_their_margin_is_of() -> None:
