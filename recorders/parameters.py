@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from inspect import cleandoc
 from textwrap import shorten
 from tomllib import TOMLDecodeError
@@ -226,8 +226,14 @@ def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> 
 
     In a list of tables, names look like `nodes[].sigma_m`; in tables by name, like `cases.NAME.sigma_m`.
     """
-    schema = kind.model_json_schema()
+    schema = _schema_of(kind)
     return list(_described(schema, schema.get("$defs", {}), "", values or {}))
+
+
+@lru_cache(maxsize=256)
+def _schema_of(kind: type[BaseModel]) -> Mapping[str, Any]:
+    """Return the JSON schema of a type, which callers only read."""
+    return kind.model_json_schema()
 
 
 def explain(kind: type[BaseModel]) -> dict[str, str]:
@@ -236,7 +242,7 @@ def explain(kind: type[BaseModel]) -> dict[str, str]:
     A location is the prefix of the names in a table, such as `range_bearing.`; it is empty for the type
     itself. Tables with the same description share an entry. Inherited text comes first.
     """
-    schema = kind.model_json_schema()
+    schema = _schema_of(kind)
     places: dict[str, list[str]] = {}
     for place, table in _tables("", schema, schema.get("$defs", {})):
         if description := table.get("description"):
@@ -358,7 +364,7 @@ def number_of(kind: type[BaseModel], name: str) -> Parameter:
 
     Raises BadInput if the type has no number of this name.
     """
-    schema = kind.model_json_schema()
+    schema = _schema_of(kind)
     tables: list[Mapping[str, Any]] = [schema]
     entries, known = list[Mapping[str, Any]](), set[str]()
     parts = [field_of(name)] if field_of(name) in schema.get("properties", {}) else name.split(".")

@@ -5,8 +5,9 @@ the next one, and samples, are both integrated over time, so topics without comm
 by the distances and turns in a window.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +38,20 @@ class Series:
 
     def integral(self, times_s: Floats) -> Floats:
         """Integrate the values from the first stamp to given times (...); NaN after the last stamp."""
-        flat = self.values.reshape(len(self.values), -1)
-        means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
-        total = np.zeros_like(flat)
-        np.cumsum(means * np.diff(self.times_s)[:, None], axis=0, out=total[1:])
         found = [
-            np.interp(times_s, self.times_s, column, left=np.nan, right=np.nan) for column in total.T
+            np.interp(times_s, self.times_s, column, left=np.nan, right=np.nan)
+            for column in self._totals
         ]
         return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
+
+    @cached_property
+    def _totals(self) -> Floats:
+        """Integrate each component to each stamp: (m, n)."""
+        flat = self.values.reshape(len(self.values), -1)
+        means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
+        totals = np.zeros_like(flat)
+        np.cumsum(means * np.diff(self.times_s)[:, None], axis=0, out=totals[1:])
+        return totals.T
 
     def moved(self, by_s: float, gain: float = 0.0) -> "Series":
         """Return the series with stamps corrected for a delay, and for the gain of its clock."""
@@ -105,21 +112,31 @@ def bodies(streams: Mapping[str, Stream]) -> list[Body]:
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
     )
-    long_enough = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
-    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in long_enough}
-    for topic, stream in long_enough.items():
-        _add(together, stream, first_ns)
-        space = topic.rpartition("/")[0]
-        for name, body in apart.items():
-            if f"{name}/".startswith(f"{space}/"):
-                _add(body, stream, first_ns)
+    parts = {topic: _part(each, first_ns) for topic, each in streams.items() if len(each) >= FEWEST}
+    together = _joined(parts.values())
     if all(len({each.topic for each in role}) <= 1 for role in together.roles):
         return [together]
-    return list(apart.values())
+    spaces = {topic: f"{topic.rpartition('/')[0]}/" for topic in parts}
+    return [
+        _joined(part for topic, part in parts.items() if name.startswith(spaces[topic]))
+        for name in dict.fromkeys(spaces.values())
+    ]
 
 
-def _add(body: Body, stream: Stream, first_ns: int) -> None:
-    """Add a topic to a body."""
+def _joined(parts: Iterable[Body]) -> Body:
+    """Join the topics of several bodies."""
+    several = list(parts)
+    return Body(
+        **{
+            each.name: [series for part in several for series in getattr(part, each.name)]
+            for each in fields(Body)
+        }
+    )
+
+
+def _part(stream: Stream, first_ns: int) -> Body:
+    """Return a body that has only one topic."""
+    body = Body()
     name, topic = stream.schema.full_name, stream.topic
     order = np.argsort(stream.publish_time_ns, kind="stable")
     stamps_ns = stream.publish_time_ns[order]
@@ -153,7 +170,7 @@ def _add(body: Body, stream: Stream, first_ns: int) -> None:
     if name == schemas.INERTIAL_SAMPLE.full_name:
         body.rates.append(series("turn_rate_radps", column("turn_rate_radps")))
         body.forces.append(series("specific_force_mps2", column("specific_force_mps2")))
-    if name in (schemas.TWIST.full_name, schemas.INERTIAL_SAMPLE.full_name) and body.rates:
+    if body.rates:
         body.turns.append(series("turn_rate_radps", column("turn_rate_radps")[:, 2]))
     if name in _TURNED and column("quaternion").shape[1] == 4:
         body.orientations.append(series("quaternion", column("quaternion")))
@@ -165,6 +182,7 @@ def _add(body: Body, stream: Stream, first_ns: int) -> None:
     for role in body.roles:
         if role and len(role[-1].times_s) < FEWEST:
             role.pop()  # type: ignore[attr-defined]
+    return body
 
 
 _PLACED = {each.full_name for each in (schemas.POSITION_FIX, schemas.POSE, schemas.COURSE_FIX)}

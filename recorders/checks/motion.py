@@ -19,6 +19,7 @@ from fuselog.recorders.checks.windows import (
     clear_moves,
     courses,
     distances,
+    lengths,
     noise_of,
     places_of,
     travelled,
@@ -148,7 +149,7 @@ class BodyMotion:
         for source in chain(self.body.speeds, self.body.velocities):
             if source.topic == against:
                 continue
-            found = timing(windows, source, travelled, tolerance_s=_hold_s(source))
+            found = timing(windows, source, lengths, tolerance_s=_hold_s(source))
             if found is not None:
                 yield Lag(source.topic, against, found)
 
@@ -160,7 +161,7 @@ class BodyMotion:
         windows = turned(self.courses, 1.0)
         found = []
         for source in self.body.turns:
-            lag = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
+            lag = timing(windows, source, lambda _, angles: angles, tolerance_s=_hold_s(source))
             if lag is not None:
                 found.append(Lag(source.topic, self.courses.topic, lag))
         return found

@@ -75,14 +75,20 @@ def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
         )
 
 
-def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find swapped latitudes and longitudes, by comparison with the distance that the wheels measure."""
+def misread(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find latitudes and longitudes, swapped or in another unit, by comparison with the wheels."""
     if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
         return
-    if np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]])) > 90.0:
-        return
     as_is = _wheels(streams, stream)
-    if as_is is None or not as_is.spread > CLEAR:
+    if as_is is not None:
+        yield from _exchanged(stream, streams, as_is)
+        yield from _scaled(stream, streams, as_is)
+
+
+def _exchanged(stream: Stream, streams: Mapping[str, Stream], as_is: Slope) -> Iterator[Finding]:
+    """Find swapped coordinates; `as_is` is how far fixes move per metre of the wheels as recorded."""
+    largest = np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]]))
+    if largest > 90.0 or not as_is.spread > CLEAR:
         return
     columns = {
         **stream.columns,
@@ -100,6 +106,33 @@ def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding
             "in the mapping swap the sources of latitude_deg and longitude_deg",
             is_fact=False,
         )
+
+
+def _scaled(stream: Stream, streams: Mapping[str, Stream], as_is: Slope) -> Iterator[Finding]:
+    """Find latitudes and longitudes in another unit; `as_is` is as for `_exchanged`."""
+    if not as_is.sign or abs(as_is.value - 1.0) <= ALIKE:
+        return
+    for what, changed in _READ_AS.items():
+        columns = {
+            **stream.columns,
+            **{name: changed(stream[name]) for name in ("latitude_deg", "longitude_deg")},
+        }
+        other = _wheels(streams, replace(stream, columns=columns))
+        if other is None or abs(other.value - 1.0) > ALIKE:
+            continue
+        if (
+            BETTER * abs(other.value - 1.0) < abs(as_is.value - 1.0)
+            and other.spread < as_is.spread + ALIKE
+        ):
+            yield _place(
+                stream,
+                as_is.value,
+                f"latitude and longitude are {what}: corrected, fixes move {other.value:.4g} m for each "
+                f"metre of the wheels; as recorded, {as_is.value:.4g} m",
+                "correct `units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
+                is_fact=False,
+            )
+            return
 
 
 def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
@@ -126,36 +159,6 @@ def jumps(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             f"one fix to the next, the first {since_first(stream, first_ns)}",
             otherwise="use one altitude throughout, above the ellipsoid or above the sea",
         )
-
-
-def scaled(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Find latitudes and longitudes in another unit, by comparison with the distance from the wheels."""
-    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
-        return
-    as_is = _wheels(streams, stream)
-    if as_is is None or not as_is.sign:
-        return
-    for what, changed in _READ_AS.items():
-        columns = {
-            **stream.columns,
-            **{name: changed(stream[name]) for name in ("latitude_deg", "longitude_deg")},
-        }
-        other = _wheels(streams, replace(stream, columns=columns))
-        if other is None or abs(other.value - 1.0) > ALIKE:
-            continue
-        if (
-            BETTER * abs(other.value - 1.0) < abs(as_is.value - 1.0)
-            and other.spread < as_is.spread + ALIKE
-        ):
-            yield _place(
-                stream,
-                as_is.value,
-                f"latitude and longitude are {what}: corrected, fixes move {other.value:.4g} m for each "
-                f"metre of the wheels; as recorded, {as_is.value:.4g} m",
-                "correct `units` of latitude_deg and longitude_deg, or degrees_minutes, in the mapping",
-                is_fact=False,
-            )
-            return
 
 
 def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:

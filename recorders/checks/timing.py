@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fuselog.recorders.checks.body import Floats, Series
 from fuselog.recorders.checks.windows import FEWEST, Windows, thinned
 
-Account = Callable[
-    [Series, Floats, Floats], Floats
-]  # values for windows, given their beginnings and ends
+Account = Callable[[Series, Floats], Floats]  # values of windows, from differences of an integral
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
 FEW = 100  # least number of windows to search for a lag or a clock
@@ -55,12 +54,12 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     count = _independent(windows)
     lags_s = np.arange(-LONGEST_S, LONGEST_S + 0.5 * STEP_S, STEP_S)
     few = windows.take(thinned(len(windows), max(FEW, 2 * count)))
-    coarse = _likeness(few, source, account, lags_s)
+    coarse = _Lagged.of(few, lags_s).likeness(source, account)
     if not np.isfinite(coarse).any():
         return None
     best_s = float(lags_s[np.nanargmax(np.abs(coarse))])
     fine_s = best_s + np.arange(-STEP_S, STEP_S + 0.5 * FINE_S, FINE_S)
-    near = _likeness(windows, source, account, fine_s)
+    near = _Lagged.of(windows, fine_s).likeness(source, account)
     if not np.isfinite(near).any():  # at an end of the lags, where too few windows remain
         return None
     best = int(np.nanargmax(np.abs(near)))
@@ -72,7 +71,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     else:
         gain, telling = 0.0, _telling(windows, source, account, lag_s)
     zero_s = np.arange(-tolerance_s, tolerance_s + 0.5 * FINE_S, max(FINE_S, tolerance_s / 10.0))
-    without = _likeness(windows, source, account, zero_s)
+    without = _Lagged.of(windows, zero_s).likeness(source, account)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
     evidence = float(_evidence(telling, likeness, usual))
     if abs(lag_s) > NEAR_S:  # of many lags, one is the best by chance
@@ -110,9 +109,10 @@ def _is_one_peak(likeness: Floats, count: float) -> bool:
 def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
     """Find the gain of the source's clock, with the lag and the correlation there."""
     lags_s = np.arange(-10.0, 10.0, 0.2)
+    lagged = _Lagged.of(windows, lags_s).sorted()
     best = (0.0, 0.0, 0.0)
     for gain in GAINS:
-        found = _likeness(windows, source.moved(0.0, gain), account, lags_s)
+        found = lagged.likeness(source.moved(0.0, gain), account)
         if np.isfinite(found).any():
             place = int(np.nanargmax(np.abs(found)))
             if abs(found[place]) > abs(best[2]):
@@ -120,20 +120,51 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
     return best
 
 
-def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
-    """Correlate at each lag; use NaN if less than half of the windows are within the source's span."""
-    begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
-    moves = account(source, begin_s, end_s)
-    is_in = np.isfinite(moves)
-    count = is_in.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        x, y = np.where(is_in, moves, 0.0), np.where(is_in, windows.values, 0.0)
-        x = np.where(is_in, x - (x.sum(axis=1) / count)[:, None], 0.0)
-        y = np.where(is_in, y - (y.sum(axis=1) / count)[:, None], 0.0)
-        xx = np.sum(x * x, axis=1)
-        found = np.sum(x * y, axis=1) / np.sqrt(xx * np.sum(y * y, axis=1))
-        varies = xx > VARIES**2 * np.sum(np.where(is_in, moves, 0.0) ** 2, axis=1)
-    return np.where(varies & (count >= max(FEWEST, 0.5 * len(windows))), found, np.nan)
+class _Lagged(NamedTuple):
+    """Windows at several lags.
+
+    Attributes:
+        times_s: (q,), stamps at which a window begins or ends.
+        begin: (lags, k), the rows of `times_s` at which the windows begin.
+        end: (lags, k), the same for their ends.
+        values: (k,), the values measured in the windows.
+    """
+
+    times_s: Floats
+    begin: NDArray[np.int64]
+    end: NDArray[np.int64]
+    values: Floats
+
+    @classmethod
+    def of(cls, windows: Windows, lags_s: Floats) -> "_Lagged":
+        """Shift windows by lags; a stamp at which windows begin and others end occurs once."""
+        stamps_s, rows = np.unique([windows.begin_s, windows.end_s], return_inverse=True)
+        offsets = len(stamps_s) * np.arange(len(lags_s))[:, None]
+        begin, end = (offsets + each for each in rows.reshape(2, -1))
+        return cls((stamps_s - lags_s[:, None]).ravel(), begin, end, windows.values)
+
+    def sorted(self) -> "_Lagged":
+        """Sort the stamps, at which many series can then be integrated faster."""
+        order = np.argsort(self.times_s)
+        places = np.empty_like(order)
+        places[order] = np.arange(len(order))
+        return self._replace(times_s=self.times_s[order], begin=places[self.begin], end=places[self.end])
+
+    def likeness(self, source: Series, account: Account) -> Floats:
+        """Correlate at each lag; use NaN if the source spans less than half of the windows."""
+        total = source.integral(self.times_s)
+        moves = account(source, total.take(self.end, axis=0) - total.take(self.begin, axis=0))
+        is_in = np.isfinite(moves)
+        count = np.count_nonzero(is_in, axis=1)
+        moves[~is_in] = 0.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x, y = moves, is_in * self.values
+            x = is_in * (x - (x.sum(axis=1) / count)[:, None])
+            y = is_in * (y - (y.sum(axis=1) / count)[:, None])
+            xx = np.sum(x * x, axis=1)
+            found = np.sum(x * y, axis=1) / np.sqrt(xx * np.sum(y * y, axis=1))
+            varies = xx > VARIES**2 * np.sum(moves**2, axis=1)
+        return np.where(varies & (count >= max(FEWEST, 0.5 * len(self.values))), found, np.nan)
 
 
 def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
@@ -145,7 +176,8 @@ def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -
     """
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)
-    moves = account(source, windows.begin_s[first] - lag_s, windows.end_s[first] - lag_s)
+    begin_s, end_s = windows.begin_s[first] - lag_s, windows.end_s[first] - lag_s
+    moves = account(source, source.integral(end_s) - source.integral(begin_s))
     is_in = np.isfinite(moves)
     x, y = moves[is_in], windows.values[first][is_in]
     if len(x) < FEWEST:

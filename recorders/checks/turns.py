@@ -251,10 +251,10 @@ def hangs(motion: BodyMotion, topic: str) -> bool:
 
 
 def _is_z_down(force: Series) -> bool:
-    mean = quietest(force)
-    if mean is None or np.median(force.values[:, 2]) >= 0.0:
+    if np.median(force.values[:, 2]) >= 0.0:
         return False
-    return bool(mean[2] < -LARGEST_SHARE * np.linalg.norm(mean))
+    mean = quietest(force)
+    return mean is not None and bool(mean[2] < -LARGEST_SHARE * np.linalg.norm(mean))
 
 
 def quietest(force: Series) -> Floats | None:

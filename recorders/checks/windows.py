@@ -111,6 +111,21 @@ def chords(fixes: Series, span_s: float) -> Windows:
     )
 
 
+def lengths(source: Series, moved: Floats) -> Floats:
+    """Compute how far a body moved, forward or backward.
+
+    Args:
+        source: the speed or velocity in m/s.
+        moved: differences of its integral in m, (...) for a speed, (..., 2) for a velocity.
+
+    Returns:
+        (...), in m, not negative.
+    """
+    if source.values.ndim == 1:
+        return np.abs(moved)
+    return np.sqrt(moved[..., 0] ** 2 + moved[..., 1] ** 2)
+
+
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
     """Compute the distance moved in windows, forward or backward, from a speed or velocity.
 
@@ -122,8 +137,7 @@ def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
     Returns:
         (k,), in m, not negative; NaN beyond the source's stamps.
     """
-    moved = source.integral(end_s) - source.integral(begin_s)
-    return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
+    return lengths(source, source.integral(end_s) - source.integral(begin_s))
 
 
 def _moves(fixes: PlaceSeries) -> bool:

@@ -126,10 +126,11 @@ class Judge:
         self._means = MeansOfAll()
         self._moments = Moments()
         self._doubts: dict[str, Doubt] = {}
+        self._runs_table: pd.DataFrame | None = None  # of everything that has been added
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
-        judged = Judged([], [], [])
+        judged, self._runs_table = Judged([], [], []), None
         self._first_fixes |= first_fixes(outputs)
         for topic, rows in outputs.items():
             schema = rows.stream.schema.full_name
@@ -200,7 +201,7 @@ class Judge:
         """Release the runs after judging; only sums are left, which can be pickled."""
         self._doubts = self.doubts
         self._sources, self._truths, self._kinds, self._on_errors = (), [], {}, None
-        self._true_states = None
+        self._true_states = self._runs_table = None
         self._steps.clear()
         for of_topic in self._uninformed.values():
             of_topic.first.clear()
@@ -209,6 +210,7 @@ class Judge:
 
     def merge(self, other: "Judge") -> None:
         """Add the results of other runs."""
+        self._runs_table = None
         self.runs += other.runs
         self._names |= other._names
         self._doubts = other.doubts | self.doubts
@@ -370,7 +372,9 @@ class Judge:
         """Return a table with a row per estimator, case and run; see `tables.table_of_runs`."""
         from fuselog.replay.judging.tables import table_of_runs
 
-        return table_of_runs(self._quantities.values(), self.innovations)
+        if self._runs_table is None:
+            self._runs_table = table_of_runs(self._quantities.values(), self.innovations)
+        return self._runs_table.copy()
 
     @property
     def times(self) -> "pd.DataFrame":

@@ -346,6 +346,24 @@ def test_of_equal_stamps_the_first_is_taken() -> None:
                 assert np.array_equal(one.values, two.values)
 
 
+def test_a_twist_in_the_plane_beside_an_inertial_unit_has_no_turn_rate_about_z() -> None:
+    streams = recorded_unit(ride(8000)).streams
+    [body] = bodies(streams)
+    stamps_ns = next(iter(streams.values())).publish_time_ns
+    empty = np.empty((len(stamps_ns), 0))
+    still = np.zeros((len(stamps_ns), 2))
+    twist = make_stream(
+        "/unit/twist",
+        schemas.TWIST,
+        stamps_ns,
+        velocity_mps=still,
+        turn_rate_radps=still[:, :1],
+        covariance=empty,
+    )
+    [also] = bodies({**streams, twist.topic: twist})
+    assert [each.topic for each in also.turns] == [each.topic for each in body.turns]
+
+
 def test_errors_that_are_not_white_say_nothing_of_their_variance() -> None:
     clean = recorded(faulty(2000, "fix variance x 4"))
     slow = clean.streams["/car/fix"]

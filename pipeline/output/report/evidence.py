@@ -5,9 +5,9 @@ The evidence is computed from the metrics and the table of runs, which exist in 
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -169,7 +169,12 @@ class Findings:
                 found[min(errors, key=errors.__getitem__)] += 1
         return found
 
-    def by_run(self, label: str, key: str) -> "pd.Series[float]":
+    @cached_property
+    def by_run(self) -> "Callable[[str, str], pd.Series[float]]":
+        """Return a function that looks up a quantity of every run by estimator and quantity."""
+        return cache(self._by_run)
+
+    def _by_run(self, label: str, key: str) -> "pd.Series[float]":
         """Return a quantity of every run, combined over cases: as RMS for errors, else as the mean."""
         if key not in self.rows:
             return pd.Series(dtype=float)
@@ -181,11 +186,11 @@ class Findings:
 
     def difference(self, first: str, second: str, key: str, target: Target = None) -> Difference | None:
         """Compute the difference of a quantity, second minus first estimator, over the runs of both."""
-        both = pd.concat([self.by_run(first, key), self.by_run(second, key)], axis=1).dropna()
-        if both.empty:
+        one, other = self.by_run(first, key).align(self.by_run(second, key), join="inner")
+        if one.empty:
             return None
-        values = both.to_numpy(dtype=float)
-        return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
+        values = one.to_numpy(dtype=float), other.to_numpy(dtype=float)
+        return paired_difference(*values, target or target_of(key) or "low", MARGIN)
 
     def stressed(self, *labels: str) -> float:
         """Return the largest effect of irrelevant changes on the main error of these estimators."""

@@ -101,6 +101,7 @@ def test_parts_of_the_runs_merge_to_the_whole(
         return {topic: gather([rows.of_run(run) for run in runs]) for topic, rows in outputs.items()}
 
     parts = judged(sources[:2], [of_runs([0, 1])])
+    assert set(parts.runs_table["run"]) == {0, 1}
     parts.merge(judged(sources[2:], [of_runs([2])], first_run=2))
     assert_alike(parts, judged(sources, [outputs]))
     assert set(parts.runs_table["run"]) == {0, 1, 2}
@@ -110,7 +111,13 @@ def test_the_worst_moment_is_that_of_the_largest_nees_else_of_the_largest_error(
     sources: list[MemorySource], outputs: dict[str, Ragged]
 ) -> None:
     judge = Judge(sources, gap_limit_s=GAP_S)
-    blocks = [judge.add(block).errors for block in cut(outputs, sources[0].epoch_ns + 2 * 10**9)]
+    blocks, counts = [], []
+    for block in cut(outputs, sources[0].epoch_ns + 2 * 10**9):
+        blocks.append(judge.add(block).errors)
+        table = judge.runs_table
+        counts.append(table["estimates"].sum())
+        table["estimates"] = 0  # of a copy
+    assert 0 < counts[0] < counts[1] == judge.runs_table["estimates"].sum()
     assert set(judge.worst) == {"ekf", "dead-reckoning"}
     for estimator, found in judge.worst.items():
         errors = [each for block in blocks for each in block if each.estimator == estimator]
