@@ -171,6 +171,12 @@ def viewed(name: str, folder: Path) -> None:
             assert (said.code, said.err.count("\n")) == ((0, 0) if has_timeline else (2, 1)), said.err
 
 
+@pytest.fixture
+def first_cause_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A diagnosis ends with its first cause, which takes a fraction of the time."""
+    monkeypatch.setattr("fuselog.pipeline.diagnosing.diagnosis.MOST_SENTENCES", 1)
+
+
 @pytest.fixture(scope="session")
 def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
     """Start a command as a process of its own."""

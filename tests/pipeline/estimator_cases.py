@@ -257,7 +257,7 @@ BOUNDS = {
 }
 FEW = {"duration_s": 2.0, "landmarks": 5, "range_bearing": {"rate_hz": 2.0}}
 LOOKS = {"scene": "random", "looks": 3}
-L4 = Situation("relative-bearings", LOOKS, {"shape": "l4"})
+L4 = Situation("relative-bearings", {**LOOKS, "looks": 1}, {"shape": "l4"})
 OWN = {
     "bingham-axis": directional("bingham-axis", "axis", [0.01, 0.02]),
     "bingham-orientation": directional("bingham-orientation", "orientation", [0.01, 0.02, 0.02, 0.03]),
@@ -311,7 +311,7 @@ OWN = {
     "set-filter": Case(
         "set-filter",
         robot(FEW, **BOUNDS),
-        {"arena_m": [-2.0, -2.0, 2.0, 2.0], "most_edges": 1, "anchor_s": 0.5},
+        {"arena_m": [-2.0, -2.0, 2.0, 2.0], "most_edges": 1, "anchor_s": 0.5, "weighting": "equal"},
         {
             **dict.fromkeys(("weighting", "sweeps"), robot(FEW, **BOUNDS, shape="l4")),
             "most_edges": robot(FEW, **BOUNDS, anchor_s=0.5),

@@ -60,6 +60,7 @@ def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
         (PRIOR, put.shifted("mean", 2), 2.0, f"{PRIOR}.heading_bias"),
     ],
 )
+@pytest.mark.usefixtures("first_cause_alone")
 def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
     run: fl.MemorySource, topic: str, fault: put.Alteration, by: float, corrected: str
 ) -> None:
@@ -222,6 +223,7 @@ def test_a_setting_says_that_truths_cover_some_targets() -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_covariances_of_fixes_are_scaled() -> None:
     """Stated 4 times too large, and mended by what the diagnosis says."""
     run = fl.record("landmarks", seed=3, duration_s=120.0, fix={"rate_hz": 5.0})
@@ -329,6 +331,7 @@ def test_every_command_alters_alike_and_says_so(
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySource) -> None:
     """No command knows its name; and what is set already is counted in."""
     faulty = put.altered(run, SEEN, put.delayed, 0.3)

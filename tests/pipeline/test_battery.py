@@ -332,6 +332,7 @@ def test_what_a_parameter_undoes_is_not_said_of_the_log(fault: str, settings: di
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_a_delay_that_is_set_too_large_is_what_is_advised() -> None:
     """Without a compass, wheels that are late are as likely as fixes that are taken back too far."""
     log = recorded(late(0.25)(drive(12)), has_compass=False, has_prior=True)

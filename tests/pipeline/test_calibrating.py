@@ -269,6 +269,7 @@ def driven(
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_a_lever_arm_is_found_from_a_start_at_which_the_filter_diverges() -> None:
     """It turns on the spot for 20 s, then drives; without the lever arm NIS is above 100."""
     time_s = 0.05 * np.arange(1200)

@@ -101,6 +101,7 @@ def test_estimates_are_equal_to_the_last_bit(
 @pytest.mark.paper
 @needs_compiler
 @pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+@pytest.mark.usefixtures("first_cause_alone")
 def test_a_deployed_filter_has_the_cause_of_its_model(tmp_path: Path) -> None:
     """It declares what its parameters are, as the model's functions read them."""
     log = recorded(tmp_path, "landmarks", **ROBOT)

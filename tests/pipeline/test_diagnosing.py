@@ -349,6 +349,7 @@ BESIDE_ITS_PLACE = {"/robot1/fix.origin": "1.0,-2.0"}
         (BESIDE_ITS_PLACE, {"/robot1/fix.origin": "0.5,0"}, {"/robot1/fix.origin": (-1.0, 2.0)}),
     ],
 )
+@pytest.mark.usefixtures("first_cause_alone")
 def test_advice_is_the_total_to_set_where_part_of_it_is_set(
     wrong: dict[str, Any], part: dict[str, Any], right: dict[str, Any]
 ) -> None:

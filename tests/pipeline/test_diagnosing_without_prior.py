@@ -80,6 +80,7 @@ def test_a_broad_model_knows_how_far_messages_are_from_the_last() -> None:
 
 @pytest.mark.parametrize(("stated", "factor", "size"), [(4.0, 1.99, "large"), (1 / 16, 4.02, "small")])
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_a_covariance_stated_wrongly_is_named_with_its_factor(
     stated: float, factor: float, size: str
 ) -> None:

@@ -29,6 +29,7 @@ from fuselog.pipeline.output.results import Result
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.estimators.landmarks import ROBOT
 from fuselog.replay.judging.consistency.consistency import ellipses
+from tests.pipeline.conftest import shadowed
 
 SURE = {"sigma_range_m": 0.03}  # of .1
 GOOD = "No problem found."
@@ -473,11 +474,16 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
 @pytest.mark.paper
-def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subprocess.Popen[str]]) -> None:
-    """Odd requests give one line a kind meanwhile, without the secret and without control characters."""
+def test_ctrl_c_ends_everything(
+    log: Path, start_fuselog: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    """Odd requests give one line a kind meanwhile, without the secret and without control characters.
+
+    No module of the current folder is imported.
+    """
     pytest.importorskip("bokeh")
     command = ["explore", str(log), "-e", "ekf", "--no-browser"]
-    with start_fuselog(*command, stderr=subprocess.STDOUT) as running:
+    with shadowed(tmp_path), start_fuselog(*command, stderr=subprocess.STDOUT) as running:
         assert running.stdout is not None
         said = running.stdout.readline()
         url = re.search(r"http://\S+/", said)

@@ -33,8 +33,9 @@ def test_no_value_that_cannot_be_makes_a_command_stumble() -> None:
     `info`, whose checks are those of `lint`, gets each kind and each scenario.
     """
     schemas = {(schema_of(each), each.field): each for each in reversed(SAMPLE)}
-    kinds = {each.kind: each for each in reversed(SAMPLE)}
-    scenarios = {each.scenario: each for each in reversed(SAMPLE)}
+    first = [*schemas.values(), *SAMPLE]
+    kinds = {each.kind: each for each in reversed(first)}
+    scenarios = {each.scenario: each for each in reversed(first)}
     assert len(schemas) > 50
     chosen = dict.fromkeys(schemas.values(), QUICK[1:])
     chosen |= dict.fromkeys((*kinds.values(), *scenarios.values()), QUICK)

@@ -19,6 +19,7 @@ from PIL import Image
 
 from fuselog.pipeline.command_line.group import fuselog
 from fuselog.pipeline.command_line.options import Output
+from fuselog.pipeline.deploying import certificate
 from fuselog.replay.timeline import viewer
 from tests.pipeline.conftest import Said, run_here, shadowed
 from tests.pipeline.outputs_audit import (
@@ -67,8 +68,9 @@ class Painter:
 
 @pytest.fixture(scope="module", autouse=True)
 def _painted() -> Iterator[None]:
-    """The viewer itself is for tests/replay/timeline."""
+    """The viewer itself is for tests/replay/timeline; `test_deploying.py` has a filter's memory."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(certificate, "_memory", lambda *_: None)
         patch.setattr(viewer, "listen", lambda *_: nullcontext(SimpleNamespace(url="")))
         patch.setattr(viewer, "ViewerClient", SimpleNamespace(connect=lambda _: Painter()))
         yield
@@ -395,7 +397,7 @@ MAY_FAIL = {"view", "report", "replay"}
 def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path: Path) -> None:
     """Nor do the processes that commands start; `before` has the commands with an output.
 
-    `test_campaigns.py` has the workers of Dask.
+    `test_campaigns.py` has the workers of Dask, `test_exploring.py` the explorer.
     """
     (here / "junk.so").write_bytes(b"no library")
     lines = [*map(str.split, OTHERS.strip().splitlines())]
@@ -409,12 +411,6 @@ def test_no_command_imports_a_module_of_the_current_folder(here: Path, tmp_path:
         )
         failed = zip(lines, json.loads(done.stdout.splitlines()[-1]), strict=True)
         assert {words[0] for words, code in failed if code} <= MAY_FAIL, done.stderr
-        script = Path(sys.executable).with_name("fuselog")
-        command = [script, "explore", "run.mcap", "-e", "ekf", "--no-browser"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE) as exploring:
-            assert exploring.stdout is not None
-            assert b"http://" in exploring.stdout.readline()
-            exploring.terminate()
 
 
 def test_settings_of_numba_in_the_current_folder_are_refused(here: Path) -> None:

@@ -255,9 +255,9 @@ def test_what_the_page_compiles_is_what_it_says(package: Path, said: dict[str, d
 
 @pytest.mark.paper
 def test_only_a_recursion_that_makes_arrays_needs_numba(package: Path) -> None:
-    """Without numba all else works, also reading a long log; what needs it says so in one sentence."""
+    """Without numba all else works, also reading several chunks; what needs it says so in a sentence."""
     commands = [
-        "fuselog record landmarks --set duration_s=600 --set robots=5 --compression none -o long.mcap",
+        "fuselog record landmarks --set duration_s=90 --set robots=5 --compression none -o long.mcap",
         "fuselog info long.mcap",
         "fuselog replay long.mcap -e dead-reckoning",
         "fuselog record landmarks --set duration_s=10 --out robot.mcap",
@@ -268,7 +268,7 @@ def test_only_a_recursion_that_makes_arrays_needs_numba(package: Path) -> None:
         "fuselog replay heard.mcap -e arrays --out arrays.mcap",
     ]
     *others, last = _run(package, commands, without="numba")
-    assert (package / "long.mcap").stat().st_size > 20e6
+    assert (package / "long.mcap").stat().st_size > 3e6
     assert [each["code"] for each in others] == [0] * 8, others
     assert last["code"] == 2
     assert re.fullmatch(

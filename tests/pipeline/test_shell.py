@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.shell_completion import BashComplete
 
+from fuselog.pipeline.command_line import fuselog
 from fuselog.pipeline.output import terminal
 from tests.pipeline.conftest import Said
 
@@ -23,16 +25,24 @@ BIN = Path(sys.executable).parent
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
 @pytest.mark.paper
 def test_the_readmes_line_completes_commands_options_names_and_settings() -> None:
-    """What bash offers after what was typed so far, once the line has been run."""
+    """What bash offers after what was typed so far, once the line has been run.
+
+    It asks a process each time, so most is asked of the class that answers in it.
+    """
     page = (ROOT / "README.md").read_text(encoding="utf-8")
     (line,) = re.findall(r"^eval .*_FUSELOG_COMPLETE=bash_source.*$", page, re.MULTILINE)
+    complete = BashComplete(fuselog, {}, "fuselog", "_FUSELOG_COMPLETE")
+    for words, expected in {
+        "re": {"record", "replay", "report"},
+        "record landm": {"landmarks", "landmarks-adverse"},
+        "replay run.mcap -e vehicle": {"vehicles", "vehicle-kalman", "vehicle-particles"},
+        "record landmarks --set dur": {"duration_s"},
+    }.items():
+        *given, begun = words.split()
+        assert expected <= {each.value for each in complete.get_completions(given, begun)}, words
     offered = {
-        "fuselog re": {"record", "replay", "report"},
         "fuselog cache --": {"--clear"},
-        "fuselog record landm": {"landmarks", "landmarks-adverse"},
-        "fuselog replay run.mcap -e vehicle": {"vehicles", "vehicle-kalman", "vehicle-particles"},
         "fuselog replay run.mcap -e ekf --set ekf.sigma_ra": {"ekf.sigma_range_m"},
-        "fuselog record landmarks --set dur": {"duration_s"},
     }
     asked = "".join(
         f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}; COMPREPLY=()\n"
