@@ -19,6 +19,8 @@ from fuselog.recorders.environment import CORES
 from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
 
+gc.disable()  # until the tests are collected: what is imported stays
+
 pytest_plugins = ["tests.goldens.keeping"]
 
 # The same examples in every run: a red test is red for everyone, and stays so until it is mended.
@@ -32,6 +34,7 @@ for _name in ("COLUMNS", "LINES"):
 
 def pytest_collection_finish() -> None:
     """Leave what is imported by now out of every later collection: a twentieth of the suite's time."""
+    gc.enable()
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)

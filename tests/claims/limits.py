@@ -22,7 +22,7 @@ from tests.claims import pages
 
 MOVES = (-3.0, 0.0, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0)
 NEAR = (0.99, 1.01)  # of what it may equal
-MOST = 6  # groups of metrics that are moved
+MOST = 3  # groups of metrics that are moved
 HALVINGS = 14
 _WORDS = ("sentence", "paper", "ours", "why", "unless")
 WIDTH = 0.05  # of a moved metric's interval, where a claim needs one

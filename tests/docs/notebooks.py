@@ -1,6 +1,9 @@
 """`python -m tests.docs.notebooks` runs the notebooks and keeps what they print and draw."""
 
+import ast
 import tempfile
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +14,19 @@ FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 
-def executed(*paths: Path, before: str = "") -> list[Any]:
-    """Notebooks, run from top to bottom, each in an empty folder; raises where a cell does.
+def executed(path: Path) -> Any:
+    """Return a notebook, run from top to bottom in an empty folder; raises where a cell does.
 
-    One kernel runs all, and code `before` them; it forgets every name between two. Without the
-    notices of what is compiled, which depend on what is in the cache.
+    Without the notices of what is compiled, which depend on what is in the cache.
     """
-    all_in_one = nbformat.v4.new_notebook()
-    all_in_one.cells.append(nbformat.v4.new_code_cell(before))
-    notebooks = [nbformat.read(path, as_version=4) for path in paths]
+    notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
-        for path, notebook in zip(paths, notebooks, strict=True):
-            place = Path(folder, path.stem)
-            place.mkdir()
-            apart = nbformat.v4.new_code_cell(f"%reset -f\nimport os\nos.chdir({str(place)!r})\ndel os")
-            all_in_one.cells += [apart, *notebook.cells]
-        nbclient.NotebookClient(all_in_one, record_timing=False).execute()
-    for cell in (cell for notebook in notebooks for cell in notebook.cells):
+        place = {"metadata": {"path": folder}}
+        nbclient.NotebookClient(notebook, record_timing=False, resources=place).execute()
+    for cell in notebook.cells:
         if "outputs" in cell:
             cell.outputs = [output for output in cell.outputs if not _is_notice(output)]
-    return notebooks
+    return notebook
 
 
 def _is_notice(output: Any) -> bool:
@@ -44,7 +40,29 @@ def printed(notebook: Any) -> list[str]:
     return [each.text if each.output_type == "stream" else each.data["text/plain"] for each in outputs]
 
 
+def printed_here(path: Path) -> list[str]:
+    """Run a notebook in this process, in the current folder; return what its cells print and give."""
+    texts, names = list[str](), dict[str, Any]()
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type != "code":
+            continue
+        # without what speaks to the kernel, such as `%matplotlib inline`
+        source = "\n".join(line for line in cell.source.splitlines() if not line.startswith("%"))
+        tree, given = ast.parse(source), None
+        *statements, last = tree.body
+        with redirect_stdout(StringIO()) as out:
+            if isinstance(last, ast.Expr):
+                exec(compile(ast.Module(statements, []), "cell.py", "exec"), names)
+                given = eval(compile(ast.Expression(last.value), "cell.py", "eval"), names)
+            else:
+                exec(compile(tree, "cell.py", "exec"), names)
+        texts += filter(None, [out.getvalue()])
+        if given is not None and not source.endswith(";"):
+            texts.append(repr(given))
+    return texts
+
+
 if __name__ == "__main__":
     for each in NOTEBOOKS:
-        nbformat.write(*executed(each), each)
+        nbformat.write(executed(each), each)
         print(each)

@@ -99,7 +99,7 @@ def importer_of(experiment: Experiment) -> str:
 
 
 SHORT = {"duration_s": 40.0}
-# of vehicles, whose steps are dear
+# of vehicles and of sets, whose steps are dear
 SHORTER = {"duration_s": 15.0}
 AUGMENTED = {
     "estimate": ["bias_range_m"],
@@ -132,11 +132,12 @@ TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 # searches, which their own tests hold to what is known
 SEARCHES = ("calibration", "diagnosis", "ellipsoid", "false-causes", "faults-together", "sensor-noise")
 RECIPES = {name: Recipe(name) for name in shipped("experiments") if name not in SEARCHES} | {
+    # of all scores together; `biometrics-simulated` has each modality and matcher by itself
     "biometrics-bssr1": Recipe(
         "biometrics-bssr1",
         estimators={
-            **{label: {"folds": 2} for label in ("qda", "knn", "logistic")},
-            **{label: {"folds": 2, "iterations": 5} for label in MIXTURES},
+            **{label: {"folds": 2, "subsets": ["all"]} for label in ("qda", "knn", "logistic")},
+            **{label: {"folds": 2, "iterations": 5, "subsets": ["all"]} for label in MIXTURES},
         },
     ),
     "biometrics-sequential": Recipe("biometrics-sequential", estimators={"ratio": {"pairs": "trimmed"}}),
@@ -251,7 +252,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name not in 
     "mrclam-set-filter": Recipe("mrclam-set-filter", estimators=SET_FILTERS, alone=True, span_s=30.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=30.0),
     "mrclam-stress": Recipe("mrclam-stress", span_s=60.0),
-    "set-filter": Recipe("set-filter", parameters=SHORT, estimators=SET_FILTERS, alone=True),
+    "set-filter": Recipe("set-filter", parameters=SHORTER, estimators=SET_FILTERS, alone=True),
     "uwb-outdoor": Recipe("uwb-outdoor", part="uwb_outdoor/LOS/Trajectory_B/Case_3", span_s=20.0),
     "uwb-pose": Recipe(
         "uwb-pose",

@@ -18,13 +18,13 @@ COMMANDS = (float(-each) for each in range(1, 10))
 CRASH, LOOP, LEAK, PRINT, NOT_A_NUMBER, NEGATIVE, FAIL, LEAVE, UNDEFINED = COMMANDS
 MESSAGES, AT = 600, 499
 SANE = 1.0
-LIMITS = {"time_limit_s": 4.0, "memory_limit_mb": 400}
+LIMITS = {"time_limit_s": 2.0, "memory_limit_mb": 400}
 # what is asked of a run at message 500, and the reason that is given
 RUNS = {
     SANE: "",
     PRINT: "",
     CRASH: "the filter crashed (SIGSEGV) at message 500 (/range)",
-    LOOP: "the filter took longer than 4 s (time_limit_s) at message 500 (/range)",
+    LOOP: "the filter took longer than 2 s (time_limit_s) at message 500 (/range)",
     LEAK: "the filter took more than 400 MB of memory (memory_limit_mb) at message 500 (/range)",
     LEAVE: "the filter ended with exit code 3 at message 500 (/range)",
     NOT_A_NUMBER: "the filter's estimate or covariance is not finite",

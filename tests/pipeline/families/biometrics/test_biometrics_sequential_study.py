@@ -54,11 +54,16 @@ def test_matchers_that_are_never_sure_watch_nothing(drawn):
 
 
 @pytest.mark.paper
-def test_simulated_scores_give_every_claim_and_need_ratios_of_all_pairs(tmp_path):
+def test_simulated_scores_give_every_claim_and_need_ratios_of_all_pairs(tmp_path, monkeypatch):
+    # each bar of each of many fusions is sent by itself
+    monkeypatch.setattr("fuselog.replay.families.biometrics.timeline.UPDATES", 3)
     name, experiment = load_experiment(
         "biometrics-sequential-simulated",
-        {"users": 80, "ratio": {"impostor_components": 2, "iterations": 5, "folds": 4}},
-        {"options": {"sequences": 200, "replicates": 20, "watched": 4, "watched_probes": 500}},
+        {
+            "users": 40,
+            "ratio": {"genuine_components": 1, "impostor_components": 1, "iterations": 2, "folds": 2},
+        },
+        {"options": {"sequences": 50, "replicates": 20, "watched": 4, "watched_probes": 200}},
     )
     result = run_experiment(name, experiment, tmp_path / "a", logs=0)
     assert len(result.claims) == 2 * 7 + 2 + 4

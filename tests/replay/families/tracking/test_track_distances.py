@@ -92,10 +92,13 @@ def test_hota_of_the_sheet():
 
 @pytest.mark.paper
 def test_figures_are_those_of_motmetrics_and_trackeval_on_random_scenes():
-    """IDF1, switches and breaks of motmetrics, HOTA and IDF1 of TrackEval; see `track_peers`."""
+    """IDF1, switches and breaks of motmetrics, HOTA and IDF1 of TrackEval; see `track_peers`.
+
+    Of every second scene: a hundred.
+    """
     kept = json.loads(track_peers.KEPT.read_text())["scenes"]
     assert len(kept) == track_peers.SCENES
-    for seed, theirs in enumerate(kept):
+    for seed, theirs in [*enumerate(kept)][::2]:
         tracks, targets = track_peers.scene(seed)
         told = [
             TracksAt(np.flatnonzero(there), at[there])
