@@ -286,9 +286,16 @@ class RangeStream(io.RawIOBase):
         return self._file.read(start, length)
 
     def close(self) -> None:
-        """Close the stream; raise BadInput if the file has changed since the path was made."""
+        """Close the stream without a request; garbage collection, which calls this, must not wait."""
         if not self.closed:
             super().close()
             self._file.close()
-            if not self._file.is_lost:
-                check_unchanged(self._path.url, self._path.identity)
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Close the stream; raise BadInput if the file has changed since the path was made.
+
+        This is not checked if the caller ends early; a generator may do so in garbage collection.
+        """
+        self.close()
+        if not self._file.is_lost and (error is None or isinstance(error, Exception)):
+            check_unchanged(self._path.url, self._path.identity)

@@ -1,5 +1,6 @@
 """Logs at URLs: the bytes that are fetched, the cache, and what goes wrong in a network."""
 
+import gc
 import pickle
 import re
 import shutil
@@ -15,7 +16,14 @@ from fsspec.registry import known_implementations
 
 from fuselog.pipeline.runs.estimates import hash_streams
 from fuselog.recorders.errors import BadInput
-from fuselog.recorders.log import Log, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.recorders.log import (
+    Log,
+    make_stream,
+    open_log,
+    read_streams,
+    schemas,
+    write_log,
+)
 from fuselog.recorders.recording import record_run
 from fuselog.recorders.remote import backends, paths
 from fuselog.recorders.remote.paths import located, partly
@@ -239,6 +247,22 @@ def test_a_log_that_changes_is_not_mixed(site, monkeypatch):
         with pytest.raises(BadInput, match="large\\.mcap: changed while it was read"):
             read()
     monkeypatch.undo()
+
+
+def test_nothing_is_asked_in_garbage_collection(site):
+    """It may run while this thread holds a lock that the thread of the network needs."""
+    path = partly(located(f"{site.url}/large.mcap"))
+
+    def reading() -> Iterator[bytes]:
+        with paths.open_binary(path) as file:
+            yield file.read(10_000)
+
+    held, begun = paths.open_binary(path), reading()
+    assert next(begun) == held.read(10_000)
+    site.asked.clear()
+    del held, begun
+    gc.collect()
+    assert site.asked == []
 
 
 def test_a_file_without_a_version_is_fetched_again(fuselog, site):
