@@ -658,7 +658,9 @@ def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
 
     def finalize(*_: object) -> None:
         Finalized()  # nobody holds it
-        time.sleep(5)
+        for _ in range(100):
+            time.sleep(0.05)
+        raise AssertionError("nothing stopped it")
 
     class Timer(threading.Timer):
         def start(self) -> None:
