@@ -99,6 +99,7 @@ class Likelihood:
     readings: Mapping[str, Reading] = field(default_factory=dict)
     broad: Mapping[str, float] = field(default_factory=dict)
     later_ns: int = 0
+    _bound: dict[Hashable, list[Bound]] = field(default_factory=dict)
     # by the metadata of channels, runs to which estimators are bound; messages do not matter for that
     _runs: dict[Hashable, Ensemble[MemorySource]] = field(default_factory=dict)
 
@@ -108,7 +109,7 @@ class Likelihood:
         If the log has no initial state, the innovations from the most likely broad start are returned.
         Raises BadInput if the estimator cannot begin.
         """
-        bound = self._bound_to(trial, _stated_by(trial))
+        bound = self._bound_to(trial)
         self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
         later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
         self.starts = broad_starts(replace(trial.source, streams=later), bound)
@@ -148,10 +149,10 @@ class Likelihood:
         groups: dict[Hashable, list[int]] = {}
         bound: dict[int, list[Bound]] = {}
         for place, trial in enumerate(trials):
-            stated = _stated_by(trial)
+            stated, key = _stated_by(trial), _key(trial)
             with suppress(BadInput):  # no run fits these settings
-                bound[place] = self._bound_to(trial, stated)
-                groups.setdefault((alike(bound[place]) or _key(trial), stated), []).append(place)
+                bound[place] = self._bound_to(trial, (key, stated))
+                groups.setdefault((alike(bound[place]) or key, stated), []).append(place)
         found = np.full((len(trials), count), -np.inf)
         for group in groups.values():
             repeated = [trials[group[0]].source] * part_count(self.starts)
@@ -165,13 +166,16 @@ class Likelihood:
 
     def disturbed(self, trial: Trial) -> list[Trial]:
         """Make copies of a trial with noise added to the controls of its log."""
-        copies = disturbed(trial.source, self._bound_to(trial, _stated_by(trial)))
+        copies = disturbed(trial.source, self._bound_to(trial))
         return [replace(trial, runs=[each]) for each in copies]
 
-    def _bound_to(self, trial: Trial, stated: Hashable) -> list[Bound]:
-        """Bind the estimator to the runs of the first trial with the same metadata, which cache it."""
-        runs = self._runs.setdefault(stated, ensemble_of(trial.runs))
-        return replace(trial, runs=runs).bind()
+    def _bound_to(self, trial: Trial, key: tuple[str, Hashable] | None = None) -> list[Bound]:
+        key = key or (_key(trial), _stated_by(trial))
+        if key not in self._bound:
+            _, stated = key
+            runs = self._runs.setdefault(stated, ensemble_of(trial.runs))
+            self._bound[key] = replace(trial, runs=runs).bind()
+        return self._bound[key]
 
     def _scored(self, trial: Trial, bound: Sequence[Bound], known: "_Known") -> Scored:
         """Select the messages that are scored: within the span of the controls, and after the prior.
