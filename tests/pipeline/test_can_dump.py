@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
-from fuselog.pipeline.diagnosing import diagnosis
 from fuselog.pipeline.diagnosing.battery.car import FAULTS, drive
 from fuselog.recorders.models.geodesy import out_of_tangent_plane
 from fuselog.recorders.simulators.car import Car
@@ -75,11 +74,9 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
 
 
 @pytest.mark.paper
-def test_the_fault_of_the_dump_is_named_first(
-    fuselog: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("first_cause_alone")
+def test_the_fault_of_the_dump_is_named_first(fuselog: Callable[..., Any], tmp_path: Path) -> None:
     """`test_battery.py` has all other faults, and several at once."""
-    monkeypatch.setattr(diagnosis, "MOST_SENTENCES", 1)
     car = FAULTS["lever (2, .6) m"](drive(3))
     found = fl.diagnose(imported(car, tmp_path, fuselog), "ekf").sentences[0]
     told = {

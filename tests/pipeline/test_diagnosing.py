@@ -304,9 +304,9 @@ def test_a_stretch_of_fixes_that_are_off_is_outliers_and_no_noise() -> None:
 
 
 @pytest.mark.paper
-def test_fixes_at_the_limit_of_what_is_possible_are_outliers(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("first_cause_alone")
+def test_fixes_at_the_limit_of_what_is_possible_are_outliers() -> None:
     """A larger scale would leave them out, as impossible, and gain by that."""
-    monkeypatch.setattr(diagnosis, "MOST_SENTENCES", 1)
     fix, seen = {"rate_hz": 2.0, "sigma_m": 0.3}, {"rate_hz": 0.0}
     log = fl.record("landmarks", seed=3, duration_s=30.0, fix=fix, range_bearing=seen)
     right = log.streams["/robot1/fix"]

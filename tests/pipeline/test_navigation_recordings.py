@@ -102,14 +102,12 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
 
 
 @pytest.mark.paper
-def test_what_is_planted_into_a_walk_is_named_first(
-    navigation: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("first_cause_alone")
+def test_what_is_planted_into_a_walk_is_named_first(navigation: Path) -> None:
     """And nothing of a walk as it is, whose receiver's covariances fit one solution, not the other.
 
     18 s of 12 to 30 s, with every sixth sample of the unit: what is named is that of the whole walk.
     """
-    monkeypatch.setattr(diagnosis, "MOST_SENTENCES", 1)
     whole = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
     first_ns = whole.streams["/fix"].publish_time_ns[0]
     streams = {}

@@ -268,7 +268,7 @@ def test_only_a_recursion_that_makes_arrays_needs_numba(package: Path) -> None:
         "fuselog replay heard.mcap -e arrays --out arrays.mcap",
     ]
     *others, last = _run(package, commands, without="numba")
-    assert (package / "long.mcap").stat().st_size > 3e6
+    assert len(open_log(package / "long.mcap").container.regions) > 2
     assert [each["code"] for each in others] == [0] * 8, others
     assert last["code"] == 2
     assert re.fullmatch(
