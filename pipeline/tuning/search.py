@@ -4,14 +4,14 @@ Positive parameters, such as standard deviations, are searched as logarithms. Ev
 searched in a unit of its own.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fuselog.pipeline.optimise import ITERATIONS, TOLERANCE, Cost, minimum
+from fuselog.pipeline.optimise import ITERATIONS, TOLERANCE, Cost, Search, minimum, side_by_side
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.parameters import Parameter
 
@@ -88,38 +88,39 @@ def coordinates_of(cost: Cost, free: Sequence[Parameter], about: Floats) -> Coor
 
     Raises BadInput if the cost does not depend on a parameter.
     """
+    places = [place for place, each in enumerate(free) if not each.is_fixed]
+
+    def gains(asked: Sequence[tuple[int, float]]) -> Sequence[float]:
+        points = np.tile(about, (len(asked), 1))
+        for row, (search, change) in zip(points, asked, strict=True):
+            place = places[search]
+            row[place] = np.clip(row[place] + change, free[place].low, free[place].high)
+        return [-each for each in cost(points).tolist()]
+
     units = np.ones(len(free))
-    for place, each in enumerate(free):
-        if each.is_fixed:
-            continue
-        value = float(about[place])
-
-        def near(steps: Sequence[float], place: int = place, each: Parameter = each) -> Floats:
-            points = np.tile(about, (len(steps), 1))
-            points[:, place] = np.clip(about[place] + np.array(steps), each.low, each.high)
-            return cost(points)
-
-        if each.is_log:
-            below, middle, above = near([-0.3 * value, 0.0, 0.3 * value])
-        else:
-            units[place], (below, middle, above) = _unit(near, value)
-        if below == middle == above:
-            raise BadInput(
-                f"{each.name}: the logs do not depend on it, so they cannot determine its value; remove "
-                "it from --free"
-            )
+    units[places] = side_by_side([_unit(free[place], float(about[place])) for place in places], gains)
     return Coordinates(free, units)
 
 
-def _unit(near: Callable[[Sequence[float]], Floats], value: float) -> tuple[float, Floats]:
-    """Return `UNIT` standard errors from the cost's curvature at a value, and the three costs used."""
-    step = 1e-3 * max(abs(value), 1.0)
-    for _ in range(LOOKS):  # the cost is not a parabola here, so a smaller or larger step is used
-        costs = near([-step, 0.0, step])
-        with np.errstate(invalid="ignore"):  # infinite costs have no curvature
-            bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
+def _unit(of: Parameter, value: float) -> Search[float, float]:
+    """Search for the unit of a parameter's coordinate: 1 for a logarithm, else `UNIT` standard errors.
+
+    The standard error follows from the curvature of the cost at the value. Raises BadInput if the cost
+    does not depend on the parameter.
+    """
+    step = 0.3 * value if of.is_log else 1e-3 * max(abs(value), 1.0)
+    for _ in range(1 if of.is_log else LOOKS):
+        # the cost may not be a parabola here, so a smaller or larger step is used
+        below, middle, above = yield [-step, 0.0, step]
+        with np.errstate(invalid="ignore"):  # infinite gains have no curvature
+            bend = np.float64(2.0 * middle - below - above) / step**2
         step = bend**-0.5 if 0.0 < bend < np.inf else step * (10.0 if bend <= 0.0 else 0.1)
-    return UNIT * step, costs
+    if below == middle == above:
+        raise BadInput(
+            f"{of.name}: the logs do not depend on it, so they cannot determine its value; remove "
+            "it from --free"
+        )
+    return 1.0 if of.is_log else UNIT * float(step)
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
