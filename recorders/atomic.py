@@ -20,10 +20,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
-
-from filelock import FileLock, Timeout
+from typing import TYPE_CHECKING
 
 from fuselog.recorders.errors import BadInput, CannotWrite
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 _LOCK, _NEW, _OLD = "fuselog.lock", "new", "old"
 _LOG = logging.getLogger(__name__)
@@ -123,6 +125,8 @@ def clear_leftovers(place: Path) -> bool:
         with suppress(OSError):
             work.rmdir()  # its creator was killed before it wrote anything
             continue
+        from filelock import FileLock, Timeout
+
         lock = FileLock(work / _LOCK, timeout=0)
         try:
             lock.acquire()
@@ -142,8 +146,10 @@ def is_being_written(file: Path) -> bool:
     )
 
 
-def _make(place: Path) -> tuple[Path, FileLock]:
+def _make(place: Path) -> tuple[Path, "FileLock"]:
     """Create a working folder and lock it."""
+    from filelock import FileLock, Timeout  # slow to import
+
     while True:
         work = Path(tempfile.mkdtemp(".part", f".{place.name}.", place.parent))
         lock = FileLock(work / _LOCK, timeout=0)
@@ -169,7 +175,7 @@ def _is_ours(work: Path) -> bool:
     return not others and (not members or locked)
 
 
-def _remove(work: Path, place: Path, lock: FileLock) -> None:
+def _remove(work: Path, place: Path, lock: "FileLock") -> None:
     """Remove a working folder whose lock is held; move a replaced folder back to its place.
 
     The lock file is removed last, so that after an interruption the rest is recognised as a leftover.

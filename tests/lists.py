@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from fuselog.pipeline.api.lists import GROUPS, KEPT, places_of, told
+from fuselog.pipeline.api.lists import GROUPS, places_of, told
+from fuselog.pipeline.runs.inputs import KEPT
 from fuselog.recorders.errors import BadInput
 
 

@@ -1,7 +1,8 @@
 """Lists of names that can be chosen, read without importing the modules that define them.
 
-The descriptions of our modules and files are stored in `data/lists.json`, which `python -m tests.lists`
-writes and a test checks. If another package registers a name, everything is imported instead.
+The descriptions of our modules and files, and the defaults of our recorders, are stored in
+`data/lists.json`, which `python -m tests.lists` writes and a test checks. If another package registers a
+name, everything is imported instead.
 """
 
 import json
@@ -11,11 +12,10 @@ from itertools import groupby
 from typing import Any
 
 from fuselog.pipeline.output.terminal import print_table, say
-from fuselog.pipeline.runs.inputs import SHIPPED, shipped
+from fuselog.pipeline.runs.inputs import KEPT, defaults_of, shipped
 from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.registry import available
 
-KEPT = SHIPPED / "lists.json"
 # The entry-point group of each list; scenarios and experiments may also be files.
 GROUPS = {
     "scenarios": "recorders",
@@ -24,6 +24,7 @@ GROUPS = {
     "methods": "models",
     "metrics": "metrics",
     "experiments": "",
+    "defaults": "recorders",
 }
 # Title of each family by the module that defines a name, in printing order.
 FAMILIES = {
@@ -94,6 +95,8 @@ def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
 
     if kind == "methods":
         return catalog.methods()
+    if kind == "defaults":
+        return {name: defaults_of(name) for name in available(GROUPS[kind])}
     return {
         name: (make() if all_load else catalog.entry_or_why(name, make)).what
         for name, make in catalog.LISTS[kind.removesuffix("s")]().items()

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
+from fuselog.pipeline.runs.inputs import kept_defaults
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.compiling.cache import cache_folder, kept_files
 from fuselog.recorders.errors import BadInput, some_of
 from fuselog.recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
-from fuselog.recorders.parameters import build, describe, flat
-from fuselog.recorders.recording import Recorder
+from fuselog.recorders.parameters import build, flat
 from fuselog.recorders.registry import available, foreign_code, load
 from fuselog.recorders.remote.copies import kept_copies
 from fuselog.recorders.remote.paths import RemotePath, partly, size_of
@@ -40,8 +40,6 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
     Result folders and timelines are also described.
     """
-    from fuselog.recorders.importers.ros.files.bags import looks_like_bag
-
     path = partly(path)
     if path.suffix == ".rrd":
         from fuselog.pipeline.logs.made import show_timeline
@@ -53,9 +51,12 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
         show_result(path, as_json=as_json)
         return
-    if looks_like_bag(path):
-        _show_bag(path, as_json=as_json)
-        return
+    if path.suffix != ".mcap" or path.is_dir():
+        from fuselog.recorders.importers.ros.files.bags import looks_like_bag
+
+        if looks_like_bag(path):
+            _show_bag(path, as_json=as_json)
+            return
     try:
         log = open_log(path, recover=recover)
     except BadInput as error:
@@ -311,8 +312,7 @@ def _say_run(run: RunMetadata) -> None:
 def _changed(run: RunMetadata) -> dict[str, Any]:
     """Return the parameters that differ from the recorder's defaults; all if the recorder is unknown."""
     try:
-        described = describe(load("recorders", run.scenario, Recorder).parameters)
+        defaults = kept_defaults(run.scenario)
     except BadInput:
         return run.parameters
-    defaults = {each.name: each.default for each in described}
     return {name: value for name, value in flat(run.parameters) if defaults.get(name) != value}

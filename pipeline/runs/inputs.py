@@ -1,6 +1,7 @@
 """Inputs of an experiment: a scenario, real data, or logs."""
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from io import BufferedIOBase
@@ -8,9 +9,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from fuselog.recorders.errors import BadInput, choices
-from fuselog.recorders.parameters import Parameters
+from fuselog.recorders.parameters import Parameters, describe
 from fuselog.recorders.parsing import read_toml
-from fuselog.recorders.registry import available
+from fuselog.recorders.registry import available, load
 
 
 class Record(Parameters):
@@ -100,12 +101,30 @@ def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: s
 
 
 SHIPPED = resources.files("fuselog_data")
+KEPT = SHIPPED / "lists.json"  # see `fuselog.pipeline.api.lists`
 
 
 def shipped(kind: str) -> dict[str, Path]:
     """Find the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
         return {path.stem: path for path in sorted(folder.rglob("*.toml"), key=lambda path: path.name)}
+
+
+def defaults_of(recorder: str) -> dict[str, Any]:
+    """Return a recorder's default parameters by full name; raise BadInput if it cannot be loaded."""
+    from fuselog.recorders.recording import Recorder
+
+    described = describe(load("recorders", recorder, Recorder).parameters)
+    return {each.name: each.default for each in described}
+
+
+def kept_defaults(recorder: str) -> dict[str, Any]:
+    """Do the same as `defaults_of`, for our own recorders without importing them."""
+    place = available("recorders").get(recorder)
+    kept = json.loads(KEPT.read_text(encoding="utf-8"))["defaults"]
+    if place is None or place.value not in kept:
+        return defaults_of(recorder)
+    return dict(kept[place.value])
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:

@@ -13,8 +13,6 @@ from hashlib import sha256
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from fuselog.recorders.atomic import whole_file
 from fuselog.recorders.environment import cache_folder as cache_folder
 from fuselog.recorders.errors import CannotWrite
@@ -119,6 +117,8 @@ def in_turn(path: Path) -> Iterator[bool]:
     The system releases the lock if the process ends. If a process keeps the lock for very long, or the
     disk does not support locks, two processes make the file, which is harmless.
     """
+    from filelock import FileLock, Timeout  # slow to import
+
     lock = FileLock(path.with_suffix(".lock"), timeout=0)
     waited = False
     try:

@@ -21,9 +21,9 @@ import pytest
 from rerun.blueprint import View
 
 import fuselog as fl
-from fuselog.pipeline.api.lists import KEPT
 from fuselog.pipeline.api.lists import told as told_of
 from fuselog.pipeline.output.results import result_folder
+from fuselog.pipeline.runs.inputs import KEPT
 from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 from fuselog.replay.timeline.drawing.canvas import Scene
 from tests.conftest import heeding_interrupts
@@ -511,6 +511,9 @@ HEAVY = (
 # What compiles and loads kernels; logs are read by kernels, too, but never by numba's.
 KERNELS = ("numba", "fuselog.recorders.compiling.kernels.native")
 
+# What reading a log needs nothing of: what recorded it, how files are written, and other kinds of logs.
+RECORDED = ("fuselog.recorders.simulators.landmarks", "filelock", "rosbags")
+
 # What a list needs nothing of: what it lists.
 LISTED = (
     *HEAVY,
@@ -528,7 +531,7 @@ LISTED = (
         # in one process, one after the other: each may import what those before it may not
         {
             **dict.fromkeys(["scenarios", "estimators", "models", "metrics", "experiments"], LISTED),
-            "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process"),
+            "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process", *RECORDED),
             "scenarios landmarks": HEAVY,
             "estimators ekf": (),
             "run landmarks --parameters": HEAVY,  # what `run` imports before its workers begin
