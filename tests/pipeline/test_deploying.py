@@ -102,7 +102,7 @@ def test_estimates_are_equal_to_the_last_bit(
 @pytest.mark.usefixtures("first_cause_alone")
 def test_a_deployed_filter_has_the_cause_of_its_model(tmp_path: Path) -> None:
     """It declares what its parameters are, as the model's functions read them."""
-    log = recorded(tmp_path, "landmarks", **ROBOT)
+    log = recorded(tmp_path, "landmarks", **{**ROBOT, "duration_s": 5.0})
     settings = {"forward_noise_density": 0.4, "gate_probability": 1.0}
     folder = fl.deploy(log, "ekf", tmp_path / "filter_c", model="robot", **settings)
     library = compiled(folder, "-shared", "-fPIC", "-O0")
