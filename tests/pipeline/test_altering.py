@@ -226,7 +226,7 @@ def test_a_setting_says_that_truths_cover_some_targets() -> None:
 @pytest.mark.usefixtures("first_cause_alone")
 def test_covariances_of_fixes_are_scaled() -> None:
     """Stated 4 times too large, and mended by what the diagnosis says."""
-    run = fl.record("landmarks", seed=3, duration_s=120.0, fix={"rate_hz": 5.0})
+    run = fl.record("landmarks", seed=3, duration_s=60.0, fix={"rate_hz": 5.0})
     fix = "/robot1/fix"
     faulty = put.altered(run, fix, put.spread("covariance_m2"), np.log(2.0))
     told = fl.diagnose(faulty, "ekf", set=OPEN).sentences[0]
@@ -289,10 +289,9 @@ def test_advice_works_on_stamps_that_begin_at_zero(
 
 
 @pytest.mark.paper
-def test_every_command_alters_alike_and_says_so(
-    tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
-) -> None:
+def test_every_command_alters_alike_and_says_so(tmp_path: Path, fuselog: Fuselog) -> None:
     log, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
+    run = fl.record("landmarks", seed=3, duration_s=8.0, speed_mps=2.0)
     fl.write(log, put.altered(run, SEEN, put.shifted("range_m"), 0.2))
     key = f"{SEEN}.range_bias"
     remedy = ["-e", "ekf", "--set", f"{key}=.2"]

@@ -25,7 +25,7 @@ def three_sensors(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]
     folder = tmp_path_factory.mktemp("los") / "result"
     with pytest.MonkeyPatch.context() as patch:
         # searches from the printed start, 200 of each case in full, diverge slowly
-        patch.setattr(printed, "_share_from_print", partial(printed._share_from_print, runs=20))
+        patch.setattr(printed, "_share_from_print", partial(printed._share_from_print, runs=6))
         return folder, run("los-three-sensors", folder, {"passes": 4}, 4)
 
 
@@ -60,8 +60,8 @@ def test_tables_stand_side_by_side(three_sensors: tuple) -> None:
 
 def test_acoustic_refutes_what_does_not_hold(tmp_path: Path) -> None:
     """Claims that hang on bounds alone, so that few runs settle them."""
-    settings = {"shots": 4, "options": {"multipliers": [0.1, 1.0, 1.5], "maps": {"step_m": 25.0}}}
-    result = run("acoustic", tmp_path / "result", settings, 4)
+    settings = {"shots": 2, "options": {"multipliers": [0.1, 1.0, 1.5], "maps": {"step_m": 25.0}}}
+    result = run("acoustic", tmp_path / "result", settings, 2)
     expected = {
         "the CRLB of native measurements is lower": "refuted",
         "estimating the sensors together with the shooter": "refuted",

@@ -378,6 +378,7 @@ def test_commands_on_all_logs_together_take_a_catalog(
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_a_diagnosis_has_a_row_for_each_log(drives: Path, fuselog: Callable[..., Said]) -> None:
     log = drives / "robot1" / "drive3.mcap"
     settings = ("-e", "ekf", "--set", "sigma_bearing_rad=0.002", "--json")

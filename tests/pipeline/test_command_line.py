@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from fuselog.replay.timeline.drawing.canvas import Scene
 from tests.conftest import heeding_interrupts
 from tests.lists import lists
 from tests.lists import main as keep_lists
+from tests.pipeline.conftest import run_here
 from tests.replay.foreign.test_isolation import SANE, run_with
 from tests.replay.foreign.test_programs import FAIL, PROGRAM, python
 
@@ -290,6 +292,12 @@ def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
     assert "cut off" in lossy.err
 
 
+@cache
+def both_lists(kind: str) -> tuple[list[dict[str, Any]], str]:
+    """A list for machines, and for a person."""
+    return run_here(kind, "--json").json, run_here(kind).out
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [
@@ -315,9 +323,9 @@ def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
     ],
 )
 def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuselog) -> None:
-    listed = fuselog(kind, "--json").json
+    listed, printed = both_lists(kind)
     assert name in [row["name"] for row in listed]
-    assert name in fuselog(kind).out
+    assert name in printed
     details = fuselog(kind, name)
     assert details.code == 0
     for word in words:
@@ -379,9 +387,9 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
 
 
 @pytest.mark.parametrize("kind", ["scenarios", "models", "estimators"])
-def test_lists_are_grouped_by_family(fuselog: Fuselog, kind: str) -> None:
+def test_lists_are_grouped_by_family(kind: str) -> None:
     """Every name is there once, and ours belong to families that have a title."""
-    lines = fuselog(kind).out.splitlines()
+    lines = both_lists(kind)[1].splitlines()
     names = [words[0] for line in lines if line.startswith("   ") and (words := line.split())]
     assert sorted(names) == sorted(getattr(fl, kind))
     assert not [line for line in lines if "Other packages" in line]
@@ -524,38 +532,30 @@ LISTED = (
 )
 
 
+# In one process, one after the other: each may import what those before it may not.
+NEEDLESS = {
+    **dict.fromkeys(["scenarios", "estimators", "models", "metrics", "experiments"], LISTED),
+    "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process", *RECORDED),
+    "replay log.mcap -e ekf -e ukf": (*HEAVY, "fuselog.pipeline.runs.experiment"),
+    "scenarios landmarks": HEAVY,
+    "estimators ekf": (),
+    "run landmarks --parameters": HEAVY,  # what `run` imports before its workers begin
+    "replay log.mcap -e ekf --save drawn.rrd": ("matplotlib", "scipy"),
+}
+
+
 @pytest.mark.paper
-@pytest.mark.parametrize(
-    "commands",
-    [
-        # in one process, one after the other: each may import what those before it may not
-        {
-            **dict.fromkeys(["scenarios", "estimators", "models", "metrics", "experiments"], LISTED),
-            "info log.mcap": (*HEAVY, "numba", "concurrent.futures.process", *RECORDED),
-            "scenarios landmarks": HEAVY,
-            "estimators ekf": (),
-            "run landmarks --parameters": HEAVY,  # what `run` imports before its workers begin
-        },
-        {
-            "replay log.mcap -e ekf -e ukf": (*HEAVY, "fuselog.pipeline.runs.experiment"),
-            "replay log.mcap -e ekf --save drawn.rrd": ("matplotlib", "scipy"),
-        },
-    ],
-    ids=("what there is", "replay"),
-)
 @pytest.mark.usefixtures("here")
-def test_a_command_imports_nothing_heavy_that_it_does_not_need(
-    world: Path, commands: dict[str, tuple[str, ...]]
-) -> None:
+def test_a_command_imports_nothing_heavy_that_it_does_not_need(world: Path) -> None:
     shutil.copy(world / "log.mcap", "log.mcap")
     code = (
         "import sys; from fuselog.pipeline.command_line import main; imported = []\n"
-        f"for command, needless in {commands}.items():\n"
+        f"for command, needless in {NEEDLESS}.items():\n"
         "    imported += [main(command.split()), {*needless} & sys.modules.keys()]\n"
         "print(imported)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines()[-1] == str([0, set()] * len(commands))
+    assert run.stdout.splitlines()[-1] == str([0, set()] * len(NEEDLESS))
 
 
 @pytest.mark.paper

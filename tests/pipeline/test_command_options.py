@@ -122,12 +122,9 @@ MOVES = [
         "compare run.mcap -e ekf -e ukf",
         {
             "--estimator": "-e dead-reckoning",
-            "--out": "--out out",
             "--save": "--save out.rrd",
             "--stress": "--stress",
-            "--json": "--json",
             "--set": "--set ekf.gate_probability=0.5",
-            "--settings": "--settings settings.toml",
         },
     ),
     Moves("compare five -e ekf -e ukf", {"--margin": "--margin 0.5"}),  # an interval needs five runs

@@ -533,6 +533,7 @@ def test_a_floor_of_the_covariance_is_told_from_a_steady_state() -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("first_cause_alone")
 def test_the_command_the_report_and_the_timeline_say_the_same(
     tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
 ) -> None:
@@ -610,7 +611,7 @@ def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:
 @pytest.mark.paper
 def test_a_log_without_a_prior_is_diagnosed() -> None:
     """The filter began at the first fixes; there is no prior whose sigma could be wrong."""
-    run = fl.record("landmarks", seed=3, duration_s=10.0, fix={"rate_hz": 2.0})
+    run = fl.record("landmarks", seed=3, duration_s=6.0, fix={"rate_hz": 2.0})
     streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/prior")}
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert not any("prior" in each.sentence for each in found.sentences)
@@ -643,7 +644,7 @@ def test_the_study_counts_what_is_named_and_what_a_removal_gains(
         "bias or turned frame", SEEN, 0.002, record={"range_bearing": {"bias_range_m": 0.002}}
     )
     short = landmarks._replace(
-        parameters={"duration_s": 20.0}, faults={"bias": landmarks.faults["bias"], "small": small}
+        parameters={"duration_s": 12.0}, faults={"bias": landmarks.faults["bias"], "small": small}
     )
     monkeypatch.setattr(study, "SCENARIOS", {"landmarks": short})
     file = tmp_path / "few.toml"

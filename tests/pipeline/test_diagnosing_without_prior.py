@@ -99,10 +99,6 @@ def test_tuning_agrees_that_the_process_noise_is_right() -> None:
     assert found["low"] < 0.01 < found["high"]
 
 
-def test_nothing_is_found_where_nothing_is_wrong() -> None:
-    assert fl.diagnose(car(2000), "ekf").sentences == []
-
-
 class Kept(fl.ModelParameters):
     """What is kept in a step; the noises are numbers in the model, which no fault is of."""
 

@@ -117,14 +117,12 @@ class CFilter(NamedTuple):
     def values(self) -> dict[str, dict[str, float]]:
         """Return the parameters that the motion and each sensor read, with their values, by name."""
         names = number_fields(self.filtering.bound_model.model.parameters)
-        return {
-            part: {
-                name: float(self.filtering.settings[row, names.index(name)])
-                for name in names
-                if any(name in _read(step) for step in self.steps.of(row))
-            }
-            for row, part in enumerate(self.parts)
-        }
+        found = {}
+        for row, part in enumerate(self.parts):
+            read = set().union(*(_read(step) for step in self.steps.of(row)))
+            of_part = zip(names, self.filtering.settings[row], strict=True)
+            found[part] = {name: float(value) for name, value in of_part if name in read}
+        return found
 
     def robustness(self, row: int) -> dict[str, float]:
         """Return the options of the gate and of robust updates, which are NaN if they are off."""

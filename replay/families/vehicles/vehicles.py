@@ -6,6 +6,7 @@ the symmetric measurement equation filter", 2016; Bar-Shalom, Li, "Multitarget-M
 the infrastructure sensor's pose (x, y, heading) if it is estimated.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -67,17 +68,31 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
     """Predict the joint state over `duration_s`, with coordinated turns and white accelerations."""
-    states = joint.mean.shape[1]
-    transition, noise = np.eye(states), np.zeros((states, states))
-    for vehicle in range(motion.vehicles):
-        own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        transition[own, own] = np.stack(
-            turn(np.eye(STATES), motion.turn_rate_radps[vehicle], duration_s)
-        )
-        first, cross, second = noise_moments(motion.acceleration_sigma_mps2[vehicle], duration_s)
-        noise[own, own] = np.kron(np.eye(2), [[first, cross], [cross, second]])
+    transition, noise = _moved(
+        tuple(motion.turn_rate_radps.tolist()),
+        tuple(motion.acceleration_sigma_mps2.tolist()),
+        joint.mean.shape[1],
+        duration_s,
+    )
     half = joint.covariance @ transition.T
     return Joint(joint.mean @ transition.T, half.swapaxes(1, 2) @ transition.T + noise)
+
+
+@lru_cache(maxsize=64)
+def _moved(
+    turn_rate_radps: tuple[float, ...],
+    acceleration_sigma_mps2: tuple[float, ...],
+    states: int,
+    duration_s: float,
+) -> tuple[Floats, Floats]:
+    """Compute the transition matrix and the noise (states, states) of all vehicles over `duration_s`."""
+    transition, noise = np.eye(states), np.zeros((states, states))
+    for vehicle, (rate, sigma) in enumerate(zip(turn_rate_radps, acceleration_sigma_mps2, strict=True)):
+        own = slice(STATES * vehicle, STATES * (vehicle + 1))
+        transition[own, own] = np.stack(turn(np.eye(STATES), rate, duration_s))
+        first, cross, second = noise_moments(sigma, duration_s)
+        noise[own, own] = np.kron(np.eye(2), [[first, cross], [cross, second]])
+    return transition, noise
 
 
 class Gain(NamedTuple):

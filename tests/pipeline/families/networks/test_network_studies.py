@@ -15,7 +15,7 @@ def verdicts(result):
 
 def test_the_room(tmp_path):
     """Its metrics, verdicts and files; tests/replay compares more runs with the sheet."""
-    name, experiment = load_experiment("ispace", {"runs": 6}, {})
+    name, experiment = load_experiment("ispace", {"runs": 4}, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)
     found = result.metrics
     assert found["ci-trace.rmse_ratio"] == pytest.approx(1.075, abs=0.05)
@@ -40,7 +40,7 @@ def test_a_run_that_ends_before_it_is_judged_is_refused(tmp_path):
 
 
 def test_sets_of_section_v_and_of_random_scenes(tmp_path):
-    name, experiment = load_experiment("relative-bearings", {"runs": 3}, {})
+    name, experiment = load_experiment("relative-bearings", {"runs": 2}, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)
     found = result.metrics
     for shape, area in (("exact", 0.01464), ("box", 0.02904), ("l4", 0.0309), ("l8", 0.0197)):

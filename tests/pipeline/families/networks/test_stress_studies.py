@@ -67,7 +67,7 @@ def test_a_robot_lies_about_its_start_and_must_be_there(robots):
 
 @pytest.mark.paper
 def test_the_room_under_stress(tmp_path):
-    name, experiment = load_experiment("ispace-stress", {"runs": 6}, {})
+    name, experiment = load_experiment("ispace-stress", {"runs": 4}, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)
     found = result.metrics
     assert found["ci.nees.calm"] < 5 < 100 < found["naive.nees.calm"]

@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 import pytest
 
-import fuselog as fl
 from fuselog.pipeline.runs.experiment import Experiment, load_experiment, run_experiment
 from fuselog.pipeline.runs.inputs import Recording
 from fuselog.recorders.errors import BadInput
@@ -80,7 +79,7 @@ def test_one_scenario_is_as_stored(autoferry: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.paper
-def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, tmp_path: Path) -> None:
+def test_claims_of_one_scenario_have_no_verdict_on_another(autoferry: Path, tmp_path: Path) -> None:
     """A limit that the published tracker itself misses elsewhere; its numbers are those of the study."""
     label = "hungarian-radar-lidar"
     _, whole = load_experiment("autoferry", {}, {})
@@ -96,19 +95,12 @@ def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, t
     values = {"title": "mine", "study": "autoferry", "import": {"source": "autoferry"}, **own}
     experiment = build(Experiment, values, "experiment mine.toml")
     found = {}
-    for scenario in (autoferry / f"scenario{number}" for number in (2, 3, 5)):
+    for scenario in (autoferry / f"scenario{number}" for number in (3, 5)):
         result = run_experiment("mine", experiment, tmp_path / scenario.name, data=scenario, logs=0)
         found[scenario.name] = [each.verdict for each in result.claims]
         gospa_m = STORED["metrics"][f"{label}.gospa_m.{scenario.name}"]
         assert float(result.claims[0].ours) == pytest.approx(gospa_m, rel=0.01)
-    log = fl.import_("autoferry", autoferry / "scenario5")
-    metrics = fl.replay(log, {label: whole.estimators[label]}).judge.metrics
-    stored = STORED["metrics"][f"{label}.gospa_m.scenario5"]
-    assert metrics[f"{label}.gospa_m"] == pytest.approx(stored, rel=1e-6)
-    assert found.pop("scenario5") == ["confirmed", "confirmed"]
-    assert len(found) == 2
-    assert {first for first, _ in found.values()} == {"no verdict"}
-    assert "refuted" in {other for _, other in found.values()}
+    assert found == {"scenario5": ["confirmed", "confirmed"], "scenario3": ["no verdict", "refuted"]}
 
 
 def test_other_estimators_are_refused(autoferry: Path, tmp_path: Path):
