@@ -74,10 +74,10 @@ def compensate_delays(
     time_ns = events.time_ns - delays_ns[run, events.source]
     settled = is_end | (time_ns < (last_ns - delays_ns.max(axis=1))[run])
     waiting = select_events(events, ~settled)
-    measured = select_events(events._replace(time_ns=time_ns), settled)
-    order = np.lexsort((measured.time_ns, run[settled]))
-    columns: Columns = (column.take(order, axis=0) for column in measured[1:])
-    measured = FilterEvents(measured.offsets, *columns)
+    places = np.flatnonzero(settled)
+    order = places[np.lexsort((time_ns[places], run[places]))]
+    columns: Columns = (column.take(order, axis=0) for column in events._replace(time_ns=time_ns)[1:])
+    measured = FilterEvents(ragged_rows(settled, events.offsets), *columns)
     measured = measured._replace(wants_estimate=last_of_stamps(measured))
     return measured._replace(wants_estimate=where_wanted(bound_model, measured)), waiting
 
