@@ -334,7 +334,7 @@ CASES = [
         "fuselog.pipeline.tuning.command.tune",
     ),
     Case(
-        "calibrate run.mcap -e ekf --out calibrated",
+        "calibrate run.mcap -e ekf --fixed forward_scale --fixed turn_scale --out calibrated",
         of_calibration,
         "fuselog.pipeline.calibrating.command.calibrate",
     ),

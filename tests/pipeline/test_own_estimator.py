@@ -260,7 +260,7 @@ def test_only_a_recursion_that_makes_arrays_needs_numba(package: Path) -> None:
         "fuselog record landmarks --set duration_s=90 --set robots=5 --compression none -o long.mcap",
         "fuselog info long.mcap",
         "fuselog replay long.mcap -e dead-reckoning",
-        "fuselog record landmarks --set duration_s=10 --out robot.mcap",
+        "fuselog record landmarks --set duration_s=3 --out robot.mcap",
         "fuselog replay robot.mcap -e ekf -e ukf",
         "fuselog diagnose robot.mcap -e ekf",
         "fuselog record beacons --set duration_s=5 --out heard.mcap",

@@ -15,6 +15,7 @@ from fuselog.pipeline.output.results import read_result
 from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.pipeline.runs.runner import Runner
+from fuselog.pipeline.sensing import study as sensing
 from tests.claims.few_runs import opposite
 from tests.pipeline.conftest import assert_whole
 
@@ -30,17 +31,17 @@ SMALLEST: dict[str, tuple[str, ...]] = {
     "ellipsoid": ("--runs 1", "options.seeds=[5000]"),
     "false-causes": ("--runs 1", "options.to_fix=[1.0]", "options.to_compass=[0.0]"),
     "faults-together": ("--runs 1", "options.pairs=1", "options.triples=1"),
-    "imu-grades": ("--runs 1", "duration_s=22", "gnss.outages_s=[[10, 21]]"),
+    "imu-grades": ("--runs 1", "duration_s=22", "gnss.outages_s=[[10, 21]]", "unit.rate_hz=20"),
     "landmarks": ("--runs 1", "duration_s=2"),
     "los-moving": ("--runs 1", "duration_s=2"),
     "los-two-sensors": ("--runs 2", "passes=1"),
     "manoeuvres": ("--runs 1", "duration_s=5"),
-    "navigation-heading": ("--runs 1", "duration_s=12"),
-    "navigation-simulated": ("--runs 1", "duration_s=12"),
-    "navigation-unknown-heading": ("--runs 1", "duration_s=12"),
+    "navigation-heading": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
+    "navigation-simulated": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
+    "navigation-unknown-heading": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
     "sensor-noise": ("--runs 1", "options.seeds=[1000]"),
     "tuning": ("--runs 1", "options.durations_s=[5.0]"),
-    "vehicles-ctm4": ("--runs 1", "duration_s=3", "options.few_runs=0"),
+    "vehicles-ctm4": ("--runs 1", "duration_s=2", "options.few_runs=0"),
     "vehicles-cv": ("--runs 1", "duration_s=2", "options.few_runs=0"),
     "warehouse-uwb": ("--runs 1", "duration_s=5"),
 }
@@ -103,11 +104,13 @@ def test_its_smallest_form_is_run_reported_and_viewed(
 ) -> None:
     """Of faults together the first cause is sought; `test_battery.py` has several at once.
 
-    Cars drive for a quarter of the time; `test_calibrating.py` has a whole drive. Of several cases the
-    timeline of the first is drawn; tests of studies draw those of all.
+    Cars drive for a quarter of the time; `test_calibrating.py` has a whole drive. A sensor unit rests
+    for an eighth of it. Of several cases the timeline of the first is drawn; tests of studies draw those
+    of all.
     """
     monkeypatch.setattr("fuselog.pipeline.diagnosing.battery.together.MOST_SENTENCES", 1)
     monkeypatch.setattr(calibration, "drive", partial(drive, duration_s=30.0))
+    monkeypatch.setattr(sensing, "SIZE", 8192)
     monkeypatch.setattr(Runner, "draw", draw_first_case)
     runs, *settings = SMALLEST[name]
     smaller = [*runs.split(), *(part for each in settings for part in ("--set", each))]
