@@ -169,7 +169,7 @@ def field_of(message: Any, path: str) -> Any:
     return message
 
 
-EACH = 5  # messages of a type
+EACH = 8  # messages of a type
 
 
 @pytest.mark.parametrize("form", FORMATS)
