@@ -169,6 +169,9 @@ def field_of(message: Any, path: str) -> Any:
     return message
 
 
+EACH = 8  # messages of a type
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> None:
     """Every number of every message of every type that is taken, whatever the lengths of its texts."""
@@ -180,7 +183,7 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
             START_NS + number * STEP_NS,
             make(name, START_NS + number * STEP_NS),
         )
-        for number in range(12)
+        for number in range(EACH)
         for name in names
     ]
     path = write_bag(tmp_path / "bag", form, sent, make.store)
@@ -211,7 +214,7 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
                 checked += 1
             for place in messages.layout.texts:
                 assert messages.text(place)[row].decode() == field_of(expected, place)
-    assert checked > 12 * len(names)
+    assert checked > EACH * len(names)
     streams, _ = imported(path, clock="bag")
     assert {stream.topic.rpartition("/")[2] for stream in streams.values()} >= {
         "fix", "inertial", "magnetic_field", "odometry", "odometry_twist", "odometry_pose", "twist",
@@ -219,7 +222,7 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
         "position", "orientation", "range", "value", *(["scan", "detections"]),
     }  # fmt: skip
     lengths = {name: len(stream) for name, stream in streams.items()}
-    assert {name for name, length in lengths.items() if length != 12} == {
+    assert {name for name, length in lengths.items() if length != EACH} == {
         name for name in lengths if name.endswith("detections")
     }
 

@@ -129,8 +129,8 @@ def test_it_is_least_squares(loss: str, uncompiled: None) -> None:
     A robust loss goes by the length of a message's residual: what scipy gets is that residual, as long
     as its loss is high. There is an outlier.
     """
-    told = vehicle_a.simulate(7)[0][:16]
-    row = max(row for row, each in enumerate(told[:12]) if each[1] == "rb")
+    told = vehicle_a.simulate(7)[0][:12]
+    row = max(row for row, each in enumerate(told[:9]) if each[1] == "rb")
     told[row] = (*told[row][:3], told[row][3] + np.array([4.0, 0.0]))
     settings = {"loss": loss, "loss_scale": 1.5}
     found = outputs(
@@ -171,7 +171,7 @@ def test_a_robust_loss_has_the_weight_of_its_slope() -> None:
 
 def test_damping_only_helps_to_get_there(uncompiled: None) -> None:
     """The first steps are held back, the optimum is the same, and its covariance has none of it."""
-    told = vehicle_a.simulate(8)[0][:40]
+    told = vehicle_a.simulate(8)[0][:20]
     free, held = (
         outputs(VEHICLE_A, "smoother", [vehicle_a.source(told)], forward="iterated", damping=damping)
         for damping in (0.0, 10.0)
@@ -295,11 +295,11 @@ def test_rotations_are_stationary_on_their_manifold(uncompiled: None) -> None:
 
     Residuals are written with rotation vectors only; the prior is 1.5 rad off, so that steps are large.
     """
-    source, gyro = short_attitude(20)
+    source, gyro = short_attitude(8)
     found = outputs(ATTITUDE, "smoother", [source], forward="iterated", every_s=attitude.STEP_S)
     assert found["solution"]["converged"] == 1
     states = found["state"]["mean"]
-    assert len(states) == 21
+    assert len(states) == 9
 
     def plus(x: Any, d: Any) -> Any:
         half = np.linalg.norm(d[:3]) / 2
@@ -316,7 +316,7 @@ def test_rotations_are_stationary_on_their_manifold(uncompiled: None) -> None:
     def residuals(flat: Any) -> Any:
         x = [plus(state, d) for state, d in zip(states, flat.reshape(-1, 6), strict=True)]
         parts = [minus(x[0], np.array([1.0, 0, 0, 0, 0, 0, 0])) / prior]
-        for k in range(20):
+        for k in range(8):
             moved = np.array(attitude.move(tuple(x[k]), tuple(gyro[k]), 0.02, None))
             parts.append(minus(x[k + 1], moved) / noise)
         for stream, measure, sigma in ((force, attitude.feel, 0.3), (field, attitude.point, 0.05)):
@@ -325,7 +325,7 @@ def test_rotations_are_stationary_on_their_manifold(uncompiled: None) -> None:
                 parts.append((value - np.array(measure(x[node], (), None))) / sigma)
         return np.concatenate(parts)
 
-    step, zero = 1e-5, np.zeros(21 * 6)
+    step, zero = 1e-5, np.zeros(9 * 6)
     jacobian = np.stack(
         [
             (residuals(zero + step * row) - residuals(zero - step * row)) / (2 * step)
@@ -356,10 +356,10 @@ def test_an_interpolated_control_and_an_axis(uncompiled: None) -> None:
 
 def test_runs_do_not_mix_and_blocks_do_not_matter(uncompiled: None) -> None:
     """Two runs at once, one of which starts in the middle of nothing, are each as alone."""
-    told = [vehicle_a.simulate(seed)[0][:40] for seed in (3, 4)]
+    told = [vehicle_a.simulate(seed)[0][:16] for seed in (3, 4)]
     sources = [vehicle_a.source(each) for each in told]
     together = outputs(VEHICLE_A, "smoother", sources, forward="iterated")
-    pieces = outputs(VEHICLE_A, "smoother", sources, block_messages=16, forward="iterated")
+    pieces = outputs(VEHICLE_A, "smoother", sources, block_messages=6, forward="iterated")
     for run, source in enumerate(sources):
         alone = outputs(VEHICLE_A, "smoother", [source], forward="iterated")
         for name in ("state", "solution", "iteration", "innovation"):
@@ -368,7 +368,7 @@ def test_runs_do_not_mix_and_blocks_do_not_matter(uncompiled: None) -> None:
 
 
 def test_what_the_gate_keeps_out_has_no_cost(uncompiled: None) -> None:
-    told = vehicle_a.simulate(7, outlier=True)[0][:130]
+    told = vehicle_a.simulate(7, outlier=True)[0][:80]
     kept = outputs(
         VEHICLE_A, "smoother", [vehicle_a.source(told)], forward="iterated", gate_probability=0.999
     )
@@ -387,7 +387,7 @@ def test_what_the_gate_keeps_out_has_no_cost(uncompiled: None) -> None:
 
 
 def test_start_and_cost_stand_in_the_summary(uncompiled: None) -> None:
-    source = vehicle_a.source(vehicle_a.simulate(7)[0][:40])
+    source = vehicle_a.source(vehicle_a.simulate(7)[0][:16])
     made = modelled_by(VEHICLE_A, METHODS["smoother"], "smoother")
     settings = {"kind": made, "forward": "iterated", "start": "prior"}
     told = replay_ensemble([source], {"best": settings}, gap_limit_s=1.0).metrics(["solution"])

@@ -277,7 +277,7 @@ def test_noise_through_the_control_and_added_beside_it() -> None:
     model = replace(make_wheel(), motion=Motion(push, added, control_noise=of_control))
     messages = wheel.simulate(5, [0.0, 0.5])
     messages |= {topic: tuple(each[-1:] for each in messages[topic]) for topic in ("dial", "tacho")}
-    found = outputs(model, "particles", [wheel.source(messages)], particles=2000, every_s=0.25)["state"]
+    found = outputs(model, "particles", [wheel.source(messages)], particles=800, every_s=0.25)["state"]
     variance = found["covariance"].reshape(-1, 2, 2)[:, 1, 1]
     assert_allclose(variance[1] - variance[0], 0.13, rtol=0.2)
 

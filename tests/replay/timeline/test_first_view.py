@@ -34,7 +34,7 @@ FIRST = {
     "ispace": First({"steps": 10}, {"network:naive": {}, "network:ci-trace": {}}),
     "landmarks": First({"duration_s": 2.0}, {"ekf": {}, "ukf": {}}),
     "manoeuvres": First({"duration_s": 20.0}, {"ekf": {}, "imm": {}}),
-    "moving-los": First({"duration_s": 10.0}, {"ekf": {}}),
+    "moving-los": First({"duration_s": 4.0}, {"ekf": {}}),
     "navigation": First({"duration_s": 11.0}, {"ekf": {}, "smoother:ekf": {}}),
     "optical-los": First({}, {"los-biases": {}, "los-positions": {}}),
     "orientation": First({"steps": 5}, {"kalman-orientation": {}}),
