@@ -172,7 +172,4 @@ def _heads(data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.vo
 
 def _clocks(records: NDArray[np.void]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Copy log times and publish times from message records or their heads."""
-    return (
-        np.ascontiguousarray(records["mcap log_time"]),
-        np.ascontiguousarray(records["mcap publish_time"]),
-    )
+    return records["mcap log_time"].copy(), records["mcap publish_time"].copy()

@@ -63,7 +63,7 @@ class Layout:
 
 
 def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
-    """Copy the schema's columns out of records.
+    """Copy the schema's columns out of records, in which numbers are not aligned as kernels need them.
 
     Args:
         schema: schema of the records.
@@ -73,7 +73,7 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
         Columns by field, (n,) or (n, width); an empty vector has shape (n, 0).
     """
     return {
-        field.name: np.ascontiguousarray(records[field.name])
+        field.name: records[field.name].copy()
         if field.name in (records.dtype.names or ())
         else np.empty((len(records), 0))
         for field in schema

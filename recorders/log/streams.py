@@ -252,7 +252,7 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
     """Convert values to an array of this type, which must represent all of them."""
     dtype, axes = NUMPY_TYPES[kind], 1 + (kind == "vector")
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes:
-        return values
+        return values if values.flags.aligned else values.copy()  # kernels need aligned numbers
     what = f"topic {topic}: {name}"
     try:
         column = given = np.asarray(values)

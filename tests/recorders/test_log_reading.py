@@ -215,6 +215,19 @@ def test_an_opened_log_tells_its_topics_and_its_run(path):
         )
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_numbers_of_packed_records_are_aligned_for_kernels(path, count):
+    """A log's messages are such records, and a user may have some; one alone may stay where it is."""
+    packed = np.zeros(count, [("odd", "u1"), ("time_ns", "i8"), ("x_m", "f8", 2)])
+    packed["time_ns"], packed["x_m"] = np.arange(count), 1.5
+    given = make_stream("/truth", schemas.TRUTH_STATE, packed["time_ns"], state=packed["x_m"])
+    write_log(path, [given])
+    for stream in (given, read_streams(open_log(path), ["/truth"])["/truth"]):
+        numbers = [stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()]
+        assert all(each.flags.aligned for each in numbers)
+        assert stream["state"].tolist() == [[1.5, 1.5]] * count
+
+
 def test_a_log_without_messages_is_a_log(path):
     write_log(path, [])
     assert open_log(path).topics == {}
