@@ -125,6 +125,7 @@ def tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tupl
     return run
 
 
+@pytest.mark.paper
 def test_numbers_are_kept_on_purpose_and_only_then(tried: Callable[..., tuple[int, str]]) -> None:
     assert "landmarks (test_of_two): nothing is kept of this run" in tried(1.0)[1]
     assert tried(1.0, "--keep-numbers")[0] == 0

@@ -74,6 +74,7 @@ def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
     assert low < value < high
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("topic", "fault", "by", "setting", "undoes"),
     [

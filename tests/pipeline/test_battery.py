@@ -235,6 +235,7 @@ def test_a_delay_on_equal_laps_is_not_determined() -> None:
     assert "this log does not determine the value; equally likely: /car/" in cause.words
 
 
+@pytest.mark.paper
 def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
     """The origin is stated 40 m too far west and 25 m too far north: fixes are east and south."""
     car = drive(SEED)

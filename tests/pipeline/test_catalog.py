@@ -158,6 +158,7 @@ def test_conditions_select_rows() -> None:
     assert "".join(rows_where(table, "log != 'b'")["log"]) == "ac"
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("condition", "words"),
     [
@@ -237,6 +238,7 @@ def test_a_catalog_that_cannot_be_used_is_refused(drives: Path, fuselog: Callabl
     assert not Path("out").exists()
 
 
+@pytest.mark.paper
 def test_each_log_of_a_selection_has_a_row(drives: Path, fuselog: Callable[..., Said]) -> None:
     """Each row has the numbers of a replay of its log alone; the logs that failed come first."""
     fl.write(drives / "still.mcap", fl.record("axis"))
@@ -415,6 +417,7 @@ def test_the_unit_of_a_verdict_is_the_group() -> None:
     assert np.isnan(few.loc["nees", "low"])
 
 
+@pytest.mark.paper
 def test_an_interrupted_selection_is_resumed(
     drives: Path, monkeypatch: pytest.MonkeyPatch, fuselog: Callable[..., Said]
 ) -> None:

@@ -298,6 +298,7 @@ def both_lists(kind: str) -> tuple[list[dict[str, Any]], str]:
     return run_here(kind, "--json").json, run_here(kind).out
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [
@@ -576,6 +577,7 @@ def test_output_in_a_narrow_terminal_and_beyond_its_encoding(
     assert written == r"\xe4 \u2603.estimates.mcap"
 
 
+@pytest.mark.paper
 def test_a_reader_that_goes_away_is_no_error(world: Path, start_fuselog: Callable[..., Any]) -> None:
     """`fuselog info log.mcap | head -0` says nothing on standard error."""
     reading, writing = os.pipe()

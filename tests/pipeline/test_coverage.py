@@ -146,6 +146,7 @@ def test_an_asymmetric_prior_is_refused(tmp_path: Path, fuselog: Callable[..., S
     assert f"the covariance of {PRIOR} is not symmetric" in said.err
 
 
+@pytest.mark.paper
 def test_a_result_has_the_table_over_all_runs(
     tmp_path: Path, fuselog: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -222,6 +223,7 @@ def test_sensors_of_one_stamp_are_told_apart_where_all_gave_innovations(unused: 
     assert counted == ([("/a + /b", 2, 3)] if unused else [("/a", 0, 3), ("/b", 3, 0)])
 
 
+@pytest.mark.paper
 def test_sides_of_a_comparison_have_the_table(
     tmp_path: Path, fuselog: Callable[..., Said], uncompiled: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -149,6 +149,7 @@ def test_likelihood_is_greatest_where_tuning_ends(session: Session) -> None:
     assert session.diagnosed("ekf", SURE)[0].startswith("1. sigma_range_m")
 
 
+@pytest.mark.paper
 def test_a_parameter_is_taken_into_the_state(session: Session) -> None:
     """Its estimate is drawn and said; NEES is still of what the truth has."""
     document_of = pytest.importorskip("bokeh.document").Document
@@ -386,6 +387,7 @@ def asked(url: str, path: str, *headers: str, upgrade: bool = True) -> bytes:
         return connection.recv(64)
 
 
+@pytest.mark.paper
 def test_a_page_of_another_origin_gets_nothing(explorer: Any) -> None:
     """Nor does another name of this machine, or a WebSocket that has no origin."""
     with urllib.request.urlopen(explorer.url) as answer:
@@ -506,6 +508,7 @@ def test_ctrl_c_ends_everything(
         urllib.request.urlopen(url[0])
 
 
+@pytest.mark.paper
 def test_a_script_that_ends_with_an_open_page_ends_the_server(
     log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,6 +46,7 @@ def schema_of(planted: Planted) -> str:
     return recorded(planted.scenario)[0][planted.topic].schema.full_name
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("planted", "command"),
     [

@@ -67,6 +67,7 @@ def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(largest_m, runs, 
     assert found.verdict == verdict
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("outages_s", "sentence"),
     [

@@ -101,6 +101,7 @@ def log(bag: Path, fuselog: Callable[..., Any]) -> Path:
     return bag / "log.mcap"
 
 
+@pytest.mark.paper
 def test_three_namespaces_and_a_truth_are_one_robot(fuselog: Callable[..., Any], log: Path) -> None:
     """It is judged right without an alignment, and what is not used is named with what would use it."""
     told = fuselog("info", log).out

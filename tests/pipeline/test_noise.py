@@ -318,6 +318,7 @@ def test_noise_is_no_motion_and_a_slow_turn_is() -> None:
         check_at_rest("/imu", "specific_force_mps2", 0.1 * noise + turning, STEP_S)
 
 
+@pytest.mark.paper
 def test_bad_input_is_a_sentence() -> None:
     def refused(stream: fl.Stream, **options: object) -> str:
         with pytest.raises(fl.BadInput) as raised:

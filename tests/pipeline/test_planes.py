@@ -76,6 +76,7 @@ def rmse_of(said: Any) -> float:
     return float(said.json["metrics"]["ekf.position_rmse_m.car"])
 
 
+@pytest.mark.paper
 def test_truth_and_fixes_of_two_planes_are_judged_in_one(
     fuselog: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -99,6 +100,7 @@ def test_truth_and_fixes_of_two_planes_are_judged_in_one(
     assert rmse_of(elsewhere) == pytest.approx(wanted, rel=1e-3)
 
 
+@pytest.mark.paper
 def test_a_truth_in_an_unknown_plane_is_not_judged_until_it_is_stated(
     fuselog: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -64,6 +64,7 @@ def read_back(folder: Path) -> tuple[Any, pd.DataFrame]:
     return (server, client, entry), table
 
 
+@pytest.mark.paper
 def test_the_catalog_has_the_numbers_of_every_run(result: Path, dataset: Path) -> None:
     (server, *_), table = read_back(dataset)
     rows = read_table(result / TABLE)

@@ -202,6 +202,7 @@ def test_a_recording_is_written_as_the_command_writes_it(fuselog: Fuselog) -> No
         fl.write("mine.mcap", recorded)
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("blank_figures")
 def test_a_replay_says_what_the_command_says(
     fuselog: Fuselog, recordings: list[fl.MemorySource]

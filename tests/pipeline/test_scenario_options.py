@@ -129,6 +129,7 @@ def fingerprint(recording: Recording) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_every_parameter_changes_what_is_recorded(name: str):
     case, kind, same = CASES.get(name, Case()), SCENARIOS[name].parameters, set()
@@ -150,6 +151,7 @@ def test_every_parameter_changes_what_is_recorded(name: str):
     assert same == set(case.nothing)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_bounds_of_parameters_are_kept(name: str):
     slow, base, kind = CASES.get(name, Case()).slow, base_of(name), SCENARIOS[name].parameters

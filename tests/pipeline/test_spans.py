@@ -151,6 +151,7 @@ def test_the_truth_starts_a_filter_as_exactly_as_is_stated(run_log: Path, fuselo
     assert_allclose(first["mean"][0], there, atol=1e-9)
 
 
+@pytest.mark.paper
 def test_a_filter_goes_on_from_its_own_estimate_as_if_it_had_never_stopped(fuselog: Fuselog) -> None:
     """Each of five Kalman filters, from the estimate before the start: to the last bit.
 

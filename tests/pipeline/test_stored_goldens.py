@@ -93,6 +93,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     assert read(path)["settings"] == {**SETTINGS, "estimators": {}}
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "content",
     [

@@ -59,6 +59,7 @@ def test_a_guessed_mapping_works_as_it_is(
     assert log["/gnss/fix"]["latitude_deg"].tolist()[:2] == [50.0, 50.01]
 
 
+@pytest.mark.paper
 def test_a_guess_whose_import_fails_leaves_nothing(fuselog: Callable[..., Any], tmp_path: Path) -> None:
     """So that the next try is not refused for the mapping of the first."""
     table, out = tmp_path / "drive.csv", tmp_path / "drive.mcap"

@@ -46,6 +46,7 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return path
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("log", "to"), FORMATS, indirect=["log"], scope="module")
 def test_exported_tables_come_back(log: Path, to: Literal["csv", "parquet"], tmp_path: Path) -> None:
     streams = fl.open(log)

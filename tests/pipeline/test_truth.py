@@ -106,6 +106,7 @@ def test_an_estimator_of_ones_own_may_not_read_it(kind: str) -> None:
         fl.replay(drive(), {"mine": estimators_of_ones_own()[kind]})
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("way", ["here", "apart", "program"])
 def test_a_foreign_filter_may_not_read_it(
     compile_filter: Callable[..., Path], tmp_path: Path, way: str
@@ -134,6 +135,7 @@ def test_tuning_and_diagnosing_refuse_it_too() -> None:
         fl.tune(drive(), settings, ["forward_noise_density"])
 
 
+@pytest.mark.paper
 def test_a_truth_of_another_name_is_diagnosed_by(tmp_path: Path) -> None:
     """By the setting that a replay takes as well."""
     log, settings = tmp_path / "log.mcap", {"topics": {"truth": "/survey/places"}}

@@ -506,6 +506,7 @@ class Away(InlineExecutor):
         return super().submit(lambda: pickle.loads(pickle.dumps(work(*args))))
 
 
+@pytest.mark.paper
 def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
     given = {"set": {"sigma_range_m": 0.5}}
     alone = fl.tune(seen, "ekf", "sigma_range_m", **given)
@@ -534,6 +535,7 @@ def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
         fl.tune(seen, "ekf", "sigma_range_m", executor=Dying(), **given)
 
 
+@pytest.mark.paper
 def test_processes_tune_as_the_command_says(
     world: Path, tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -364,6 +364,7 @@ def test_clean_logs_have_no_finding() -> None:
     assert lint([driving(clean(1))]) == []
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found(name: str) -> None:
     assert missed(name, 1) == ""
@@ -508,6 +509,7 @@ def test_a_sensor_that_sees_nothing_for_a_while_has_lost_nothing(lost: float, ki
     assert [each.kind for each in found] == kinds
 
 
+@pytest.mark.paper
 def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     """From the file, as the command's --set reads it."""
     advised = 0

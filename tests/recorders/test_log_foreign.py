@@ -91,6 +91,7 @@ OFFICIAL_OPTIONS = [
 ]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("recover", [False, True])
 @pytest.mark.parametrize("options", OFFICIAL_OPTIONS, ids=lambda options: ",".join(options))
 def test_a_log_by_the_mcap_library_is_read_whatever_it_leaves_out(tmp_path, options, recover):

@@ -155,6 +155,7 @@ def test_statistics_and_metadata_are_what_the_mcap_library_expects(written):
     assert metadata["fuselog.run"]["scenario"] == "demo"
 
 
+@pytest.mark.paper
 def test_rerun_checks_converts_and_reads_the_log(written, tmp_path):
     """Rerun's own reader finds no fault and gets the columns that we wrote, bit for bit."""
     path, streams = written

@@ -121,6 +121,7 @@ PERIODS_S = [
 ]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("late_s", [0.0, 0.25, 2.0])
 @pytest.mark.parametrize(("period_s", "speed_period_s"), PERIODS_S)
 def test_no_delay_is_named_that_is_a_period_off(
@@ -168,6 +169,7 @@ def test_a_receiver_that_jumps_is_named_and_not_the_wheels(
         assert "at 25.2 s" in found.evidence or "at 33.0 s" in found.evidence
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", SHEET)
 def test_ratios_slopes_scatter_and_lags_are_those_of_the_sheet(name: str) -> None:
     """Within 4 of the sheet's standard deviations, of two runs."""
@@ -186,6 +188,7 @@ def test_ratios_slopes_scatter_and_lags_are_those_of_the_sheet(name: str) -> Non
     assert np.all(np.abs(np.array(found) - expected) < 4.0 * scale)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_of_car_d_is_named_first_or_none(name: str) -> None:
     told = compared(recorded(faulty(2003, name)).streams)

@@ -214,6 +214,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, list[str], str]] = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", WRONG)
 def test_lint_names_what_a_wrong_mapping_does(name: str, tmp_path: Path) -> None:
     columns, table, streams, words = WRONG[name]

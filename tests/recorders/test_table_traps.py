@@ -49,6 +49,7 @@ def test_json_that_is_nested_deeply_is_refused(tmp_path: Path) -> None:
     assert open_table(shallow).columns == ["t", "x", "y.0"]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("suffix", ["csv", "jsonl", "npz", "parquet"])
 def test_more_columns_than_can_be_read_are_refused(suffix: str, tmp_path: Path) -> None:
     path, names = tmp_path / f"wide.{suffix}", [f"c{number}" for number in range(20_000)]

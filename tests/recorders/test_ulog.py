@@ -55,6 +55,7 @@ def streams_of(path: Path) -> dict:
     return {stream.topic: stream for stream in recording.streams}
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", FILES)
 def test_every_column_is_that_of_pyulog_and_the_counts_are_the_sheets(logs: Path, name: str):
     file, peer = UlogFile(logs / f"{name}.ulg"), ULog(str(logs / f"{name}.ulg"))
@@ -215,6 +216,7 @@ def test_a_flipped_bit_changes_one_row_or_costs_those_up_to_the_next_mark(tmp_pa
         assert len(found) + changed >= 240 or not len(found)
 
 
+@pytest.mark.paper
 def test_what_flips_in_heads_costs_rows_and_no_wrong_number(tmp_path: Path):
     """Heads are length and type; numbers have no checksum, so that nobody can know of theirs."""
     whole = by_hand()

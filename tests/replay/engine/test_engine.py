@@ -323,6 +323,7 @@ def ragged_topics(draw: st.DrawFn) -> dict[str, Ragged]:
     return {topic: gather(streams) for topic, streams in parts.items()}
 
 
+@pytest.mark.paper
 @given(ragged_topics())
 def test_events_are_the_messages_sorted_by_run_time_and_place(topics: dict[str, Ragged]):
     events = merge_events(topics, "publish_time")

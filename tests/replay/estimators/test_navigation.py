@@ -109,6 +109,7 @@ def test_a_start_is_as_near_to_the_truth_as_it_says(carrier: str):
     assert start.how == "levelled, with the course as its heading"
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("carrier", "given"),
     [

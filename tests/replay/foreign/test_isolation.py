@@ -72,6 +72,7 @@ def test_failures_in_this_process(compile_filter: Compile) -> None:
         assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 4)
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 def test_a_program_ends_when_we_are_killed() -> None:
     """It reads nothing and listens to no signal; a program that it started ends with it."""

@@ -43,6 +43,7 @@ def test_the_page_is_worked_through(drifter: Path) -> None:
     assert metrics["failed_runs"] == 0
 
 
+@pytest.mark.paper
 def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_filter: Compile) -> None:
     """It is said; what it gives is what RMSE gives with them, and by the likelihood is refused."""
     said = ' \\"innovation\\": {\\"x_m\\": \\"linear\\", \\"y_m\\": \\"linear\\"},'

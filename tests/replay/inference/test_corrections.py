@@ -64,6 +64,7 @@ def test_a_correction_carries_the_covariance_by_its_derivative(back: bool):
     assert_allclose(covariance, slopes @ P @ slopes.T, atol=1e-6)
 
 
+@pytest.mark.paper
 def test_an_iterated_update_linearises_along_the_curve():
     step_to, chain = relinearising(MODEL)
     rows, work = np.eye(T), workspace(STEP)

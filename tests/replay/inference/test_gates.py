@@ -10,6 +10,7 @@ from tests.replay.inference.scalar import SCALAR, source
 LAST = 4
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("method", ["ekf", "ukf", "iekf", "particles"])
 def test_what_is_at_the_bound_is_let_in(
     method: str, uncompiled: None, monkeypatch: pytest.MonkeyPatch

@@ -81,6 +81,7 @@ def of_particles(model: Model, mean: np.ndarray, covariance: np.ndarray, given: 
     return np.sqrt(np.mean(np.square(errors), axis=1))
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("model", "control", "name"),
     [

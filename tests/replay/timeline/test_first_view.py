@@ -52,6 +52,7 @@ def test_every_simulated_scenario_has_a_first_view() -> None:
     assert set(FIRST) == {name for name, each in scenarios.items() if isinstance(each, Simulator)}
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("scenario", FIRST)
 def test_the_first_view_shows_all_at_a_size_that_can_be_read(scenario: str, tmp_path: Path) -> None:
     first = FIRST[scenario]

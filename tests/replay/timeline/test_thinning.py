@@ -56,6 +56,7 @@ def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[in
         assert_array_equal(whole.rows.publish_time_ns, times)
 
 
+@pytest.mark.paper
 @given(st.lists(st.integers(1, 20_000), max_size=4), st.integers(1, 19_999), st.integers(0, 5))
 def test_peaks_stay_in_any_blocks(cuts: list[int], peak: int, missing: int) -> None:
     """The least and the greatest of each curve are kept, NaN beside them or not; nothing is made up."""

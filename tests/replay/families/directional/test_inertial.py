@@ -241,6 +241,7 @@ def with_own_topic(source: fl.MemorySource, topic: str) -> fl.MemorySource:
     return replace(source, streams=streams)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "settings", [*METHODS, {"kind": "vqf"}, {"kind": "triad"}, {"kind": "ekf", "model": "orientation"}]
 )

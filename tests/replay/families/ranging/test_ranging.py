@@ -203,6 +203,7 @@ def maps(source: MemorySource) -> dict[str, Stream]:
 FOUND = {"sigma_range_m": 0.05, "height_m": 1.0}
 
 
+@pytest.mark.paper
 def test_a_pose_is_found_in_the_first_ranges_whatever_its_heading() -> None:
     for seed in range(4):
         source = recorded(seed, duration_s=0.1, start_sigma_m=4.0, start_sigma_rad=2.0)

@@ -71,6 +71,7 @@ def test_where_the_cache_lies(monkeypatch, chosen, xdg, expected):
     assert cache_folder() == expected
 
 
+@pytest.mark.paper
 @given(st.data())
 def test_no_damage_goes_unseen(tmp_path_factory, data):
     """Any byte changed or any tail cut off: the file gives its samples unharmed, or none."""
@@ -88,6 +89,7 @@ def test_no_damage_goes_unseen(tmp_path_factory, data):
     assert found is None or np.array_equal(found, points)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("content", [b"", b"\n", b"PK\x03\x04", b"not ours\nat all"])
 def test_a_damaged_file_is_computed_again_and_mended(folder, content):
     expected = cached_set(SMALL)
