@@ -125,7 +125,7 @@ def clear_leftovers(place: Path) -> bool:
         with suppress(OSError):
             work.rmdir()  # its creator was killed before it wrote anything
             continue
-        from filelock import FileLock, Timeout
+        from filelock import FileLock, Timeout  # slow to import, and seldom needed here
 
         lock = FileLock(work / _LOCK, timeout=0)
         try:

@@ -108,19 +108,23 @@ def _unit(of: Parameter, value: float) -> Search[float, float]:
     The standard error follows from the curvature of the cost at the value. Raises BadInput if the cost
     does not depend on the parameter.
     """
-    step = 0.3 * value if of.is_log else 1e-3 * max(abs(value), 1.0)
-    for _ in range(1 if of.is_log else LOOKS):
-        # the cost may not be a parabola here, so a smaller or larger step is used
-        below, middle, above = yield [-step, 0.0, step]
-        with np.errstate(invalid="ignore"):  # infinite gains have no curvature
-            bend = np.float64(2.0 * middle - below - above) / step**2
-        step = bend**-0.5 if 0.0 < bend < np.inf else step * (10.0 if bend <= 0.0 else 0.1)
+    unit = 1.0
+    if of.is_log:
+        below, middle, above = yield [-0.3 * value, 0.0, 0.3 * value]
+    else:
+        step = 1e-3 * max(abs(value), 1.0)
+        for _ in range(LOOKS):  # the cost is not a parabola here, so a smaller or larger step is used
+            below, middle, above = yield [-step, 0.0, step]
+            with np.errstate(invalid="ignore"):  # infinite gains have no curvature
+                bend = np.float64(2.0 * middle - below - above) / step**2
+            step = float(bend**-0.5 if 0.0 < bend < np.inf else step * (10.0 if bend <= 0.0 else 0.1))
+        unit = UNIT * step
     if below == middle == above:
         raise BadInput(
             f"{of.name}: the logs do not depend on it, so they cannot determine its value; remove "
             "it from --free"
         )
-    return 1.0 if of.is_log else UNIT * float(step)
+    return unit
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
