@@ -5,6 +5,9 @@ import pickle
 import re
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import chdir, contextmanager, nullcontext
@@ -551,11 +554,44 @@ def test_the_simulated_driver_is_the_limit_where_it_is_busy():
 
 
 @pytest.mark.paper
+def test_processes_give_the_same_bytes_also_after_a_kill(place, worked_off, monkeypatch):
+    monkeypatch.setattr("fuselog.pipeline.runs.ensemble.RUNS_AT_ONCE", 128)
+    runs = 130
+    files = run(place, runs=runs)
+    shutil.rmtree(place)
+    worked_off.clear()
+    command = [
+        "run",
+        "landmarks",
+        "--runs",
+        str(runs),
+        "--logs",
+        "2",
+        "--out",
+        str(place),
+        "--set",
+        f"duration_s={SETTINGS['duration_s']}",
+    ]
+    fuselog = Path(sys.executable).with_name("fuselog")
+    begun = subprocess.Popen([fuselog, *command, "--workers", "2"], stderr=subprocess.PIPE)
+    while not list(unfinished(place).glob("*.bin")):
+        assert begun.poll() is None, begun.communicate()
+        time.sleep(0.01)
+    begun.kill()
+    begun.communicate()
+    assert not place.exists()
+    assert main(command) == 0
+    assert contents(place) == files
+    assert len(worked_off) < 2  # in this process; the other cell is of a worker
+    assert not unfinished(place).exists()
+
+
+@pytest.mark.paper
 @pytest.mark.usefixtures("all_cores")
 def test_dask_workers_give_the_same_bytes(place, files, tmp_path):
     """Of `local:1`, and by its address as of a cluster that is there, whose worker may share no files.
 
-    A worker uses one core from its first task on, and imports no module of the current folder.
+    A worker uses one core, also when it was started again, and imports no module of the current folder.
     """
     distributed = pytest.importorskip("distributed")
     with shadowed(tmp_path), pool_for(None, "local:1", RUNS)() as pool:
@@ -564,6 +600,8 @@ def test_dask_workers_give_the_same_bytes(place, files, tmp_path):
         for each in (lambda: nullcontext(pool), pool_for(None, client.scheduler.address, RUNS)):
             assert run(place, each) == files
             shutil.rmtree(place)
+        client.restart()
+        assert pool.executor.submit(eval, CORES_THERE).result() == ({1}, 1)
 
 
 def test_cells_of_a_library_that_was_compiled_again_are_not_used(tmp_path: Path) -> None:
