@@ -4,6 +4,7 @@
 a file such as `random.py` would then replace the module of the standard library.
 """
 
+import gc
 import os
 import subprocess
 import sys
@@ -76,6 +77,14 @@ def limit_libraries() -> None:
         _threads_of_user.setdefault(name, os.environ.get(name))
         os.environ[name] = "1"
     threadpool_limits(1)
+
+
+def collect_garbage_seldom() -> None:
+    """Collect garbage less often than Python does, in a process that is fuselog's own.
+
+    Imports leave up to 420,000 objects and no garbage; each collection would go through all of them.
+    """
+    gc.set_threshold(500_000, 20, 100)
 
 
 def keep_off_settings_here() -> None:

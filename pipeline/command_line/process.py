@@ -1,7 +1,6 @@
 """The command line as a process: exit codes, signals, and messages for errors."""
 
 import atexit
-import gc
 import io
 import logging
 import math
@@ -23,7 +22,7 @@ from fuselog.pipeline.command_line.group import fuselog
 from fuselog.recorders import environment
 from fuselog.recorders.compiling.trial import require_processor
 from fuselog.recorders.errors import BadInput, printable, without_warnings_of_numbers
-from fuselog.recorders.processes import keep_off_settings_here
+from fuselog.recorders.processes import collect_garbage_seldom, keep_off_settings_here
 from fuselog.recorders.remote.backends import masked
 
 
@@ -37,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             function collects garbage less often, and ends the process.
     """
     if arguments is None:
-        gc.set_threshold(200_000, 20, 100)  # imports leave up to 200,000 objects and no garbage
+        collect_garbage_seldom()
         try:
             code = _code_of(arguments)
         except Exception:

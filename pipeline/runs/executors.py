@@ -26,7 +26,12 @@ from typing import Any, NamedTuple
 
 from fuselog.recorders.compiling.compile import core_count, use_cores
 from fuselog.recorders.errors import BadInput, ignore_warnings_of_numbers
-from fuselog.recorders.processes import keep_off_settings_here, limit_libraries, safe_spawning
+from fuselog.recorders.processes import (
+    collect_garbage_seldom,
+    keep_off_settings_here,
+    limit_libraries,
+    safe_spawning,
+)
 from fuselog.recorders.registry import registered
 from fuselog.recorders.remote.paths import RemotePath, state_of
 
@@ -202,6 +207,7 @@ def _import_cells() -> None:
 
 def _begin_worker() -> None:
     """Limit a worker to one core, ignore interrupts, and end it when the parent ends."""
+    collect_garbage_seldom()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _use_one_core()
     keep_off_settings_here()
