@@ -34,6 +34,10 @@ test-fast: .venv/with-test
 all-tests fast-tests keep-numbers: export OPENBLAS_NUM_THREADS = 1
 all-tests fast-tests keep-numbers: export OMP_NUM_THREADS = 1
 all-tests fast-tests keep-numbers: export NUMBA_NUM_THREADS = 1
+# memory of large arrays stays with the process: getting it anew takes half of the time spent in the kernel of Linux
+all-tests fast-tests keep-numbers: export MALLOC_MMAP_THRESHOLD_ = 1073741824
+all-tests fast-tests keep-numbers: export MALLOC_TRIM_THRESHOLD_ = 4294967296
+all-tests fast-tests keep-numbers: export MALLOC_TOP_PAD_ = 67108864
 
 all-tests: .venv/with-test
 	$(BIN)/pytest -n logical --dist loadfile
