@@ -7,6 +7,7 @@ import sqlite3
 import tarfile
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,10 +194,10 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
         found: dict[str, list[Messages]] = {}
         for batch in ours.batches(lambda _: True):
             each = batch.connection
-            definitions = definitions_of(each.type_name, each.definition, "ros2_humble")
-            reader = readers.setdefault(
-                each.topic, MessageType(each.type_name, definitions, each.encoding)
-            )
+            if each.topic not in readers:
+                definitions = definitions_of(each.type_name, each.definition, "ros2_humble")
+                readers[each.topic] = MessageType(each.type_name, definitions, each.encoding)
+            reader = readers[each.topic]
             for which, raw in by_size(batch.data, batch.begins, batch.lengths):
                 for messages in reader.read(raw, which):
                     assert isinstance(messages, Messages), messages
@@ -490,16 +491,16 @@ def test_a_sqlite_bag(real_data: Path, tmp_path: Path) -> None:
 
 def odometry_bag(place: Path, form: str, count: int, first: int = 0) -> Path:
     """Odometry with an x that counts, 100 a second."""
-    make = Maker(form)
-    stamps = [START_NS + number * STEP_NS for number in range(first, first + count)]
-    sent = [
-        (
-            "/odom",
-            stamp,
-            make("nav_msgs/msg/Odometry", stamp, pose__pose__position__x=float(first + number)),
+    make, sent = Maker(form), []
+    some = [make("nav_msgs/msg/Odometry") for _ in range(20)]  # a message takes long to make
+    for number in range(first, first + count):
+        stamp_ns, one = START_NS + number * STEP_NS, some[number % 20]
+        stamp = replace(one.header.stamp, sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        position = replace(one.pose.pose.position, x=float(number))
+        pose = replace(one.pose, pose=replace(one.pose.pose, position=position))
+        sent.append(
+            ("/odom", stamp_ns, replace(one, header=replace(one.header, stamp=stamp), pose=pose))
         )
-        for number, stamp in enumerate(stamps)
-    ]
     return write_bag(place, form, sent, make.store)
 
 

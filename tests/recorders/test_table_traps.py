@@ -92,7 +92,7 @@ def test_arrays_are_read_block_by_block(order: str, tmp_path: Path) -> None:
     """Every row of an array of several blocks is as it was."""
     path = tmp_path / "long.npz"
     pairs = np.asarray(np.arange(600_000).reshape(-1, 2), ">i4", order=order)
-    np.savez_compressed(path, pairs=pairs, t=np.arange(300_000.0), word=np.full(300_000, "a"))
+    np.savez(path, pairs=pairs, t=np.arange(300_000.0), word=np.full(300_000, "a"))
     table = open_table(path)
     batches = list(table.batches(["pairs.0", "pairs.1", "t"], ["word"]))
     assert len(batches) > 1
