@@ -105,9 +105,20 @@ def test_a_folder_that_must_stay_stays_whenever_that_is_found(tmp_path):
 KILLED = """
     import os, signal, sys
     from pathlib import Path
+    import filelock
     from fuselog.recorders import atomic
     from fuselog.recorders.atomic import whole_file, whole_folder
-    place, moment = Path(sys.argv[1]), int(sys.argv[2])
+    for moment in range(0, 200, 5):
+        child = os.fork()
+        if not child:
+            break
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        print(moment, code, flush=True)
+        if code == 0:
+            break
+    if child:
+        sys.exit()
+    place = Path(sys.argv[1]) / str(moment) / sys.argv[2]
     def trace(frame, event, argument):
         global moment
         if event == "line" and frame.f_code.co_filename == atomic.__file__:
@@ -123,7 +134,7 @@ KILLED = """
         with whole_folder(place, lambda found: None) as new:
             (new / "a").write_text("new")
     sys.settrace(None)
-    print("done")
+    os._exit(0)
 """
 
 
@@ -137,9 +148,13 @@ def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, na
         (folder / inside).parent.mkdir(parents=True)
         (folder / inside).write_text("old")
         (folder / "mine").write_text("mine")
-        command = [sys.executable, "-c", textwrap.dedent(KILLED), str(folder / name), str(moment)]
-        said = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert said.returncode in (0, -9), said.stderr
+    # one process, forked before each moment: importing takes longer than what is done here
+    command = [sys.executable, "-c", textwrap.dedent(KILLED), str(tmp_path), name]
+    said = subprocess.run(command, capture_output=True, text=True, check=True)
+    for line in said.stdout.splitlines():
+        moment, code = map(int, line.split())
+        folder = tmp_path / str(moment)
+        assert code in (0, -9), said.stderr
         found = [
             path.read_text()
             for path in (folder / inside, *folder.glob(".*.part/old/a"))
@@ -153,7 +168,7 @@ def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, na
                 new.write_text("new")
         assert contents(folder) == {inside: "new", "mine": "mine"}
         assert len(list(folder.iterdir())) == 2
-        if said.returncode == 0:
+        if code == 0:
             return
     raise AssertionError("never came to the end")
 

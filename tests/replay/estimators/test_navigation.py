@@ -125,7 +125,13 @@ def test_what_is_not_given_of_a_start_is_found_honestly(carrier: str, given: dic
     """
     runs, squares, nees = 30, [], []
     for run in range(runs):
-        values = {"duration_s": 12.0, "carrier": carrier, "prior": {"is_told": False}, **given}
+        values = {
+            "duration_s": 12.0,
+            "unit": {"rate_hz": 50.0},
+            "carrier": carrier,
+            "prior": {"is_told": False},
+            **given,
+        }
         recording, _ = record_run("navigation", values, 1, run)
         streams = {stream.topic.removeprefix("/body/"): stream for stream in recording.streams}
         start = align(streams, NavigationParameters())
@@ -276,8 +282,8 @@ def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: Mem
 
 @cache
 def drives(runs: int, values: str) -> list[MemorySource]:
-    """Drives of 28 s, once for all methods; what they have of their own as JSON."""
-    given = {"duration_s": 28.0, **json.loads(values)}
+    """Drives of 28 s at 50 samples/s, once for all methods; what they have of their own as JSON."""
+    given = {"duration_s": 28.0, "unit": {"rate_hz": 50.0}, **json.loads(values)}
     return [memory_source(*record_run("navigation", given, 1, run)) for run in range(runs)]
 
 

@@ -1,6 +1,7 @@
 """The reference sheet's problem of section 5: attitude and a gyro's bias from three sensors."""
 
 from functools import cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -110,34 +111,46 @@ ATTITUDE = Model(
 )
 
 
+def _rates(steps: int) -> Floats:
+    t = np.arange(steps) * STEP_S
+    return np.stack([0.5 * np.sin(0.7 * t), 0.4 * np.cos(0.5 * t), np.full(steps, 0.3)], axis=1)
+
+
+@cache
+def _turned(steps: int) -> Floats:
+    """The rotation since the start after every step, (steps, 4)."""
+    turns = Rotation.from_rotvec(_rates(steps) * STEP_S).as_quat(scalar_first=True)
+    return np.stack([*accumulate(turns, compose)])
+
+
 @cache
 def simulate(seed: int, steps: int = 500) -> tuple[MemorySource, Floats, Floats]:
     """The log, the true states after every step, and what the gyro said."""
     rng = np.random.default_rng(seed)
     start = np.array([0.3] * 3 + [0.02] * 3) * rng.standard_normal(6)
     q, bias = Rotation.from_rotvec(start[:3]).as_quat(scalar_first=True), start[3:]
-    t = np.arange(steps) * STEP_S
-    rates = np.stack([0.5 * np.sin(0.7 * t), 0.4 * np.cos(0.5 * t), np.full(steps, 0.3)], axis=1)
-    turns = Rotation.from_rotvec(rates * STEP_S).as_quat(scalar_first=True)
-    gyro, force, field, truth = [], [], [], []
-    for k in range(steps):
-        gyro.append(rates[k] + bias + 0.01 / np.sqrt(STEP_S) * rng.standard_normal(3))
-        bias = bias + 0.001 * np.sqrt(STEP_S) * rng.standard_normal(3)
-        q = compose(q, turns[k])
-        if (k + 1) % 5 == 0:
-            up = rotate(conjugate(q), np.array([0.0, 0.0, 9.81]))
-            force.append((k + 1, up + 0.3 * rng.standard_normal(3)))
-        if (k + 1) % 10 == 0:
-            north = rotate(conjugate(q), np.array([0.5, 0.0, -0.4]))
-            field.append((k + 1, north + 0.05 * rng.standard_normal(3)))
-        truth.append(np.append(q, bias))
+    step, rates = np.arange(steps), _rates(steps)
+    # drawn step by step: of the gyro, its bias, and of what is measured after every fifth and tenth
+    counts = 6 + 3 * ((step + 1) % 5 == 0) + 3 * ((step + 1) % 10 == 0)
+    drawn, begin = rng.standard_normal(counts.sum()), np.cumsum(counts) - counts
+
+    def drawn_in(chosen: Any, offset: int) -> Floats:
+        return drawn[(begin[chosen] + offset)[:, None] + np.arange(3)]
+
+    drifts = 0.001 * np.sqrt(STEP_S) * drawn_in(step, 3)
+    biases = np.cumsum(np.concatenate([bias[None], drifts]), axis=0)
+    gyro = rates + biases[:-1] + 0.01 / np.sqrt(STEP_S) * drawn_in(step, 0)
+    q = compose(q, _turned(steps))
+    fifth, tenth = step[4::5], step[9::10]
+    force = rotate(conjugate(q[fifth]), np.array([0.0, 0.0, 9.81])) + 0.3 * drawn_in(fifth, 6)
+    field = rotate(conjugate(q[tenth]), np.array([0.5, 0.0, -0.4])) + 0.05 * drawn_in(tenth, 9)
     step_ns = 20_000_000
     metadata = {"components": ",".join(STATE), "kinds": ",".join(STATE.values())}
     prior = np.diag([0.3**2] * 3 + [0.02**2] * 3)
 
     def vectors(topic: str, at: Any, values: Any) -> Any:
-        stamps = EPOCH_NS + step_ns * np.array(at)
-        return make_stream(topic, schemas.VECTOR_MEASUREMENT, stamps, value=np.array(values))
+        stamps = EPOCH_NS + step_ns * at
+        return make_stream(topic, schemas.VECTOR_MEASUREMENT, stamps, value=values)
 
     streams = [
         make_stream(
@@ -148,10 +161,9 @@ def simulate(seed: int, steps: int = 500) -> tuple[MemorySource, Floats, Floats]
             mean=[[1.0, 0, 0, 0, 0, 0, 0]],
             covariance=prior.reshape(1, 36),
         ),
-        vectors("/gyro", np.arange(steps), gyro),
-        vectors("/force", *zip(*force, strict=True)),
-        vectors("/field", *zip(*field, strict=True)),
+        vectors("/gyro", step, gyro),
+        vectors("/force", fifth + 1, force),
+        vectors("/field", tenth + 1, field),
     ]
     run = RunMetadata(scenario="attitude", parameters={}, seed=seed, run=0, epoch_ns=EPOCH_NS)
-    states = np.array(truth)
-    return memory_source(Recording(streams), run), states, np.array(gyro)
+    return memory_source(Recording(streams), run), np.concatenate([q, biases[1:]], axis=1), gyro

@@ -195,9 +195,15 @@ def test_the_first_node_may_have_the_priors_stamp() -> None:
 
 
 @cache
-def trajectories(runs: int) -> tuple[MemorySource, ...]:
-    simulated = [vehicle_a.simulate(seed, missing=False) for seed in range(1000, 1000 + runs)]
-    return tuple(vehicle_a.source(told, truth=truth) for told, truth in simulated)
+def trajectories(runs: int, end_s: float = 20.0) -> tuple[MemorySource, ...]:
+    simulated = vehicle_a.simulate_all(range(1000, 1000 + runs), missing=False)
+    return tuple(
+        vehicle_a.source(
+            [each for each in told if each[0] <= end_s],
+            truth=[each for each in truth if each[0] <= end_s],
+        )
+        for told, truth in simulated
+    )
 
 
 @pytest.mark.paper
@@ -223,7 +229,7 @@ def test_two_hundred_trajectories_give_the_sheets_table() -> None:
 @pytest.mark.usefixtures("uncompiled")
 def test_parts_blocks_and_orders_of_an_ensemble_give_the_same_bound() -> None:
     """Cut in two, and in blocks: equal but for round-off of the sums."""
-    sources = trajectories(4)
+    sources = trajectories(4, 8.0)
     whole = bounds_of(outputs(VEHICLE_A, "bound", sources), sources).covariances()
     merged = Bounds()
     for part in (slice(0, 1), slice(1, 4)):

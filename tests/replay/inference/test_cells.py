@@ -28,7 +28,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     # the prior is wrong by a standard deviation, along what the sum of the pressures does not tell
     "batch-reactor": ("batch-reactor", {"prior_mean": [2.9, 1.1], "prior_variance": 0.01}),
     "extended-target": ("extended-target", {}),
-    "inertial": ("navigation", {"duration_s": 12.0}),
+    "inertial": ("navigation", {"duration_s": 12.0, "unit": {"rate_hz": 50.0}}),
     "moving-shooter": ("shot-sequence", {"shots": 4}),
     "moving-sights": ("moving-los", {"duration_s": 3.0}),
     "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
@@ -42,7 +42,10 @@ CONSISTENT = (*NEAR_LINEAR, "inertial", "ranging-pose", "ranging-position")
 # So many particles that a sharp measurement does not leave a few; and these vehicles go on as they
 # are: an interacting multiple model that expects manoeuvres is too careful.
 SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
-    **{(name, "particles"): {"particles": 10_000} for name in SCENARIOS},
+    **{
+        (name, "particles"): {"particles": 10_000 if name.startswith("ranging") else 5_000}
+        for name in SCENARIOS
+    },
     ("vehicle", "imm"): {"manoeuvres_per_s": 0.0},
 }
 CELLS = [
@@ -50,7 +53,7 @@ CELLS = [
     for name, model in registered_models().items()
     for method, each in METHODS.items()
     if not each.lacks(model) and method != "bound"  # which estimates nothing, see `test_bound`
-    # of 12 and 15 components, ten thousand particles leave too few near what sharp sensors say
+    # of 12 and 15 components, thousands of particles leave too few near what sharp sensors say
     if (name, method) not in (("inertial", "particles"), ("moving-sights", "particles"))
     # whose kernels take longest to compile, see `test_unscented_and_extended_inertial_filters_agree`
     if (name, method) not in (("inertial", "ukf"), ("inertial", "lrkf"))
@@ -89,7 +92,7 @@ def test_every_cell_is_consistent(model: str, method: str, request: pytest.Fixtu
     """The mean NEES per component is 1 within 4 standard errors where the model is near linear.
 
     Of what takes long there are a third of the runs. Elsewhere two logs are followed to their ends, in
-    plain Python but for ten thousand particles and the extended target, whose kernels others use.
+    plain Python but for particles and the extended target, whose kernels others use.
     """
     settings = SETTINGS.get((model, method), {})
     if model in CONSISTENT:

@@ -323,10 +323,10 @@ def problem(name: str) -> tuple[Model, MemorySource]:
     if name == "vehicle":
         return VEHICLE_A, vehicle_a.source(vehicle_a.simulate(9, outlier=True)[0][:90])
     if name == "wheel":
-        return wheel.make_wheel(), wheel.source(wheel.simulate(3, np.arange(0, 24) * 0.1))
+        return wheel.make_wheel(), wheel.source(wheel.simulate(3, np.arange(0, 14) * 0.1))
     source, *_ = attitude.simulate(21)
     streams = [
-        each.take(slice(0, np.searchsorted(each.publish_time_ns, attitude.EPOCH_NS + 10**9)))
+        each.take(slice(0, np.searchsorted(each.publish_time_ns, attitude.EPOCH_NS + 10**9 // 2)))
         for each in source.streams.values()
     ]
     return ATTITUDE, memory_source(Recording(streams), source.run)

@@ -111,8 +111,8 @@ VEHICLE_A = Model(
 )
 
 
-def wrap(angle: float) -> float:
-    return float(angle - 2 * np.pi * np.round(angle / (2 * np.pi)))
+def wrap(angle: Any) -> Any:
+    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 def messages() -> Iterator[tuple[float, str, int]]:
@@ -127,35 +127,61 @@ def messages() -> Iterator[tuple[float, str, int]]:
         yield time_s, sensor, beacon
 
 
-def simulate(
-    seed: int, *, missing: bool = True, outlier: bool = False
-) -> tuple[list[tuple[float, str, int, Floats]], list[tuple[float, Floats]]]:
+Told = list[tuple[float, str, int, Floats]]
+Truths = list[tuple[float, Floats]]
+
+
+def simulate(seed: int, *, missing: bool = True, outlier: bool = False) -> tuple[Told, Truths]:
     """Messages with their values, and the truth at the distinct stamps."""
-    rng = np.random.default_rng(seed)
-    x = MEAN + np.sqrt(VARIANCES) * rng.standard_normal(5)
+    [found] = simulate_all([seed], missing=missing, outlier=outlier)
+    return found
+
+
+def simulate_all(
+    seeds: Sequence[int], *, missing: bool = True, outlier: bool = False
+) -> list[tuple[Told, Truths]]:
+    """What `simulate` gives of each seed."""
+    in_order = [*messages()]
+    stamps = len({time_s for time_s, *_ in in_order})
+    numbers = 5 * (1 + stamps) + sum(1 if sensor == "speed" else 2 for _, sensor, _ in in_order)
+    drawn = np.array([np.random.default_rng(seed).standard_normal(numbers) for seed in seeds])
+    at = 0
+
+    def draw(count: int) -> Floats:
+        nonlocal at
+        at += count
+        return drawn[:, at - count : at]
+
+    x = MEAN + np.sqrt(VARIANCES) * draw(5)
     now, told, truth, seen = 0.0, [], [(0.0, x)], 0
-    for time_s, sensor, beacon in messages():
+    for time_s, sensor, beacon in in_order:
         if time_s > now:
             duration_s = time_s - now
-            moved = np.array(move(tuple(x), (), duration_s, None))
-            x = moved + np.sqrt(NOISE * duration_s) * rng.standard_normal(5)
+            moved = np.stack(move(tuple(x.T), (), duration_s, None), axis=1)
+            x = moved + np.sqrt(NOISE * duration_s) * draw(5)
             now = time_s
             truth.append((now, x))
         if sensor == "speed":
-            told.append((time_s, sensor, 0, x[3:4] + 0.1 * rng.standard_normal(1)))
+            told.append((time_s, sensor, 0, x[:, 3:4] + 0.1 * draw(1)))
             continue
-        z = np.array([0.3, 0.05]) * rng.standard_normal(2)
-        distance, bearing = range_bearing(x[:3], BEACONS[beacon])
-        value = np.array([distance + z[0], wrap(bearing + z[1])])
+        z = np.array([0.3, 0.05]) * draw(2)
+        distance, bearing = range_bearing(tuple(x.T[:3]), BEACONS[beacon])
+        value = np.stack([distance + z[:, 0], wrap(bearing + z[:, 1])], axis=1)
         if outlier and seen == 40:
-            value[0] += 5.0
+            value[:, 0] += 5.0
         if missing and seen % 7 == 6:
-            value[1] = np.nan
+            value[:, 1] = np.nan
         if missing and seen % 11 == 10:
-            value[0] = np.nan
+            value[:, 0] = np.nan
         seen += 1
         told.append((time_s, sensor, beacon, value))
-    return told, truth
+    return [
+        (
+            [(*of, values[run]) for *of, values in told],
+            [(time_s, states[run]) for time_s, states in truth],
+        )
+        for run in range(len(seeds))
+    ]
 
 
 def source(

@@ -108,7 +108,7 @@ def test_an_angle_that_is_not_measured():
     measured[:, 1] = np.nan
     offsets, density = (
         np.array([0, 60]),
-        wrapped_normal.density(WrappedNormal(np.zeros(2), np.eye(2)), torus_grid(40)),
+        wrapped_normal.density(WrappedNormal(np.zeros(2), np.eye(2)), torus_grid(32)),
     )
     grid = run_torus_grid_filter(given, density[None] / density.sum(), offsets, measured, turn_on)
     for own in (

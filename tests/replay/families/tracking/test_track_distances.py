@@ -94,11 +94,11 @@ def test_hota_of_the_sheet():
 def test_figures_are_those_of_motmetrics_and_trackeval_on_random_scenes():
     """IDF1, switches and breaks of motmetrics, HOTA and IDF1 of TrackEval; see `track_peers`.
 
-    Of every second scene: a hundred.
+    Of every fifth scene: forty.
     """
     kept = json.loads(track_peers.KEPT.read_text())["scenes"]
     assert len(kept) == track_peers.SCENES
-    for seed, theirs in [*enumerate(kept)][::2]:
+    for seed, theirs in [*enumerate(kept)][::5]:
         tracks, targets = track_peers.scene(seed)
         told = [
             TracksAt(np.flatnonzero(there), at[there])
