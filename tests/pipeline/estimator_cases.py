@@ -87,7 +87,7 @@ def targets(**settings: Any) -> Situation:
 
 def scores(**settings: Any) -> Situation:
     """A few users."""
-    return Situation("biometric-scores", {"users": 30, "low_galleries": 4}, settings)
+    return Situation("biometric-scores", {"users": 20, "low_galleries": 3}, settings)
 
 
 def nodes(**settings: Any) -> Situation:
@@ -256,7 +256,7 @@ BOUNDS = {
     "heading_error_radps": 0.02,
 }
 FEW = {"duration_s": 2.0, "landmarks": 5, "range_bearing": {"rate_hz": 2.0}}
-LOOKS = {"scene": "random", "looks": 3}
+LOOKS = {"scene": "random", "looks": 2}
 L4 = Situation("relative-bearings", {**LOOKS, "looks": 1}, {"shape": "l4"})
 OWN = {
     "bingham-axis": directional("bingham-axis", "axis", [0.01, 0.02]),
