@@ -3,7 +3,8 @@
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache, lru_cache
-from typing import Annotated, Any, ClassVar
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
 
 from pydantic import Field, PositiveFloat
 
@@ -18,13 +19,20 @@ CombinedParameters = Any  # type: ignore[explicit-any]
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
     """List the parameters that a model's functions can read: all parameters that are numbers."""
-    schema = parameters.model_json_schema()["properties"]
-    numeric = ("number", "integer", "boolean", "null")
-    return tuple(
-        name
-        for name, entry in schema.items()
-        if all(each.get("type") in numeric for each in entry.get("anyOf", [entry]))
-    )
+    fields = parameters.model_fields.items()
+    return tuple(name for name, field in fields if _is_number(field.annotation))
+
+
+def _is_number(accepted: object) -> bool:
+    """Test whether a parameter accepts only numbers and None."""
+    kind = get_origin(accepted)
+    if kind is Annotated:
+        return _is_number(get_args(accepted)[0])
+    if kind in (Union, UnionType):
+        return all(map(_is_number, get_args(accepted)))
+    if kind is Literal:
+        return all(_is_number(type(choice)) for choice in get_args(accepted))
+    return accepted in (float, int, bool, None, NoneType)
 
 
 @lru_cache(maxsize=64)
