@@ -18,7 +18,6 @@ from fuselog.replay.engine.arrays import Floats
 from fuselog.replay.engine.streams.channels import heading_variance
 from fuselog.replay.engine.streams.measurements import PLANE
 from fuselog.replay.engine.vectors.tangent import Kind
-from fuselog.replay.inference.all_methods import modelled
 from fuselog.replay.inference.model.model import FIX, POSITION, Control, Map, Model, Motion, Sensor
 from fuselog.replay.inference.model.parameters import ModelParameters
 from fuselog.replay.inference.model.start import Start
@@ -332,17 +331,3 @@ ROBOT = Model(
     },
     start=START,
 )
-RECKONING = Model(
-    "robot pose from odometry only",
-    POSE,
-    DeadReckoningParameters,
-    (),
-    MOTION,
-    control=ODOMETRY,
-    output="pose",
-    needs_sensor=False,
-    augmentable=DRIVE_ERRORS,
-    start=START,
-    takes_fixes=False,
-)
-DEAD_RECKONING = modelled(RECKONING, "ekf")

@@ -16,7 +16,7 @@ from fuselog.recorders.parameters import build
 from fuselog.replay.engine.replaying.estimator import Bound
 from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.estimators.landmarks import ROBOT
-from fuselog.replay.families.vehicles.vehicle_kalman import VEHICLE
+from fuselog.replay.families.vehicles.vehicle_model import VEHICLE
 from fuselog.replay.inference.all_methods import METHODS
 from fuselog.replay.inference.estimators import bind_model, combined
 from fuselog.replay.inference.model.model import Model, Switching

@@ -247,7 +247,7 @@ def test_a_replay_says_what_the_command_says(
 
 def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -> None:
     """A model with a method is what the registered estimator is, with settings too."""
-    from fuselog.replay.estimators.landmarks import DEAD_RECKONING
+    from fuselog.replay.estimators.dead_reckoning import DEAD_RECKONING
 
     assert isinstance(DEAD_RECKONING, Estimator)
     mine, wide = fl.modelled(robot(), "ekf"), {"sigma_range_m": 0.4}
@@ -326,7 +326,7 @@ def test_a_component_that_was_not_measured_is_nan(recordings: list[fl.MemorySour
 )
 def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.MemorySource]) -> None:
     """What is not registered, tied to a method by its name, is replayed as the command replays it."""
-    from fuselog.replay.families.vehicles.vehicle_kalman import VEHICLE
+    from fuselog.replay.families.vehicles.vehicle_model import VEHICLE
 
     has_modes = method.startswith("imm")
     logs = [fl.record("manoeuvres", **SHORT)] if has_modes else recordings[:1]

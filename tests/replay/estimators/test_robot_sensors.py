@@ -15,8 +15,8 @@ from fuselog.recorders.models.planar import drive, wrap_angle
 from fuselog.recorders.recording import Recording
 from fuselog.replay.engine.streams.failures import sentences_of
 from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.estimators.dead_reckoning import RECKONING
 from fuselog.replay.estimators.landmarks import (
-    RECKONING,
     ROBOT,
     LocalizationParameters,
     align,

@@ -15,7 +15,8 @@ from fuselog.recorders.log import RunMetadata, make_stream, schemas
 from fuselog.recorders.models.planar import range_bearing
 from fuselog.replay.engine.streams.blocks import gather
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.estimators.landmarks import RECKONING, ROBOT
+from fuselog.replay.estimators.dead_reckoning import RECKONING
+from fuselog.replay.estimators.landmarks import ROBOT
 from fuselog.replay.inference.model.augmentation import augmented
 from fuselog.replay.inference.model.checking import check_model
 from fuselog.replay.inference.model.model import Model, Motion, Sensor

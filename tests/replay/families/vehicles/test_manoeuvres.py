@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from fuselog.pipeline.runs.recorded import record_ensemble, replay_ensemble
 from fuselog.replay.engine.streams.sources import MemorySource
-from fuselog.replay.families.vehicles.vehicle_kalman import VEHICLE
+from fuselog.replay.families.vehicles.vehicle_model import VEHICLE
 from tests.replay.inference.replays import outputs
 
 RUNS = 200
