@@ -90,10 +90,28 @@ def heeding_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+_MADE: set[tuple[tuple[str, ...], ...]] = set()
+
+
 @contextmanager
 def without_drawing() -> Iterator[None]:
-    """Figures are made and written, but not drawn, which takes most of a short run's time."""
+    """Figures are made and written, but not drawn, which takes most of a short run's time.
+
+    Of charts with the same axes only the first is made.
+    """
+    from matplotlib.figure import Figure
+
+    from fuselog.pipeline.output.charts import Chart, draw
+
+    def made(chart: Chart) -> Figure:
+        axes = tuple((panel.title, panel.x.label, panel.y.label) for panel in chart.panels)
+        if axes in _MADE:
+            return Figure()
+        _MADE.add(axes)
+        return draw(chart)
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fuselog.pipeline.output.results.draw", made)
         patch.setattr("matplotlib.figure.Figure.draw", lambda *_: None)
         yield
 
