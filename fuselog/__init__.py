@@ -4,9 +4,9 @@ A name is imported on first use, from the module that the stub file in this fold
 on first use make `import fuselog` fast, and editors and type checkers still see every name.
 """
 
-import ast
 import sys
 import warnings
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,8 +21,11 @@ from fuselog import replay as _room  # noqa: E402
 _RENAMED = {"Told": "Diagnostics"}  # names of the previous release
 
 
+@cache
 def _names() -> dict[str, tuple[str, str]]:
     """Read the stub file, and map each public name to its module and to its name in that module."""
+    import ast  # as slow to import as the rest of this file; commands need no public name
+
     stub = ast.parse((_HERE / "__init__.pyi").read_text(encoding="utf-8"))
     return {
         alias.asname or alias.name: (node.module or "", alias.name)
@@ -33,7 +36,7 @@ def _names() -> dict[str, tuple[str, str]]:
 
 
 def _public(name: str) -> Any:
-    module, there = _NAMES[name]
+    module, there = _names()[name]
     return getattr(__import__(module, fromlist=[there]), there)
 
 
@@ -50,8 +53,6 @@ class _Replay(ModuleType):
         return signature(_public("replay"))
 
 
-_NAMES = _names()
-__all__ = list(_NAMES)
 _room.__class__ = _Replay
 
 
@@ -61,11 +62,13 @@ def __getattr__(name: str) -> Any:
         message = f"fuselog.{name} was renamed to fuselog.{new}; the next release removes the old name"
         warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(sys.modules[__name__], new)
-    if name not in _NAMES:
+    if name == "__all__":
+        return list(_names())
+    if name.startswith("__") or name not in _names():
         raise AttributeError(f"module 'fuselog' has no attribute '{name}'")
     found = globals()[name] = _public(name)
     return found
 
 
 def __dir__() -> list[str]:
-    return sorted(_NAMES)
+    return sorted(_names())

@@ -117,6 +117,19 @@ def methods() -> dict[str, dict[str, str]]:
     return {name: _methods_of(model) for name, model in registered_models().items()}
 
 
+def types() -> dict[str, list[str]]:
+    """For each model, find the types of topics of which a log has one if the model fits it.
+
+    Any log may fit a model that has no such types.
+    """
+    found: dict[str, list[str]] = {}
+    for name, model in registered_models().items():
+        sensors = model.all_sensors if model.needs_sensor else ()
+        needed = [model.control] if model.control else sensors
+        found[name] = sorted({each for one in needed for each in serving(one.schema)})
+    return found
+
+
 def show_formulas(name: str | None, *, as_json: bool) -> None:
     """Print the formulas of a model; raise BadInput if `name` is None or not a known model."""
     if name is None:

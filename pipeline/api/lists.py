@@ -5,14 +5,13 @@ The descriptions of our modules and files, and the defaults of our recorders, ar
 name, everything is imported instead.
 """
 
-import json
 import re
 from collections.abc import Iterator
 from itertools import groupby
 from typing import Any
 
 from fuselog.pipeline.output.terminal import print_table, say
-from fuselog.pipeline.runs.inputs import KEPT, defaults_of, shipped
+from fuselog.pipeline.runs.inputs import defaults_of, kept_lists, shipped
 from fuselog.recorders.parsing import read_toml
 from fuselog.recorders.registry import available
 
@@ -22,6 +21,7 @@ GROUPS = {
     "estimators": "estimators",
     "models": "models",
     "methods": "models",
+    "types": "models",
     "metrics": "metrics",
     "experiments": "",
     "defaults": "recorders",
@@ -78,8 +78,12 @@ def by_family(kind: str) -> Iterator[tuple[str, str]]:
 
 
 def listed(kind: str) -> dict[str, Any]:
-    """Return each name's description; for "methods", whether each method can estimate each model."""
-    kept, places = json.loads(KEPT.read_text(encoding="utf-8"))[kind], places_of(kind)
+    """Return each name's description.
+
+    For "methods", it tells whether each method can estimate each model; for "types", see
+    `fuselog.pipeline.api.catalog.types`.
+    """
+    kept, places = kept_lists()[kind], places_of(kind)
     if kept.keys() >= {*places.values()}:
         return {name: kept[place] for name, place in places.items()}
     return told(kind)
@@ -95,6 +99,8 @@ def told(kind: str, *, all_load: bool = False) -> dict[str, Any]:
 
     if kind == "methods":
         return catalog.methods()
+    if kind == "types":
+        return catalog.types()
     if kind == "defaults":
         return {name: defaults_of(name) for name in available(GROUPS[kind])}
     return {

@@ -88,7 +88,9 @@ class Describing:
             "publish_end_ns": published[1],
             "messages": sum(each.messages for each in opened.topics.values()),
             "topics": topics,
-            "models": [name for name, each in fitting_of(opened.topics).items() if each.methods],
+            "models": [
+                name for name, each in fitting_of(opened.topics, is_all=False).items() if each.methods
+            ],
         }
         if run is not None:
             row |= {name: getattr(run, name) for name in ("scenario", "seed", "run", "epoch_ns")}

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from fuselog.pipeline.output import RESULT_FILE
 from fuselog.pipeline.output.terminal import print_json, print_table, say, say_next, warn
-from fuselog.pipeline.runs.inputs import kept_defaults
+from fuselog.pipeline.runs.inputs import kept_defaults, kept_lists
 from fuselog.recorders.checks.finding import Finding
 from fuselog.recorders.compiling.cache import cache_folder, kept_files
 from fuselog.recorders.errors import BadInput, some_of
@@ -134,9 +134,22 @@ class Fitting(NamedTuple):
     lacks: list[str]
 
 
-def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
-    """Test how every registered model fits a log, by name."""
-    return {name: _fitting(model, topics) for name, model in registered_models().items()}
+def fitting_of(topics: Mapping[str, Topic], *, is_all: bool = True) -> dict[str, Fitting]:
+    """Test how registered models fit a log, by name.
+
+    Unless `is_all`, our models of whose types the log has no topic are not imported, and it is not told
+    what they lack.
+    """
+    here, kept = (
+        {topic.schema_name for topic in topics.values()},
+        {} if is_all else kept_lists()["types"],
+    )
+    places = {name: entry.value for name, entry in available("models").items()}
+    unfit = {name for name, place in places.items() if kept.get(place) and not here & {*kept[place]}}
+    models = registered_models(places.keys() - unfit)
+    tried = {name: _fitting(model, topics) for name, model in models.items()}
+    found = dict.fromkeys(unfit, Fitting([], [], [])) | tried
+    return {name: found[name] for name in places if name in found}
 
 
 def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
@@ -184,7 +197,7 @@ def _topics_used(bound: Sequence[Bound]) -> list[str]:
 
 def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
     """Print which models and other estimators fit the log and, with `is_all`, what other models need."""
-    fittings = fitting_of(log.topics)
+    fittings = fitting_of(log.topics, is_all=is_all)
     fit = {name: each for name, each in fittings.items() if each.methods}
     others = {name: each for name, each in fittings.items() if name not in fit}
     by_topics: dict[tuple[str, ...], list[str]] = {}

@@ -12,10 +12,10 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from io import StringIO
-from statistics import median
 from time import monotonic
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -292,7 +292,7 @@ def over_cases(tables: "Sequence[MetricTable]") -> dict[str, dict[str, list[floa
 def _spread(values: Sequence[float]) -> str | None:
     if not values:
         return None
-    least, middle, greatest = map(format_value, (min(values), float(median(values)), max(values)))
+    least, middle, greatest = map(format_value, (min(values), float(np.median(values)), max(values)))
     return middle if least == greatest else f"{middle} ({least} to {greatest})"
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import resources
 from io import BufferedIOBase
 from pathlib import Path
@@ -118,10 +119,17 @@ def defaults_of(recorder: str) -> dict[str, Any]:
     return {each.name: each.default for each in described}
 
 
+@cache
+def kept_lists() -> dict[str, dict[str, Any]]:
+    """Read what is kept of our own modules and files, by list and place."""
+    kept: dict[str, dict[str, Any]] = json.loads(KEPT.read_text(encoding="utf-8"))
+    return kept
+
+
 def kept_defaults(recorder: str) -> dict[str, Any]:
     """Do the same as `defaults_of`, for our own recorders without importing them."""
     place = available("recorders").get(recorder)
-    kept = json.loads(KEPT.read_text(encoding="utf-8"))["defaults"]
+    kept = kept_lists()["defaults"]
     if place is None or place.value not in kept:
         return defaults_of(recorder)
     return dict(kept[place.value])

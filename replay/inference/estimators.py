@@ -1,6 +1,6 @@
 """Estimators made from a model and a method, and their binding to the topics of a log."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
@@ -68,11 +68,14 @@ from fuselog.replay.inference.run.out_of_sequence import OutOfSequenceFilter
 from fuselog.replay.inference.run.reading import reading_of
 
 
-@lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
     """Return the parameter type that combines the parameters of a model and of a method."""
-    name = f"{model.parameters.__name__}With{method.parameters.__name__}"
-    return _created(name, (method.parameters, model.parameters))
+    return _combined(model.parameters, method.parameters)
+
+
+@lru_cache(maxsize=256)
+def _combined(of_model: type[ModelParameters], of_method: type[Parameters]) -> type[ModelParameters]:
+    return _created(f"{of_model.__name__}With{of_method.__name__}", (of_method, of_model))
 
 
 def _created(
@@ -182,13 +185,13 @@ class _OfAnyModel(AnyEstimator):
         return _made_for(where, method, build(method.parameters, variant, where))
 
 
-def registered_models() -> dict[str, Model]:
-    """Return the registered models by name, without those that fail to load.
+def registered_models(names: Iterable[str] | None = None) -> dict[str, Model]:
+    """Return all registered models, or those named, by name, without those that fail to load.
 
     An error in such a model is raised only when the user names it.
     """
     found = {}
-    for name in available("models"):
+    for name in available("models") if names is None else names:
         with suppress(BadInput):
             found[name] = load("models", name, Model)
     return found

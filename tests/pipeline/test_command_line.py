@@ -23,11 +23,14 @@ from rerun.blueprint import View
 
 import fuselog as fl
 from fuselog.pipeline.api.lists import told as told_of
+from fuselog.pipeline.logs.information import fitting_of
 from fuselog.pipeline.output.results import result_folder
 from fuselog.pipeline.runs.inputs import KEPT
 from fuselog.recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.timeline.drawing.canvas import Scene
 from tests.conftest import heeding_interrupts
+from tests.faults.planted import SCENARIOS, recorded
 from tests.lists import lists
 from tests.lists import main as keep_lists
 from tests.pipeline.conftest import run_here
@@ -221,6 +224,22 @@ def test_info_says_that_no_model_fits(
         'of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the '
         "documentation"
     )
+
+
+def test_info_imports_every_model_that_fits() -> None:
+    """Of logs of all scenarios: types that are kept leave out only models that do not fit."""
+    fitting = set[str]()
+    for scenario in SCENARIOS:
+        topics = MemorySource(*recorded(scenario), scenario).topics
+        whole, chosen = fitting_of(topics), fitting_of(topics, is_all=False)
+        found, same = (
+            {name: each for name, each in all_.items() if each.methods} for all_ in (whole, chosen)
+        )
+        assert found == same, scenario
+        assert chosen.keys() == whole.keys()
+        assert any(not each.lacks for name, each in chosen.items() if name not in found), scenario
+        fitting |= found.keys()
+    assert len(fitting) > 7
 
 
 def test_info_names_the_tracker_of_detections(

@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.random import Generator
-from threadpoolctl import threadpool_limits
 
 from fuselog.recorders.errors import BadInput
 from fuselog.replay.inference.sampling.distance import Array, lcd_distance_and_gradient
@@ -69,6 +68,8 @@ def lcd_samples(
         if symmetric:
             gradient = gradient[:free] - gradient[free : 2 * free]
         return OBJECTIVE_SCALE * distance, OBJECTIVE_SCALE * gradient.ravel()
+
+    from threadpoolctl import threadpool_limits  # slow to import
 
     optima = []
     for start in range(starts):
