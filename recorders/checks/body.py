@@ -39,19 +39,18 @@ class Series:
     def integral(self, times_s: Floats) -> Floats:
         """Integrate the values from the first stamp to given times (...); NaN after the last stamp."""
         found = [
-            np.interp(times_s, self.times_s, column, left=np.nan, right=np.nan)
-            for column in self._totals
+            np.interp(times_s, self.times_s, column, left=np.nan, right=np.nan) for column in self.totals
         ]
         return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
 
     @cached_property
-    def _totals(self) -> Floats:
-        """Integrate each component to each stamp: (m, n)."""
+    def totals(self) -> Floats:
+        """The integral of each component to each stamp: (m, n)."""
         flat = self.values.reshape(len(self.values), -1)
         means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
         totals = np.zeros_like(flat)
         np.cumsum(means * np.diff(self.times_s)[:, None], axis=0, out=totals[1:])
-        return totals.T
+        return np.ascontiguousarray(totals.T)
 
     def moved(self, by_s: float, gain: float = 0.0) -> "Series":
         """Return the series with stamps corrected for a delay, and for the gain of its clock."""

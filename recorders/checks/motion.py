@@ -19,7 +19,6 @@ from fuselog.recorders.checks.windows import (
     clear_moves,
     courses,
     distances,
-    lengths,
     noise_of,
     places_of,
     travelled,
@@ -149,7 +148,7 @@ class BodyMotion:
         for source in chain(self.body.speeds, self.body.velocities):
             if source.topic == against:
                 continue
-            found = timing(windows, source, lengths, tolerance_s=_hold_s(source))
+            found = timing(windows, source, is_path=True, tolerance_s=_hold_s(source))
             if found is not None:
                 yield Lag(source.topic, against, found)
 
@@ -161,7 +160,7 @@ class BodyMotion:
         windows = turned(self.courses, 1.0)
         found = []
         for source in self.body.turns:
-            lag = timing(windows, source, lambda _, angles: angles, tolerance_s=_hold_s(source))
+            lag = timing(windows, source, is_path=False, tolerance_s=_hold_s(source))
             if lag is not None:
                 found.append(Lag(source.topic, self.courses.topic, lag))
         return found

@@ -1,15 +1,14 @@
 """Search for the delay, and the clock's gain, at which a topic agrees best with another's motion."""
 
-from collections.abc import Callable
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fuselog.recorders.checks.body import Floats, Series
-from fuselog.recorders.checks.windows import FEWEST, Windows, thinned
+from fuselog.recorders.checks.windows import FEWEST, Windows, lengths, thinned
+from fuselog.recorders.log.loops import kernel
 
-Account = Callable[[Series, Floats], Floats]  # values of windows, from differences of an integral
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
 FEW = 100  # least number of windows to search for a lag or a clock
@@ -47,31 +46,38 @@ class Timing(NamedTuple):
     is_alone: bool
 
 
-def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
-    """Find the lag and gain with the largest correlation; return None if there are too few windows."""
+def timing(windows: Windows, source: Series, *, is_path: bool, tolerance_s: float) -> Timing | None:
+    """Find the lag and gain with the largest correlation; return None if there are too few windows.
+
+    Args:
+        windows: the motion in windows: lengths if `is_path`, otherwise angles.
+        source: a speed, velocity or turn rate.
+        is_path: whether the length of the source's motion counts.
+        tolerance_s: lags up to this size are ignored.
+    """
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
     count = _independent(windows)
     lags_s = np.arange(-LONGEST_S, LONGEST_S + 0.5 * STEP_S, STEP_S)
     few = windows.take(thinned(len(windows), max(FEW, 2 * count)))
-    coarse = _Lagged.of(few, lags_s).likeness(source, account)
+    coarse = likenesses(few, lags_s, source, is_path=is_path)
     if not np.isfinite(coarse).any():
         return None
     best_s = float(lags_s[np.nanargmax(np.abs(coarse))])
     fine_s = best_s + np.arange(-STEP_S, STEP_S + 0.5 * FINE_S, FINE_S)
-    near = _Lagged.of(windows, fine_s).likeness(source, account)
+    near = likenesses(windows, fine_s, source, is_path=is_path)
     if not np.isfinite(near).any():  # at an end of the lags, where too few windows remain
         return None
     best = int(np.nanargmax(np.abs(near)))
     lag_s, likeness = float(fine_s[best]), float(near[best])
-    gain, gained_s, gained = _gained(few, source, account)
-    telling = _telling(windows, source.moved(0.0, gain), account, gained_s)
+    gain, gained_s, gained = _gained(few, source, is_path=is_path)
+    telling = _telling(windows, source.moved(0.0, gain), gained_s, is_path=is_path)
     if _evidence(telling, gained, likeness) > max(10.0, 0.05 * count) and abs(gain) > 0.005:
         lag_s, likeness = gained_s, gained
     else:
-        gain, telling = 0.0, _telling(windows, source, account, lag_s)
+        gain, telling = 0.0, _telling(windows, source, lag_s, is_path=is_path)
     zero_s = np.arange(-tolerance_s, tolerance_s + 0.5 * FINE_S, max(FINE_S, tolerance_s / 10.0))
-    without = _Lagged.of(windows, zero_s).likeness(source, account)
+    without = likenesses(windows, zero_s, source, is_path=is_path)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
     evidence = float(_evidence(telling, likeness, usual))
     if abs(lag_s) > NEAR_S:  # of many lags, one is the best by chance
@@ -106,13 +112,12 @@ def _is_one_peak(likeness: Floats, count: float) -> bool:
     return bool(is_within and as_good[-1] - as_good[0] + 1 == len(as_good))
 
 
-def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
+def _gained(windows: Windows, source: Series, *, is_path: bool) -> tuple[float, float, float]:
     """Find the gain of the source's clock, with the lag and the correlation there."""
     lags_s = np.arange(-10.0, 10.0, 0.2)
-    lagged = _Lagged.of(windows, lags_s).sorted()
     best = (0.0, 0.0, 0.0)
     for gain in GAINS:
-        found = lagged.likeness(source.moved(0.0, gain), account)
+        found = likenesses(windows, lags_s, source.moved(0.0, gain), is_path=is_path)
         if np.isfinite(found).any():
             place = int(np.nanargmax(np.abs(found)))
             if abs(found[place]) > abs(best[2]):
@@ -120,54 +125,112 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
     return best
 
 
-class _Lagged(NamedTuple):
-    """Windows at several lags.
+def likenesses(windows: Windows, lags_s: Floats, source: Series, *, is_path: bool) -> Floats:
+    """Correlate windows with a source at each lag; NaN if the source spans less than half of them."""
+    found, moves = np.empty(len(lags_s)), np.empty(len(windows))
+    spans = np.ascontiguousarray(windows.begin_s), np.ascontiguousarray(windows.end_s)
+    values = np.ascontiguousarray(windows.values)
+    slopes = np.diff(source.totals) / np.diff(source.times_s)
+    integral = source.times_s, source.totals, slopes
+    kernel(_correlate)(found, moves, lags_s, *spans, values, *integral, is_path)
+    return found
 
-    Attributes:
-        times_s: (q,), stamps at which a window begins or ends.
-        begin: (lags, k), the rows of `times_s` at which the windows begin.
-        end: (lags, k), the same for their ends.
-        values: (k,), the values measured in the windows.
+
+def _correlate(
+    found: Floats,
+    moves: Floats,
+    lags_s: Floats,
+    begin_s: Floats,
+    end_s: Floats,
+    values: Floats,
+    times_s: Floats,
+    totals: Floats,
+    slopes: Floats,
+    is_path: bool,
+) -> None:
+    """Fill in the correlation at each lag.
+
+    Args:
+        found: (lags,), the correlations.
+        moves: (k,), work memory.
+        lags_s: (lags,), how much later the windows are than the source.
+        begin_s, end_s, values: (k,), the windows.
+        times_s: (n,), stamps of the source.
+        totals: (m, n), its integral to each stamp.
+        slopes: (m, n - 1), how the integral grows from each stamp to the next, per second.
+        is_path: whether the length of the source's motion counts, not the motion itself.
     """
-
-    times_s: Floats
-    begin: NDArray[np.int64]
-    end: NDArray[np.int64]
-    values: Floats
-
-    @classmethod
-    def of(cls, windows: Windows, lags_s: Floats) -> "_Lagged":
-        """Shift windows by lags; a stamp at which windows begin and others end occurs once."""
-        stamps_s, rows = np.unique([windows.begin_s, windows.end_s], return_inverse=True)
-        offsets = len(stamps_s) * np.arange(len(lags_s))[:, None]
-        begin, end = (offsets + each for each in rows.reshape(2, -1))
-        return cls((stamps_s - lags_s[:, None]).ravel(), begin, end, windows.values)
-
-    def sorted(self) -> "_Lagged":
-        """Sort the stamps, at which many series can then be integrated faster."""
-        order = np.argsort(self.times_s)
-        places = np.empty_like(order)
-        places[order] = np.arange(len(order))
-        return self._replace(times_s=self.times_s[order], begin=places[self.begin], end=places[self.end])
-
-    def likeness(self, source: Series, account: Account) -> Floats:
-        """Correlate at each lag; use NaN if the source spans less than half of the windows."""
-        total = source.integral(self.times_s)
-        moves = account(source, total.take(self.end, axis=0) - total.take(self.begin, axis=0))
-        is_in = np.isfinite(moves)
-        count = np.count_nonzero(is_in, axis=1)
-        moves[~is_in] = 0.0
-        with np.errstate(invalid="ignore", divide="ignore"):
-            x, y = moves, is_in * self.values
-            x = is_in * (x - (x.sum(axis=1) / count)[:, None])
-            y = is_in * (y - (y.sum(axis=1) / count)[:, None])
-            xx = np.sum(x * x, axis=1)
-            found = np.sum(x * y, axis=1) / np.sqrt(xx * np.sum(y * y, axis=1))
-            varies = xx > VARIES**2 * np.sum(moves**2, axis=1)
-        return np.where(varies & (count >= max(FEWEST, 0.5 * len(self.values))), found, np.nan)
+    for lag in range(len(lags_s)):
+        _move(moves, begin_s, end_s, lags_s[lag], times_s, totals, slopes, is_path)
+        found[lag] = _correlation(moves, values)
 
 
-def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -> float:
+def _move(
+    moves: Floats,
+    begin_s: Floats,
+    end_s: Floats,
+    lag_s: float,
+    times_s: Floats,
+    totals: Floats,
+    slopes: Floats,
+    is_path: bool,
+) -> None:
+    """Fill in the motion of the source in each window; NaN for windows that it does not span."""
+    final = len(times_s) - 1
+    rate_hz = final / (times_s[final] - times_s[0])
+    first, last = 0, 0
+    for k in range(len(moves)):
+        start_s, stop_s = begin_s[k] - lag_s, end_s[k] - lag_s
+        moves[k] = math.nan
+        if start_s >= times_s[0] and stop_s <= times_s[final]:
+            first = _stamp_before(times_s, start_s, first, rate_hz)
+            last = _stamp_before(times_s, stop_s, last, rate_hz)
+            square, move = 0.0, 0.0
+            for column in range(totals.shape[0]):
+                move = totals[column, last] + slopes[column, last] * (stop_s - times_s[last])
+                move -= totals[column, first] + slopes[column, first] * (start_s - times_s[first])
+                square += move * move
+            moves[k] = math.sqrt(square) if is_path else move
+
+
+def _stamp_before(times_s: Floats, time_s: float, near: int, rate_hz: float) -> int:
+    """Return the number of the last stamp that is not after a time; the final stamp is left out.
+
+    The search begins where that stamp would be if all steps from a near stamp on had the same length.
+    """
+    final = len(times_s) - 2
+    place = min(max(near + int((time_s - times_s[near]) * rate_hz), 0), final)
+    while place > 0 and times_s[place] > time_s:
+        place -= 1
+    while place < final and times_s[place + 1] <= time_s:
+        place += 1
+    return place
+
+
+def _correlation(moves: Floats, values: Floats) -> float:
+    """Correlate known moves with values; NaN if fewer than half are known, or if they hardly vary."""
+    count, of_moves, of_values = 0, 0.0, 0.0
+    for k in range(len(moves)):
+        if not math.isnan(moves[k]):
+            count += 1
+            of_moves += moves[k]
+            of_values += values[k]
+    if count < max(FEWEST, 0.5 * len(moves)):
+        return math.nan
+    xx, xy, yy, squares = 0.0, 0.0, 0.0, 0.0
+    for k in range(len(moves)):
+        if not math.isnan(moves[k]):
+            x, y = moves[k] - of_moves / count, values[k] - of_values / count
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            squares += moves[k] * moves[k]
+    if xx <= VARIES * VARIES * squares or yy == 0.0:
+        return math.nan
+    return xy / math.sqrt(xx * yy)
+
+
+def _telling(windows: Windows, source: Series, lag_s: float, *, is_path: bool) -> float:
     """Estimate the number of independent windows.
 
     Only windows that do not overlap are counted. Windows have less weight if residuals persist from one
@@ -177,7 +240,9 @@ def _telling(windows: Windows, source: Series, account: Account, lag_s: float) -
     span_s = float(np.median(windows.end_s - windows.begin_s))
     _, first = np.unique(np.floor(windows.begin_s / span_s), return_index=True)
     begin_s, end_s = windows.begin_s[first] - lag_s, windows.end_s[first] - lag_s
-    moves = account(source, source.integral(end_s) - source.integral(begin_s))
+    moves = source.integral(end_s) - source.integral(begin_s)
+    if is_path:
+        moves = lengths(source, moves)
     is_in = np.isfinite(moves)
     x, y = moves[is_in], windows.values[first][is_in]
     if len(x) < FEWEST:
