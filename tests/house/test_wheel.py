@@ -17,8 +17,10 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[2]
 # as `python -m build` does it, in one process: the source distribution, and the wheel from what is in it
 BUILD = """
-import os, sys, tarfile, tomllib
+import os, sys, tarfile, tomllib, zlib
 from importlib import import_module
+compress = zlib.compressobj
+zlib.compressobj = lambda level=0, *form: compress(0, *form)
 _, root, dist = sys.argv
 os.chdir(root)
 backend = import_module(tomllib.load(open("pyproject.toml", "rb"))["build-system"]["build-backend"])

@@ -534,7 +534,7 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
         parts = np.reshape(stream[name], (len(stream), -1)).T
         fields[name] = [f"{name}_{index}" for index in range(len(parts))]
         table = table.assign(**dict(zip(fields[name], parts, strict=True)))
-    table.to_csv(folder / "log.csv", index=False)
+    table.to_parquet(folder / "log.parquet", index=False)
     fields = {name: columns for name, columns in fields.items() if columns}
     line = advice.partition(" in the mapping")[0].replace("[SIGMA, ...]", "[0.1, 0.1, 1.0]")
     if "swap the sources of" in advice:
@@ -545,13 +545,13 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
         time, line = re.sub(r"column = \.\.\.", 'column = "t", unit = "ns"', line), ""
     given = {name: columns for name, columns in fields.items() if f"deviations.{name}" not in line}
     (folder / "mapping.toml").write_text(
-        f'[[tables]]\nfiles = "log.csv"\n{time}\narrival = {{ column = "logged", unit = "ns" }}\n'
+        f'[[tables]]\nfiles = "log.parquet"\n{time}\narrival = {{ column = "logged", unit = "ns" }}\n'
         f'[[tables.streams]]\ntopic = "{stream.topic}"\nbecomes = "{stream.schema.name}"\n'
         + "".join(f"fields.{name} = {json.dumps(columns)}\n" for name, columns in given.items())
         + line
     )
     values = {"mapping": str(folder / "mapping.toml")}
-    return import_run("table", folder / "log.csv", values)[0].streams[0]
+    return import_run("table", folder / "log.parquet", values)[0].streams[0]
 
 
 @pytest.mark.paper

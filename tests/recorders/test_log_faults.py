@@ -9,7 +9,7 @@ from tests.faults import crafted, cuts, damaged_logs, flips
 
 @pytest.mark.paper
 @pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize(("campaign", "most"), [(flips, 15), (cuts, 15), (crafted, 4)], ids=str)
+@pytest.mark.parametrize(("campaign", "most"), [(flips, 8), (cuts, 8), (crafted, 3)], ids=str)
 def test_faults_hold(campaign, most):
     """Exactly the right numbers, a stated part of them, or one sentence."""
     tally = campaign.run(60.0, np.random.default_rng(0), most)

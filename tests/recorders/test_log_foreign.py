@@ -610,7 +610,7 @@ def assert_reads_as(log, honest, clock: str) -> None:
         for start in range(int(times[0]), int(times[-1]) + 1, 200):
             found = read_streams(log, [topic], order=clock, start_ns=start, end_ns=start + 200)[topic]
             assert_same(found, stream, (times >= start) & (times < start + 200))
-        blocks = [block[topic] for block in read_blocks(log, [topic], order=clock, block_messages=1)]
+        blocks = [block[topic] for block in read_blocks(log, [topic], order=clock, block_messages=10)]
         assert_same(concatenate(blocks), stream)
 
 

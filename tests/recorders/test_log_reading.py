@@ -51,7 +51,7 @@ def test_every_schema_reads_back_bit_for_bit(path, schema, data, compression):
 
 
 @pytest.mark.paper
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     data=st.data(),
     chunk_bytes=st.sampled_from([1, 150, 500, 1 << 20]),
@@ -100,7 +100,7 @@ def test_blocks_follow_one_another_in_time_however_late_messages_come(
             begin += len(each)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 5),
     order=st.sampled_from(["publish_time", "log_time"]),

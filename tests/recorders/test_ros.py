@@ -918,7 +918,7 @@ def test_a_bag_is_imported_block_by_block(tmp_path: Path, monkeypatch: pytest.Mo
     """Small blocks give the same log as one block; so do composed transforms."""
     make = Maker()
     sent: list[Sent] = []
-    for number in range(400):
+    for number in range(200):
         stamp = START_NS + number * STEP_NS
         pairs = [("map", "odom")] * (number % 10 == 0) + [("odom", "base_link")]
         for parent, child in pairs:
@@ -928,15 +928,15 @@ def test_a_bag_is_imported_block_by_block(tmp_path: Path, monkeypatch: pytest.Mo
         sent.append(("/odom", stamp, make("nav_msgs/msg/Odometry", stamp)))
     path = write_bag(tmp_path / "bag", "bag", sent, make.store)
     whole, notes = imported(path, transforms="map:base_link")
-    monkeypatch.setattr(importer, "_BLOCK_MESSAGES", 50)
+    monkeypatch.setattr(importer, "_BLOCK_MESSAGES", 25)
     found = importer.read(path, RosParameters(transforms=["map:base_link"]))
     sizes = [max(map(len, block)) for block in found.blocks if block]
     assert len(sizes) > 10
-    assert max(sizes) < 100
+    assert max(sizes) < 50
     in_blocks, notes_of_blocks = imported(path, transforms="map:base_link")
     assert notes_of_blocks == notes
     for topic, stream in whole.items():
         assert_array_equal(in_blocks[topic].publish_time_ns, stream.publish_time_ns)
         for name, column in stream.columns.items():
             assert_allclose(in_blocks[topic][name], column, atol=1e-12)
-    assert len(whole["/tf/map/base_link"]) == 391
+    assert len(whole["/tf/map/base_link"]) == 191

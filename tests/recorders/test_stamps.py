@@ -30,7 +30,7 @@ odd = st.sampled_from(
 @example(text="1e-32000000", places=9)
 @example(text="9223372036.854775808", places=9)
 @example(text="1767225600000", places=9)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_a_text_gives_its_stamp_or_a_sentence(text: str, places: int) -> None:
     """And its neighbour keeps the last digit."""
     try:
@@ -53,7 +53,7 @@ def test_a_text_gives_its_stamp_or_a_sentence(text: str, places: int) -> None:
     since_ns=st.integers(-(2**62), 2**62),
     kind=st.sampled_from(["int64", "uint64", "float64", "int32"]),
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_a_product_is_exact_or_refused(
     values: list[int], unit_ns: int, since_ns: int, kind: str
 ) -> None:

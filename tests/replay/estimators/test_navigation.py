@@ -282,7 +282,7 @@ def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: Mem
 
 @cache
 def drives(runs: int, values: str) -> list[MemorySource]:
-    """Drives of 28 s at 50 samples/s, once for all methods; what they have of their own as JSON."""
+    """Drives of 28 s, at 50 samples/s if not given, once for all methods; the values given are JSON."""
     given = {"duration_s": 28.0, "unit": {"rate_hz": 50.0}, **json.loads(values)}
     return [memory_source(*record_run("navigation", given, 1, run)) for run in range(runs)]
 
@@ -304,8 +304,8 @@ def aligned_nees(method: str, runs: int = 40, **values: Any) -> tuple[Any, int]:
 @pytest.mark.paper
 @pytest.mark.parametrize("method", ["ekf", "smoother"])
 def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
-    """The mean NEES of 40 drives is in its 95 % interval nearly always."""
-    nees, runs = aligned_nees(method)
+    """The mean NEES of 40 drives at 25 samples/s is in its 95 % interval nearly always."""
+    nees, runs = aligned_nees(method, unit={"rate_hz": 25.0})
     low, high = chi2.ppf([0.025, 0.975], 15 * runs) / runs
     mean = nees.mean(axis=1)
     assert np.mean((mean > low) & (mean < high)) > 0.9
@@ -316,7 +316,8 @@ def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
 @pytest.mark.parametrize("method", ["ekf", "smoother"])
 def test_from_a_heading_off_by_20_deg_errors_are_as_those_from_one_that_is_known(method: str):
     """Where each component is corrected by itself, the mean NEES of the filter is above 20."""
-    nees, _ = aligned_nees(method, prior={"heading_sigma_rad": np.radians(20.0)})
+    turned = {"heading_sigma_rad": np.radians(20.0)}
+    nees, _ = aligned_nees(method, unit={"rate_hz": 25.0}, prior=turned)
     assert nees.mean() == pytest.approx(15.0, abs=1.0)
 
 

@@ -184,18 +184,18 @@ def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, go
     """A bank goes on after it as its filters do; a cloud of particles has no such step, and says so."""
     slow = {"unit": {"rate_hz": 5.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
     count = {} if goes_on else {"particles": 8}
-    source = drive(partial(silent, begin_s=10.0), duration_s=16.0, **slow)
+    source = drive(partial(silent, begin_s=6.0), duration_s=12.0, **slow)
     found = outputs(INERTIAL, method, [source], **count)
     times_s = since_s(found["state"].stream)
     last_s = times_s[-1]
     failures = sentences_of(found["failure"].stream)
     if goes_on:
         assert failures == []
-        assert last_s == pytest.approx(16.0)
-        assert not ((times_s > 10.01) & (times_s < 12.99)).any()
+        assert last_s == pytest.approx(12.0)
+        assert not ((times_s > 6.01) & (times_s < 8.99)).any()
     else:
         assert failures == ["the control is missing for too long"]
-        assert last_s == pytest.approx(10.0)
+        assert last_s == pytest.approx(6.0)
 
 
 @pytest.mark.paper
@@ -203,7 +203,7 @@ def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, go
 def test_modes_go_on_after_a_gap_of_the_unit_as_one_filter_does():
     """Of three equal modes, which mix while nothing is known, the estimates are those of one."""
     slow = {"unit": {"rate_hz": 5.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
-    source = drive(partial(silent, begin_s=10.0), duration_s=14.0, **slow)
+    source = drive(partial(silent, begin_s=6.0), duration_s=10.5, **slow)
     alone = outputs(INERTIAL, "ekf", [source])
     together = outputs(twins(INERTIAL), "imm", [source])
     assert len(together["failure"].stream) == 0

@@ -101,7 +101,7 @@ def with_bias(source: MemorySource) -> MemorySource:
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("method", ["ekf", "ukf", "smoother"])
 def test_it_is_the_model_that_has_it_in_its_state(method: str) -> None:
-    source = vehicle_a.source(vehicle_a.simulate(7)[0])
+    source = vehicle_a.source(vehicle_a.simulate(7)[0][:80])
     found = outputs(DECLARED, method, [source], **ESTIMATE)
     by_hand = outputs(WRITTEN, method, [with_bias(source)])
     assert found["state"].stream.components[-1] == "bias_range_m"

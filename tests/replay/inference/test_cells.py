@@ -43,7 +43,7 @@ CONSISTENT = (*NEAR_LINEAR, "inertial", "ranging-pose", "ranging-position")
 # are: an interacting multiple model that expects manoeuvres is too careful.
 SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     **{
-        (name, "particles"): {"particles": 10_000 if name.startswith("ranging") else 5_000}
+        (name, "particles"): {"particles": 5_000 if name.startswith("ranging") else 2_500}
         for name in SCENARIOS
     },
     ("vehicle", "imm"): {"manoeuvres_per_s": 0.0},

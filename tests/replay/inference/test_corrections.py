@@ -1,5 +1,6 @@
 """Corrections of components that bend together, of a state that has one more by itself."""
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,14 +30,24 @@ def workspace(step: Any) -> Any:
     made = {"state": N, "transition": (T, T), "product": (T, T), "turned": T, "slope": T}
     made["change"] = (1, T)
     work = SimpleNamespace(step=step, **{name: np.empty(shape) for name, shape in made.items()})
-    sloping(MODEL.kinds, MODEL.correct)(MEAN, P, work.slope)
+    made_slope()(MEAN, P, work.slope)
     return work
+
+
+@cache
+def made_slope() -> Any:
+    return sloping(MODEL.kinds, MODEL.correct)
+
+
+@cache
+def made_correction(back: bool) -> Any:
+    return correcting(MODEL.kinds, MODEL.correct, back=back)
 
 
 def corrected(step: Any, back: bool) -> tuple[Any, Any]:
     """The mean and the covariance after a step."""
     mean, covariance = MEAN.copy(), P.copy()
-    correcting(MODEL.kinds, MODEL.correct, back=back)(mean, covariance, workspace(step))
+    made_correction(back)(mean, covariance, workspace(step))
     return mean, covariance
 
 

@@ -129,8 +129,8 @@ def test_it_is_least_squares(loss: str, uncompiled: None) -> None:
     A robust loss goes by the length of a message's residual: what scipy gets is that residual, as long
     as its loss is high. There is an outlier.
     """
-    told = vehicle_a.simulate(7)[0][:12]
-    row = max(row for row, each in enumerate(told[:9]) if each[1] == "rb")
+    told = vehicle_a.simulate(7)[0][:9]
+    row = max(row for row, each in enumerate(told[:7]) if each[1] == "rb")
     told[row] = (*told[row][:3], told[row][3] + np.array([4.0, 0.0]))
     settings = {"loss": loss, "loss_scale": 1.5}
     found = outputs(
@@ -356,7 +356,7 @@ def test_an_interpolated_control_and_an_axis(uncompiled: None) -> None:
 
 def test_runs_do_not_mix_and_blocks_do_not_matter(uncompiled: None) -> None:
     """Two runs at once, one of which starts in the middle of nothing, are each as alone."""
-    told = [vehicle_a.simulate(seed)[0][:16] for seed in (3, 4)]
+    told = [vehicle_a.simulate(seed)[0][:10] for seed in (3, 4)]
     sources = [vehicle_a.source(each) for each in told]
     together = outputs(VEHICLE_A, "smoother", sources, forward="iterated")
     pieces = outputs(VEHICLE_A, "smoother", sources, block_messages=6, forward="iterated")

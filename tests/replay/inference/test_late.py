@@ -314,7 +314,7 @@ def test_angles_maps_gates_and_missing_components(
     model: Model, method: str, values: dict[str, Any]
 ) -> None:
     """The final estimate and all innovations of a model with all of that, of several modes too."""
-    source = delayed(vehicle_a.source(vehicle_a.simulate(7)[0][:90]), 3, "/sighting", "/speed")
+    source = delayed(vehicle_a.source(vehicle_a.simulate(7)[0][:50]), 3, "/sighting", "/speed")
     in_order = replayed(None, [source], model, method, **values)
     back = replayed("rewind:0.5", [cut(source)], model, method, **values)
     assert len(back["rewound"]) > 10

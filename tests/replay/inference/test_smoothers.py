@@ -128,7 +128,7 @@ def test_a_fixed_lag_gives_the_sheets_numbers(
 
 def test_a_fixed_lag_is_the_smoothed_log_that_ends_there(uncompiled: None) -> None:
     """At every node, up to the end: messages just within the lag are used, those beyond are not."""
-    told = vehicle_a.simulate(8)[0][:60]
+    told = vehicle_a.simulate(8)[0][:40]
     found = outputs(VEHICLE_A, "smoother", [vehicle_a.source(told)], forward="ekf:lag=500ms")["state"]
     times_ns = found.stream.publish_time_ns
     lag_ns = 500_000_000
@@ -141,7 +141,7 @@ def test_a_fixed_lag_is_the_smoothed_log_that_ends_there(uncompiled: None) -> No
             assert_allclose(found[name][row], whole[name][row], rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("lag", ["60ms", "400ms", "2s", "100s"])
+@pytest.mark.parametrize("lag", ["60ms", "2s", "100s"])
 def test_the_window_of_steps_gives_what_the_direct_way_gives(
     lag: str, uncompiled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -317,7 +317,7 @@ def test_predictions_between_nodes_are_nodes_that_nobody_asked_for(
     """Five gyro messages a node, or each a node of its own: equal estimates, rotations and all."""
     source, *_ = attitude.simulate(21)
     streams = [
-        each.take(slice(0, np.searchsorted(each.publish_time_ns, attitude.EPOCH_NS + 2 * 10**9)))
+        each.take(slice(0, np.searchsorted(each.publish_time_ns, attitude.EPOCH_NS + 10**9)))
         for each in source.streams.values()
     ]
     short = memory_source(Recording(streams), source.run)
@@ -458,7 +458,7 @@ def test_an_ensemble_is_its_runs_alone_and_one_that_fails_fails_alone(
 
 def test_what_the_gate_kept_out_says_nothing_backwards_either(uncompiled: None) -> None:
     """The outlier is as if it had not come, but for its stamp."""
-    told = vehicle_a.simulate(7, outlier=True)[0]
+    told = vehicle_a.simulate(7, outlier=True)[0][:100]
     kept = outputs(VEHICLE_A, "smoother", [vehicle_a.source(told)], gate_probability=0.999)
     [row] = np.flatnonzero(kept["innovation"]["accepted"] == 0)
     at_ns = kept["innovation"].stream.publish_time_ns[row]

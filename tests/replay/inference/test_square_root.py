@@ -86,7 +86,7 @@ def test_options_and_manifolds_are_as_of_the_plain_filters(
 ) -> None:
     """Gates, outliers, components that are missing, a negative weight, rotations that are reset."""
     source = (
-        attitude.simulate(5, steps=100)[0]
+        attitude.simulate(5, steps=50)[0]
         if model is ATTITUDE
         else vehicle_a.source(vehicle_a.simulate(7, outlier=True)[0][:90])
     )

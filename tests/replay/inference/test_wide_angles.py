@@ -40,7 +40,7 @@ MODELS: dict[str, tuple[Model, tuple[float, ...]]] = {
     "inertial": (INERTIAL, TURNED),
     "attitude": (ATTITUDE, TURNED),
 }
-SIGMAS_RAD = (0.01, 0.5, 0.95, 1.0, 1.5, 3.0, 10.0, 100.0)
+SIGMAS_RAD = (0.01, 0.95, 1.0, 1.5, 3.0, 100.0)
 STEP_S, STEPS = 0.1, 3
 
 
