@@ -92,6 +92,8 @@ def printed_by(words: list[str]) -> str:
     if words[0] == "python":
         done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, check=True)
         return done.stdout
+    if "--diagnose" in words:  # the page shows nothing of these runs
+        words[words.index("--runs") + 1] = "2"
     said = run_here(*words[1:])
     assert said.code == 0 or words[1] == "lint", (words, said.err)  # lint finds something: exit code 1
     return said.out
