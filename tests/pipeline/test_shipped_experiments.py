@@ -12,11 +12,11 @@ import pytest
 from fuselog.pipeline.calibrating import study as calibration
 from fuselog.pipeline.calibrating.manoeuvres import drive
 from fuselog.pipeline.output.results import read_result
-from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.pipeline.sensing import study as sensing
 from tests.claims.few_runs import opposite
+from tests.claims.pages import as_shipped
 from tests.pipeline.conftest import assert_whole
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
@@ -90,7 +90,7 @@ def draw_first_case(runner: Runner, sources: Any, outputs: Any, folder: str = ""
 def test_each_that_ships_its_data_has_a_smallest_form_or_a_study() -> None:
     """Others import data, and `test_report` makes pages of their kept results."""
     assert {*SMALLEST, *STUDIED} == {
-        name for name in shipped("experiments") if not load_experiment(name, {}, {})[1].import_
+        name for name in shipped("experiments") if not as_shipped(name).import_
     }
     for name, file in STUDIED.items():
         text = (Path(__file__).parent / f"{file}.py").read_text(encoding="utf-8")
