@@ -7,6 +7,7 @@ import sys
 import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,14 @@ def mrclam6_log(mrclam6: Path) -> MemorySource:
 def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the Autoferry scenarios, unpacked once."""
     return _unpacked(real_data / "autoferry.tar.xz", tmp_path_factory) / "autoferry"
+
+
+@pytest.fixture(scope="session")
+def autoferry_log(autoferry: Path) -> Callable[[int], MemorySource]:
+    """The log of an Autoferry scenario, each imported once."""
+    return cache(
+        lambda number: memory_source(*import_run("autoferry", autoferry / f"scenario{number}", {}))
+    )
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fuselog.pipeline.output.claims import Claim, decide
-from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.pipeline.runs.experiment import Study, numbers_of
 from fuselog.recorders.parameters import build
 from fuselog.recorders.registry import load
 from tests.claims import pages
@@ -29,7 +29,7 @@ def opposite(name: str, settings: Mapping[str, Any], claims: Sequence[Claim]) ->
 
 def as_of_all(name: str, result: Mapping[str, Any]) -> list[Claim]:
     """The claims of a shipped experiment by what few runs found, as if these were all of its runs."""
-    _, experiment = load_experiment(name, {}, {})
+    experiment = pages.as_shipped(name)
     options = build(load("studies", experiment.study, Study).options, experiment.options, name)
     numbers = numbers_of(experiment, options)
     return decide(experiment.claims, result["metrics"], result["intervals"], numbers)

@@ -14,7 +14,7 @@ from fuselog.pipeline.output.claims import Claim, StatedClaim, _combinations, _d
 from fuselog.pipeline.output.expressions import Values
 from fuselog.pipeline.output.numbers import exactly
 from fuselog.pipeline.output.results import MetricValue, split_metric
-from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.pipeline.runs.experiment import Study, numbers_of
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.parameters import build
 from fuselog.recorders.registry import load
@@ -163,7 +163,7 @@ def all_limits() -> list[tuple[Made, list[Limit]]]:
 def made_claims() -> Iterator[Made]:
     """Every shipped claim, of the first thing that it is of; where these are words, of the last too."""
     for name in shipped("experiments"):
-        _, experiment = load_experiment(name, {}, {})
+        experiment = pages.as_shipped(name)
         kept = pages.stored()[name]
         study = load("studies", experiment.study, Study)
         numbers = numbers_of(experiment, build(study.options, experiment.options, name))

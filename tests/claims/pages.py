@@ -27,7 +27,7 @@ from typing import Any
 from fuselog.pipeline.api.lists import listed
 from fuselog.pipeline.output.claims import decide, known
 from fuselog.pipeline.output.results import MetricValue, Result, read_result
-from fuselog.pipeline.runs.experiment import Study, load_experiment, numbers_of
+from fuselog.pipeline.runs.experiment import Experiment, Study, load_experiment, numbers_of
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.importers.tables.mapping import read_mapping
 from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
@@ -165,7 +165,7 @@ class Catalogue:
         """The table of data with the experiments that import them."""
         experiments: dict[str, list[str]] = {}
         for name in sorted(shipped("experiments")):
-            of = load_experiment(name, {}, {})[1].import_
+            of = as_shipped(name).import_
             if of is not None:
                 experiments.setdefault(of.parameters.get("mapping", of.source), []).append(name)
         summaries = listed("scenarios") | _mappings()
@@ -203,7 +203,7 @@ def _write(name: str, kept: Mapping[str, Any]) -> Path:
 
 def decided(name: str) -> list[dict[str, str]]:
     """The claims of an experiment as it ships, by the numbers of its kept result."""
-    _, experiment = load_experiment(name, {}, {})
+    experiment = as_shipped(name)
     study = load("studies", experiment.study, Study)
     numbers = numbers_of(experiment, build(study.options, experiment.options, name))
     kept, recordings = stored()[name], dict.fromkeys(experiment.recordings, True)
@@ -215,6 +215,12 @@ def decide_anew(name: str) -> None:
     """Keep the claims of an experiment as its kept numbers decide them now."""
     kept = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
     _write(name, kept | {"claims": decided(name)})
+
+
+@cache
+def as_shipped(name: str) -> Experiment:
+    """An experiment as it ships, read once."""
+    return load_experiment(name, {}, {})[1]
 
 
 @cache

@@ -8,7 +8,6 @@ import pytest
 
 from fuselog.pipeline.output.claims import Claim
 from fuselog.pipeline.output.results import Outcome, result_folder, write_outcome
-from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.recorders.importers.tables.mapping import shipped as shipped_mappings
 from tests.bench import __main__ as bench
@@ -35,7 +34,7 @@ def test_every_experiment_has_its_result_and_every_claim_its_page() -> None:
     assert set(pages.stored()) == set(shipped("experiments"))
     templates = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES)
     for name, result in pages.stored().items():
-        _, experiment = load_experiment(name, {}, {})
+        experiment = pages.as_shipped(name)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         stated = {key: value for key, value in result.settings.items() if key != "parameters"}
         assert stated == settings, f"make docs-claims NAMES={name}"
@@ -62,7 +61,7 @@ def test_the_systems_are_all_there_and_counted() -> None:
         named += names
     with_claims = {name for name, each in pages.stored().items() if each.verdicts != "0, 0, 0, 0"}
     assert sorted(named) == sorted(with_claims)
-    demo = load_experiment("landmarks", {}, {})[1]
+    demo = pages.as_shipped("landmarks")
     assert f"replays {ONES[len(demo.estimators)]} estimators" in README
 
 
@@ -106,7 +105,7 @@ def test_a_benchmark_is_kept_beside_the_others(tmp_path: Path, monkeypatch: pyte
 def test_the_data_sets_are_all_there() -> None:
     """Every experiment that imports data stands once in the table, every mapping in that of mappings."""
     catalogue = pages.Catalogue()
-    imports = [name for name in shipped("experiments") if load_experiment(name, {}, {})[1].import_]
+    imports = [name for name in shipped("experiments") if pages.as_shipped(name).import_]
     named = re.findall(r"`(?:fuselog run )?([a-z0-9-]+)(?: --data PATH)?`", catalogue.data_sets)
     assert sorted(named) == sorted(imports)
     assert re.findall(r"^\| `(.*?)`", catalogue.mappings, re.MULTILINE) == shipped_mappings()

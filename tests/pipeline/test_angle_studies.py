@@ -25,8 +25,8 @@ def three_sensors(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]
     folder = tmp_path_factory.mktemp("los") / "result"
     with pytest.MonkeyPatch.context() as patch:
         # searches from the printed start, 200 of each case in full, diverge slowly
-        patch.setattr(printed, "_share_from_print", partial(printed._share_from_print, runs=6))
-        return folder, run("los-three-sensors", folder, {"passes": 4}, 4)
+        patch.setattr(printed, "_share_from_print", partial(printed._share_from_print, runs=2))
+        return folder, run("los-three-sensors", folder, {"passes": 2}, 2)
 
 
 def verdicts(result: dict, start: str) -> dict[str, str]:

@@ -12,11 +12,11 @@ import pytest
 from fuselog.pipeline.calibrating import study as calibration
 from fuselog.pipeline.calibrating.manoeuvres import drive
 from fuselog.pipeline.output.results import read_result
-from fuselog.pipeline.runs.experiment import load_experiment
 from fuselog.pipeline.runs.inputs import shipped
 from fuselog.pipeline.runs.runner import Runner
 from fuselog.pipeline.sensing import study as sensing
 from tests.claims.few_runs import opposite
+from tests.claims.pages import as_shipped
 from tests.pipeline.conftest import assert_whole
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
@@ -25,7 +25,7 @@ Fuselog = Callable[..., Any]
 
 # the smallest form of each: its options of `run`, then what --set sets
 SMALLEST: dict[str, tuple[str, ...]] = {
-    "acoustic-sequence": ("--runs 2", "shots=3", "mixture.kind=particles:20"),
+    "acoustic-sequence": ("--runs 2", "shots=2", "mixture.kind=particles:20"),
     "calibration": ("--runs 1", "options.seeds=[3000]", "options.motions=[]"),
     "diagnosis": ("--runs 1", 'options.faults=["landmarks-bias"]', "options.battery_runs=0"),
     "ellipsoid": ("--runs 1", "options.seeds=[5000]"),
@@ -33,17 +33,17 @@ SMALLEST: dict[str, tuple[str, ...]] = {
     "faults-together": ("--runs 1", "options.pairs=1", "options.triples=1"),
     "imu-grades": ("--runs 1", "duration_s=22", "gnss.outages_s=[[10, 21]]", "unit.rate_hz=20"),
     "landmarks": ("--runs 1", "duration_s=2"),
-    "los-moving": ("--runs 1", "duration_s=2"),
+    "los-moving": ("--runs 1", "duration_s=1.1"),
     "los-two-sensors": ("--runs 2", "passes=1"),
-    "manoeuvres": ("--runs 1", "duration_s=5"),
+    "manoeuvres": ("--runs 1", "duration_s=2"),
     "navigation-heading": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
     "navigation-simulated": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
     "navigation-unknown-heading": ("--runs 1", "duration_s=11", "unit.rate_hz=20"),
     "sensor-noise": ("--runs 1", "options.seeds=[1000]"),
     "tuning": ("--runs 1", "options.durations_s=[5.0]"),
-    "vehicles-ctm4": ("--runs 1", "duration_s=2", "options.few_runs=0"),
-    "vehicles-cv": ("--runs 1", "duration_s=2", "options.few_runs=0"),
-    "warehouse-uwb": ("--runs 1", "duration_s=5"),
+    "vehicles-ctm4": ("--runs 1", "duration_s=1", "options.few_runs=0"),
+    "vehicles-cv": ("--runs 1", "duration_s=1", "options.few_runs=0"),
+    "warehouse-uwb": ("--runs 1", "duration_s=2"),
 }
 # what tests of studies run; their results are reported and viewed by `kept_numbers`
 STUDIED = {
@@ -90,7 +90,7 @@ def draw_first_case(runner: Runner, sources: Any, outputs: Any, folder: str = ""
 def test_each_that_ships_its_data_has_a_smallest_form_or_a_study() -> None:
     """Others import data, and `test_report` makes pages of their kept results."""
     assert {*SMALLEST, *STUDIED} == {
-        name for name in shipped("experiments") if not load_experiment(name, {}, {})[1].import_
+        name for name in shipped("experiments") if not as_shipped(name).import_
     }
     for name, file in STUDIED.items():
         text = (Path(__file__).parent / f"{file}.py").read_text(encoding="utf-8")

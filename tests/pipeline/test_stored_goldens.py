@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fuselog.pipeline.checking.stored import read, write
+from fuselog.pipeline.checking.stored import MOST_BYTES, read, write
 from fuselog.recorders.errors import BadInput
 from tests.pipeline.conftest import Said
 
@@ -97,7 +97,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        lambda: lzma.compress(bytes(1 << 27), preset=0),
+        lambda: lzma.compress(bytes(MOST_BYTES + 1), preset=0),
         lambda: lzma.compress(b"[" + b"[]," * (1 << 22) + b"[]]", preset=0),
         lambda: lzma.compress(b"[" * (1 << 20)),
         lambda: lzma.compress(b"{}") + lzma.compress(b"{}"),

@@ -16,12 +16,14 @@ from fuselog.recorders.errors import BadInput
 from fuselog.recorders.registry import available
 from fuselog.testing import assert_same
 from tests.goldens import store
-from tests.goldens.recipes import RECIPES, covered, index, unpack
+from tests.goldens.recipes import DATA, RECIPES, covered, index, unpack
 from tests.goldens.store import ALLOWED
 from tests.older_cpu import older_cpu
 
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
+# real data that are fixtures of all tests
+UNPACKED = ("acoustic", "autoferry", "mrclam6", "navigation")
 # what rounding once decided: vertices, half turns, searches that end early (`test_biometrics` has ties);
 # with the variables of `tests.older_cpu`, `make test` runs all tests so
 FRAGILE = ("navigation-unknown-heading", "set-filter")
@@ -60,14 +62,16 @@ def streams_of(golden: Golden) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where real data are unpacked."""
+    """Where other real data are unpacked."""
     return tmp_path_factory.mktemp("goldens")
 
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_golden(name: str, scratch: Path, request: pytest.FixtureRequest) -> None:
     importer, places = RECIPES[name].importer, {}
-    if importer:
+    if importer and (folder := DATA[importer][0]) in UNPACKED:
+        places = {importer: request.getfixturevalue(folder)}
+    elif importer:
         places = unpack(request.getfixturevalue("real_data"), [importer], scratch)
     assert_is_golden(name, places)
 

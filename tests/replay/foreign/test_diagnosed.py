@@ -126,7 +126,7 @@ def recursion(**changed: Any) -> fl.Estimator[RecursionParameters]:
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A log of a drifter that drifts less than the filters state, in the folder where the test runs."""
     monkeypatch.chdir(tmp_path)
-    rng, steps, step_s, sigma_m = np.random.default_rng(3), 300, 0.1, 0.5
+    rng, steps, step_s, sigma_m = np.random.default_rng(3), 120, 0.1, 0.5
     truth = np.cumsum(rng.normal(0.0, STATED / TOO_LARGE * step_s**0.5, (steps, 2)), axis=0)
     stamps_ns = fl.simulation_stamps_ns(step_s * np.arange(steps))
     state = {"components": "x_m,y_m", "kinds": "linear,linear"}

@@ -13,6 +13,8 @@ from fuselog.pipeline.checking.stored import write
 from fuselog.pipeline.command_line.process import main
 from tests.replay.foreign.conftest import EXAMPLES, Compile
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 MINE = "lib:./robot_ekf.so"
 
 

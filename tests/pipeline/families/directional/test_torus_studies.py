@@ -16,7 +16,7 @@ from tests.conftest import without_drawing
 
 pytestmark = pytest.mark.paper
 
-OPTIONS, MC_RUNS = PropagationOptions(), 12
+OPTIONS, MC_RUNS = PropagationOptions(), 8
 # the sheet's rows: rho, then by c the errors of mu and C of the five samples, and of the UKF's
 FIGURE_3 = {
     -0.9: {

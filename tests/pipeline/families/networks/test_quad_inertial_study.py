@@ -160,7 +160,7 @@ def test_a_smoothed_heading_is_the_sheets_on_average_over_draws_of_the_fixes(
     squares, sources = [], []
     for name in ("GT.csv", "IMU_1.csv"):  # the other units are not used
         shutil.copy(navigation / "quad_mimu" / f"path_{path}" / name, tmp_path)
-    for seed in range(1, 13):
+    for seed in range(1, 9):
         drawn = import_run("table", tmp_path, {"mapping": "quadrotor", "seed": seed})
         own = flight_of(f"path_{path}", memory_source(*drawn))
         sources.append(log_of(own, own.units[0], offset_s))

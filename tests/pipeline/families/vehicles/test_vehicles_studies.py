@@ -31,7 +31,7 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     }
     options = {
         "few_runs": 2,
-        "cases": {"straight": {"duration_s": 5.0}},
+        "cases": {"straight": {"duration_s": 2.0}},
         "few": {label: {"kind": f"vehicle-particles:{method}"} for label, method in particles.items()},
     }
     return folder, run("vehicles-ctm2", folder, {"options": options}, 12)
@@ -80,7 +80,7 @@ def test_tables_and_metrics_agree(turning: tuple[Path, dict[str, Any]]) -> None:
 
 def test_scaling_tells_methods_apart(tmp_path: Path) -> None:
     """Every method goes as far as it should, in its own place; time and error are there for all."""
-    settings = {"duration_s": 3.0, "options": {"vehicles": [2, 7, 10]}}
+    settings = {"duration_s": 2.0, "options": {"vehicles": [2, 7, 10]}}
     result = run("vehicles-scaling", tmp_path / "result", settings, 1)
     table = pd.read_parquet(tmp_path / "result" / "tables" / "scaling.parquet")
     assert len(table) == 8 * 3 - 1  # the collapse over all maps ends at seven vehicles

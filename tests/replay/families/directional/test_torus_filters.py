@@ -66,16 +66,16 @@ def rmse(truth: np.ndarray, estimate: np.ndarray) -> float:
     ],
 )
 def test_comparison_of_the_sheet(parameters, expected):
-    """Torus filter, wrapped and naive UKF over 1000 runs; the sheet's 100 runs are good to .02.
+    """Torus filter, wrapped and naive UKF over 400 runs; the sheet's 100 runs are good to .02.
 
     The naive filter's errors come from rare wraps, so that its mean of 100 runs is good to .05.
     """
     given = model(*parameters)
-    truth, offsets, measured = simulate(given, 1000, 3)
+    truth, offsets, measured = simulate(given, 400, 3)
     estimates = [
-        run_toroidal_filter(given, start(1000), offsets, measured)[1],
+        run_toroidal_filter(given, start(400), offsets, measured)[1],
         *(
-            run_unscented_filter(given, start(1000), offsets, measured, wrapped=wrapped)[1]
+            run_unscented_filter(given, start(400), offsets, measured, wrapped=wrapped)[1]
             for wrapped in (True, False)
         ),
     ]
@@ -85,12 +85,12 @@ def test_comparison_of_the_sheet(parameters, expected):
 
 
 def test_toroidal_filter_is_nearly_as_good_as_a_grid():
-    """The sheet's first row, where 48 x 48 cells reach .392; the same 40 runs for both."""
+    """The sheet's first row, where 48 x 48 cells reach .392; the same 20 runs for both."""
     given = model(0.1, 0.2, 0.8, 0.8, 0.5)
-    truth, offsets, measured = simulate(given, 40, 5)
-    own = run_toroidal_filter(given, start(40), offsets, measured)[1]
+    truth, offsets, measured = simulate(given, 20, 5)
+    own = run_toroidal_filter(given, start(20), offsets, measured)[1]
     density = wrapped_normal.density(make_wrapped_normal([0.0, 0.0], np.eye(2)), torus_grid(32))
-    cells = np.broadcast_to(density / density.sum(), (40, 32, 32))
+    cells = np.broadcast_to(density / density.sum(), (20, 32, 32))
     grid = run_torus_grid_filter(given, cells, offsets, measured)
     assert rmse(truth, own.mean) == pytest.approx(rmse(truth, grid.mean), abs=0.005)
     np.testing.assert_allclose(grid.state.sum(axis=(1, 2)), 1.0)

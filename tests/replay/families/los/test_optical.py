@@ -263,7 +263,7 @@ def test_fixing_any_one_bias_is_not_safe() -> None:
 def test_printed_starting_point_misses_scenario_1() -> None:
     """Eqs (21)-(23), put right, bring no run of scenario 1 to the estimate; the rays bring all."""
     scene, truth = three_sensors(1, *REPRODUCING)
-    measured = simulate(scene, truth, 200, seed=1)
+    measured = simulate(scene, truth, 40, seed=1)
     found = optical.estimate(scene, measured, optical.printed_starting_point(scene, measured))
     right = optical.estimate(scene, measured).parameters
     assert (np.abs(found.parameters / right - 1.0).max(axis=1) < 1e-3).sum() == 0

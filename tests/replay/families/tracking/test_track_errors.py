@@ -1,16 +1,14 @@
 """Tracks judged at instants: the sheet's check without a tracker; what is followed, switched, broken."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
 
 from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
 from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
-from fuselog.recorders.recording import import_run
 from fuselog.replay.engine.streams.blocks import gather
-from fuselog.replay.engine.streams.sources import MemorySource, memory_source
+from fuselog.replay.engine.streams.sources import MemorySource
 from fuselog.replay.families.tracking.judging.errors import (
     SOME_ARE_KNOWN,
     UNREFERENCED_M,
@@ -50,8 +48,8 @@ def last_scans(streams: Mapping[str, Stream], sensor: str, at_ns: np.ndarray) ->
 
 @pytest.mark.paper
 @pytest.mark.parametrize("scenario", SHEET)
-def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
-    source = memory_source(*import_run("autoferry", autoferry / f"scenario{scenario}", {}))
+def test_the_sheets_check_without_a_tracker(autoferry_log: Callable[[int], MemorySource], scenario: int):
+    source = autoferry_log(scenario)
     at_ns, true, limit_m = instants_of(source)
     assert limit_m == UNREFERENCED_M
     radar, lidar = (

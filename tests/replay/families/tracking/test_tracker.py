@@ -1,8 +1,8 @@
 """The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from fuselog.pipeline.runs.recorded import replay_in_memory
 from fuselog.recorders.errors import BadInput
 from fuselog.recorders.log import RunMetadata, Stream, make_stream, schemas
 from fuselog.recorders.models.states import PLANE_MOTION, state_metadata
-from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
+from fuselog.recorders.recording import SIMULATION_EPOCH_NS, Recording
 from fuselog.replay.engine.replaying import replaying
 from fuselog.replay.engine.replaying.estimator import bind
 from fuselog.replay.engine.replaying.late import parse_late
@@ -597,12 +597,9 @@ def test_pmbm_follows_targets_in_clutter():
 
 
 @pytest.mark.paper
-def test_the_sheets_reference_trackers(autoferry: Path):
+def test_the_sheets_reference_trackers(autoferry_log: Callable[[int], MemorySource]):
     """Radar and lidar over all scenarios, within the sheet's tolerances of its row, or better."""
-    sources = [
-        memory_source(*import_run("autoferry", autoferry / f"scenario{number}", {}))
-        for number in (2, 3, 5, 13, 16, 22)
-    ]
+    sources = [autoferry_log(number) for number in (2, 3, 5, 13, 16, 22)]
     label = "tracker:jipda"
     outputs = replay_in_memory(sources, {label: {"sensors": ["radar", "lidar"]}})
     figures = []
