@@ -24,8 +24,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from fuselog.pipeline.diagnosing import causes, diagnosis
-from fuselog.pipeline.diagnosing.causes import hypotheses, seek
+from fuselog.pipeline.diagnosing import diagnosis
+from fuselog.pipeline.diagnosing.causes import seek
 from fuselog.replay.timeline import show
 from tests.pipeline.conftest import run_here
 
@@ -105,11 +105,6 @@ def missing_peers(code: str, names: Mapping[str, Any]) -> list[str]:
     return missing or ["theirs"] * ("- theirs" in code and "theirs" not in names)
 
 
-def of_noise(*given: Any) -> list[Any]:
-    """The noise of a flight's fixes and velocities; `test_diagnosing.py` seeks all other faults."""
-    return [each for each in hypotheses(*given) if each.kind == "measurement noise"]
-
-
 def flat(text: str) -> str:
     """Text without its line breaks and rules."""
     return " ".join(re.sub("[─│]", "", text).split())
@@ -123,7 +118,6 @@ def test_a_page_can_be_worked_through(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(diagnosis, "seek", lambda *given: seek(*given[:3], MOST_CAUSES))
     if name == "flight":
-        monkeypatch.setattr(causes, "hypotheses", of_noise)
         _unpack_flight(request.getfixturevalue("real_data"))
     names: dict[str, Any] = {}
     printed, shown, left_out = "", 0, list[str]()
