@@ -15,7 +15,7 @@ def verdicts(result):
 
 def test_the_room(tmp_path):
     """Its metrics, verdicts and files; tests/replay compares more runs with the sheet."""
-    name, experiment = load_experiment("ispace", {"runs": 2}, {})
+    name, experiment = load_experiment("ispace", {"runs": 4}, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)
     found = result.metrics
     assert found["ci-trace.rmse_ratio"] == pytest.approx(1.075, abs=0.05)

@@ -31,7 +31,7 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     }
     options = {
         "few_runs": 2,
-        "cases": {"straight": {"duration_s": 2.0}},
+        "cases": {"straight": {"duration_s": 5.0}},
         "few": {label: {"kind": f"vehicle-particles:{method}"} for label, method in particles.items()},
     }
     return folder, run("vehicles-ctm2", folder, {"options": options}, 12)
