@@ -35,9 +35,9 @@ def definitions_of(path: Path) -> list[Definition]:
 
 
 def definitions_in(node: ast.AST) -> Iterator[Definition]:
-    """A node and what is defined in it. Most nodes are in expressions, which define nothing."""
+    """A node and what is defined in it. Definitions are in blocks of statements alone."""
     if isinstance(node, Definition):
         yield node
-    for each in ast.iter_child_nodes(node):
-        if not isinstance(each, ast.expr):
+    for block in ("body", "handlers", "orelse", "finalbody", "cases"):
+        for each in getattr(node, block, ()):
             yield from definitions_in(each)

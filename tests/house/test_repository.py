@@ -4,6 +4,7 @@ import ast
 import os
 import re
 import tomllib
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -144,25 +145,31 @@ def test_ci_runs_the_two_commands_everywhere() -> None:
     assert "python -m tests.older_cpu" in older["run"]
 
 
+@cache
+def texts() -> dict[Path, str]:
+    """What is written in code, pages and data."""
+    return {
+        path: path.read_text(encoding="utf-8")
+        for folder in ("fuselog", "recorders", "replay", "pipeline", "tests", "docs", "data")
+        for path in (ROOT / folder).rglob("*.*")
+        if path.suffix in (".py", ".pyi", ".md", ".toml", ".ipynb")
+    }
+
+
 def test_no_file_cites_what_is_outside_the_repository() -> None:
-    for folder in ("recorders", "replay", "pipeline", "tests", "docs", "data"):
-        for path in (ROOT / folder).rglob("*.*"):
-            if path.suffix in (".py", ".md", ".toml") and path != Path(__file__):
-                found = re.search(
-                    r"\b(?:shared|spec|tech)/[a-z]|\bpapers/[a-z-]+\.txt",
-                    path.read_text(encoding="utf-8"),
-                )
-                assert not found, f"{path}: {found}"
+    cited = re.compile(r"\b(?:shared|spec|tech)/[a-z]|\bpapers/[a-z-]+\.txt")
+    for path, text in texts().items():
+        if path.suffix in (".py", ".md", ".toml") and path != Path(__file__):
+            found = cited.search(text)
+            assert not found, f"{path}: {found}"
 
 
 def test_rooms_are_named_as_parts_of_fuselog() -> None:
     """In strings and pages too: under a name of its own a room would be loaded twice, in a clone."""
     alone = re.compile(r"(?:-m|(?:^|[\"';])\s*(?:from|import)) (?:pipeline|recorders|replay)\b", re.M)
-    for folder in ("fuselog", "recorders", "replay", "pipeline", "tests", "docs", "data"):
-        for path in (ROOT / folder).rglob("*.*"):
-            if path.suffix in (".py", ".pyi", ".md", ".toml", ".ipynb"):
-                found = alone.search(path.read_text(encoding="utf-8"))
-                assert not found, f"{path}: {found}"
+    for path, text in texts().items():
+        found = alone.search(text)
+        assert not found, f"{path}: {found}"
 
 
 def test_one_version_everywhere() -> None:

@@ -8,6 +8,7 @@ import tarfile
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,12 @@ Sent = tuple[str, int, Any]
 
 def store_of(form: str = "mcap") -> Typestore:
     """The types of ROS 1 or 2, with those that are made up here."""
-    store = get_typestore(Stores.ROS1_NOETIC if form.startswith("bag") else Stores.ROS2_HUMBLE)
+    return types_of(Stores.ROS1_NOETIC if form.startswith("bag") else Stores.ROS2_HUMBLE)
+
+
+@cache
+def types_of(stores: Stores) -> Typestore:
+    store = get_typestore(stores)
     for name, text in VISION.items():
         store.register(get_types_from_msg(text, name))
     return store

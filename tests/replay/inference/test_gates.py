@@ -17,11 +17,12 @@ def test_what_is_at_the_bound_is_let_in(
 ) -> None:
     """Of five measurements the last one lies farthest off, and the gate is at its NIS."""
     log = source([0.5, -0.2, 0.4, 0.1, 3.0])
-    squared = outputs(SCALAR, method, [log], gate_probability=1.0)["innovation"]
+    count = {"particles": 100} if method == "particles" else {}
+    squared = outputs(SCALAR, method, [log], gate_probability=1.0, **count)["innovation"]
     nis = squared["normalised_innovation_squared"]
     assert nis.argmax() == LAST
     for bound, accepted_likelihood in ((nis[LAST], 1), (np.nextafter(nis[LAST], 0.0), 0)):
         monkeypatch.setattr(filtering, "_nis_bounds", lambda *_, at=bound: np.array([np.inf, at]))
-        found = outputs(SCALAR, method, [log], gate_probability=0.9)["innovation"]
+        found = outputs(SCALAR, method, [log], gate_probability=0.9, **count)["innovation"]
         assert found["normalised_innovation_squared"][LAST] == nis[LAST]
         assert found["accepted"].tolist() == [1, 1, 1, 1, accepted_likelihood]

@@ -237,7 +237,7 @@ def one_set(dimension: int, kappa: float) -> SampleSets:
 
 @pytest.mark.paper
 @pytest.mark.parametrize(("method", "kappa"), [("ekf", 0.0), ("iekf", 0.0), ("ukf", 0.0), ("ukf", 1.7)])
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(st.integers(1, 4), st.integers(1, 3), st.integers(1, 5), seeds)
 def test_filters_are_exact_for_linear_models_of_any_size(
     method: str, kappa: float, states: int, controls: int, components: int, seed: int
@@ -289,6 +289,7 @@ def test_sampling_says_where_the_covariance_is_none():
     assert told == NOT_POSITIVE_DEFINITE
 
 
+@settings(max_examples=20)
 @given(seeds)
 def test_tangent_vectors_from_a_shifted_centre_lead_to_the_same_states(seed: int):
     """By less than half a turn, or half of that of an axis, however far they were."""

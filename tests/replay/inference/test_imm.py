@@ -321,7 +321,7 @@ def twin_initial(parameters: Any) -> Any:
 
 def problem(name: str) -> tuple[Model, MemorySource]:
     if name == "vehicle":
-        return VEHICLE_A, vehicle_a.source(vehicle_a.simulate(9, outlier=True)[0][:90])
+        return VEHICLE_A, vehicle_a.source(vehicle_a.simulate(9, outlier=True)[0][:80])
     if name == "wheel":
         return wheel.make_wheel(), wheel.source(wheel.simulate(3, np.arange(0, 14) * 0.1))
     source, *_ = attitude.simulate(21)
@@ -396,7 +396,7 @@ def memory_of(n: int, t: int, modes: int) -> Any:
 
 def test_what_no_mode_lets_in_changes_nothing(uncompiled: None) -> None:
     """The outlier is as a message that measured nothing."""
-    told = vehicle_a.simulate(7, outlier=True)[0][:100]
+    told = vehicle_a.simulate(7, outlier=True)[0][:85]
     kept = outputs(SWITCHING_A, "imm", [vehicle_a.source(told)], gate_probability=0.999)
     shut = np.flatnonzero(kept["innovation"]["accepted"] == 0)
     assert len(shut) == 1

@@ -368,7 +368,7 @@ def test_runs_do_not_mix_and_blocks_do_not_matter(uncompiled: None) -> None:
 
 
 def test_what_the_gate_keeps_out_has_no_cost(uncompiled: None) -> None:
-    told = vehicle_a.simulate(7, outlier=True)[0][:80]
+    told = vehicle_a.simulate(7, outlier=True)[0][:78]
     kept = outputs(
         VEHICLE_A, "smoother", [vehicle_a.source(told)], forward="iterated", gate_probability=0.999
     )

@@ -146,7 +146,7 @@ def test_the_window_of_steps_gives_what_the_direct_way_gives(
     lag: str, uncompiled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lags of no node, of some and of all, across a gap; to the last bit whatever the blocks."""
-    told = [each for each in vehicle_a.simulate(8)[0][:90] if not 2.5 < each[0] < 3.8]
+    told = [each for each in vehicle_a.simulate(8)[0][:60] if not 2.5 < each[0] < 3.8]
     source, forward = vehicle_a.source(told), f"ekf:lag={lag}"
     slid = outputs(VEHICLE_A, "smoother", [source], forward=forward)["state"]
     for found in in_blocks(
@@ -458,7 +458,7 @@ def test_an_ensemble_is_its_runs_alone_and_one_that_fails_fails_alone(
 
 def test_what_the_gate_kept_out_says_nothing_backwards_either(uncompiled: None) -> None:
     """The outlier is as if it had not come, but for its stamp."""
-    told = vehicle_a.simulate(7, outlier=True)[0][:100]
+    told = vehicle_a.simulate(7, outlier=True)[0][:85]
     kept = outputs(VEHICLE_A, "smoother", [vehicle_a.source(told)], gate_probability=0.999)
     [row] = np.flatnonzero(kept["innovation"]["accepted"] == 0)
     at_ns = kept["innovation"].stream.publish_time_ns[row]

@@ -88,7 +88,7 @@ def test_options_and_manifolds_are_as_of_the_plain_filters(
     source = (
         attitude.simulate(5, steps=50)[0]
         if model is ATTITUDE
-        else vehicle_a.source(vehicle_a.simulate(7, outlier=True)[0][:90])
+        else vehicle_a.source(vehicle_a.simulate(7, outlier=True)[0][:80])
     )
     option = {"imm": "filter", "smoother": "forward"}.get(method, "")
     rooted = {option: f"sqrt:{name}"} if option else {"filter": method}

@@ -573,18 +573,19 @@ def test_one_pass_goes_to_a_file_and_to_a_running_receiver(
     rrd: Path, ensemble: Replayed, tmp_path: Path
 ) -> None:
     both, live = tmp_path / "both.rrd", tmp_path / "live.rrd"
+    wanted = [read(rrd, static=each) for each in (False, True)]
     with listen(tmp_path, "--save", str(live)) as receiver:
         source = ensemble.sources[RUN]
         show(source, ensemble.outputs, ensemble.errors, run=RUN, save=both, connect=receiver.url)
         end = time.monotonic() + 30
         while time.monotonic() < end:
             with suppress(RuntimeError):  # the receiver is still writing
-                if all(read(live, static=each) == read(rrd, static=each) for each in (False, True)):
+                if [read(live, static=each) for each in (False, True)] == wanted:
                     break
             time.sleep(0.1)
-    assert read(both) == read(rrd)
-    assert read(live) == read(rrd)
-    assert read(live, static=True) == read(rrd, static=True)
+    assert read(both) == wanted[0]
+    assert read(live) == wanted[0]
+    assert read(live, static=True) == wanted[1]
     port = int(receiver.url.rpartition(":")[2].partition("/")[0])
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), timeout=1)
