@@ -126,7 +126,17 @@ def _gained(windows: Windows, source: Series, *, is_path: bool) -> tuple[float, 
 
 
 def likenesses(windows: Windows, lags_s: Floats, source: Series, *, is_path: bool) -> Floats:
-    """Correlate windows with a source at each lag; NaN if the source spans less than half of them."""
+    """Correlate windows with a source at each lag; NaN if the source spans less than half of them.
+
+    Args:
+        windows: k windows: lengths if `is_path`, otherwise angles.
+        lags_s: (lags,), how much later the windows are than the source.
+        source: a speed, velocity or turn rate.
+        is_path: whether the length of the source's motion counts, not the motion itself.
+
+    Returns:
+        (lags,), -1 to 1.
+    """
     found, moves = np.empty(len(lags_s)), np.empty(len(windows))
     spans = np.ascontiguousarray(windows.begin_s), np.ascontiguousarray(windows.end_s)
     values = np.ascontiguousarray(windows.values)
